@@ -92,7 +92,7 @@ def test_a_bad_picture_of_a_folder_is_named_or_left_out(embed, mistake, tmp_path
         lenient = embed(folder, "--sensor", "gelsight_mini", "--on-bad-sample", "skip", "--frames", frames)
         assert lenient["rows"].tolist() == lenient["key/frame_index"].tolist() == ends
         assert lenient["key/path"].tolist() == [f"{end}.png" for end in ends]
-        assert f"{8 - frames - len(ends)} skipped" in lenient["done"].out
+        assert f"{8 - frames - len(ends)} skipped" in lenient["done"].out and "2.png" in lenient["done"].err
     of_manifest = embed(world, "--frames", 3)
     same = of_manifest["features"][of_manifest["rows"] == 6]
     np.testing.assert_allclose(same, lenient["features"][-1:], atol=1e-6)
@@ -112,7 +112,7 @@ def test_a_bad_row_of_a_manifest_is_named_however_the_run_was_trained(anytouch, 
     words = ("embed", *shared, "--out", tmp_path / "f.npz", "--batch", 4)
     assert "row 10 of" in mistake(*words)
     done = anytouch(*words, "--on-bad-sample", "skip")
-    assert done.status == 0 and "1 skipped" in done.out
+    assert done.status == 0 and "1 skipped" in done.out and "row 10 of" in done.err
     done = anytouch("probe", "label", *shared)
     assert done.status == 2 and "row 10 of" in done.err
 

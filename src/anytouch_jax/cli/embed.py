@@ -60,7 +60,7 @@ class EmbedOptions(FrameOptions):
     split: str | None = None  # Only this split of a manifest.
     batch: Count[int] = 64  # Frames at a time.
     on_bad_sample: Literal["error", "skip"] = "error"
-    """Stop at a row or picture that cannot be read, or skip and count it."""
+    """Stop at a row or picture that cannot be read, or skip it, count it and name the first."""
     column: str | None = None  # Also write the features into the LeRobot data set of the manifest, as this feature.
 
 
@@ -292,10 +292,11 @@ def _numbered_frames(
 ) -> Iterator[tuple[int, str, np.ndarray | None]]:
     """Yield number, name and RGB u8 pixels of each frame; the frames of a video have no names.
 
-    A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped. The
-    time stamps of a video's frames are appended to `times`.
+    A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped, and the
+    first are logged. The time stamps of a video's frames are appended to `times`.
     """
     from anytouch_jax.data import images
+    from anytouch_jax.data.loading.evaluation import NAMED
 
     if data.suffix.lower() in images.SUFFIXES and data.is_file():
         yield 0, data.name, images.decode(data)
@@ -308,14 +309,16 @@ def _numbered_frames(
     files, others = images.list_images(data)
     if others:
         log(f"{', '.join(file.name for file in others.values())}: not a frame, not embedded")
-    start = 0  # first frame number of a finger: no clip spans two fingers
+    start = skipped = 0  # `start` is the first frame number of a finger: no clip spans two fingers
     for names in images.split_series([file.name for file in files]).values():
         numbers = [start + number for number in images.frame_numbers(names)]
         start = numbers[-1] + 2
         for number, name in zip(numbers, names, strict=True):
             try:
                 yield number, name, images.decode(data / name)
-            except images.ImageError:
+            except images.ImageError as error:
                 if on_bad_sample == "error":
                     raise
+                if (skipped := skipped + 1) <= NAMED:
+                    log(f"skipped: {error}")
                 yield number, name, None

@@ -72,8 +72,8 @@ def embed_rows(
 
     A row's clip is the `frames` frames that end at it. A sensor that the model does not know gets the universal tokens,
     which is logged; `sensor_row` serves all rows by one row of the table. `edit` changes clips u8 (B, T, H, W, 3) of
-    rows (B,) before they are encoded. With `on_bad_sample` "skip", rows that cannot be read are left out. Raises
-    UserError.
+    rows (B,) before they are encoded. With `on_bad_sample` "skip", rows that cannot be read are left out, and the first
+    are logged. Raises UserError.
     """
     if not len(rows):
         raise UserError("there are no rows to embed; check the split and the filters")
@@ -82,7 +82,7 @@ def embed_rows(
     if on_bad_sample == "error":
         manifest = with_backgrounds(encoder, manifest, rows, log)
     settings = {"data.batch_size": min(batch, len(rows)), "data.on_bad_sample": on_bad_sample}
-    config, ids = encoder.config.with_settings(settings), []
+    config, ids, skipped = encoder.config.with_settings(settings), [], list[str]()
 
     def touches() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
@@ -95,6 +95,7 @@ def embed_rows(
             unknown="universal",
             prepare=encoder.prepare,
             like=encoder.blank,
+            skipped=skipped,
         ):
             ids.append(row_ids)
             clips = part.clip[: len(row_ids)]
@@ -107,6 +108,8 @@ def embed_rows(
         return encoder.encode_touch(clips, sensor, pooling=pooling, join=join)
 
     values = run_in_batches(encode, tracked(touches(), "frames embedded", len(rows)), config.data.batch_size)
+    for sentence in skipped:
+        log(f"skipped: {sentence}")
     if not ids:
         raise UserError(f"none of the {len(rows)} rows can be read; check them with `anytouch data verify`")
     return np.concatenate(ids), values

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
+from jax.typing import DTypeLike
 
 from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.anytouch import AnyTouch
@@ -112,9 +113,13 @@ class Part:
         return _with(jax.tree.map(jnp.asarray, params), *_skeleton(self.kind, self.options))(*args)
 
 
-@lru_cache(maxsize=24)
 def _skeleton(kind: Callable[[Any], Any], options: Any) -> tuple[Any, Any]:
-    """Return graph and abstract state of a module."""
+    """Return graph and abstract state of a module, whose parameters have the widest float of the context."""
+    return _cached_skeleton(kind, options, jax.dtypes.canonicalize_dtype(float))
+
+
+@lru_cache(maxsize=24)
+def _cached_skeleton(kind: Callable[[Any], Any], options: Any, _: DTypeLike) -> tuple[Any, Any]:
     return nnx.split(nnx.eval_shape(lambda: kind(options)))
 
 

@@ -94,7 +94,7 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
         (GOOD.replace("test", "te st"), ["row 2", "'split'", "'te st'", "did you mean test?"]),
         (GOOD.replace("train,2,t,0", "train,0,t,0"), ["row 1", "'stride'", "at least 1, is 0"]),
         (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["row 0", "'commercial'", "0 or 1", "'yes'"]),
-        (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["cannot be read as a csv", "Expected 11 columns"]),
+        (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["line 3: 10 cells for 11 columns", "b.png,"]),
         (GOOD.replace("other\n", "path\n"), ["'path' is there twice"]),
         (HEAD + "\n", ["has no rows"]),
         ("", ["cannot be read as a csv"]),
@@ -310,7 +310,7 @@ def test_a_csv_reads_one_class_from_spaces_unicode_forms_and_empty_spellings(tmp
     head = "path,sensor,sequence,frame_index,split,object,label.kind,label.force"
     cells = [
         ("train ", "mug", "oak wood", "1"), (" train", " mug", "oak  wood ", "n/a"), ("train", "mug\u00a0", "", "NaN"),
-        ("train", "-", "?", "-"), ("train", "None", "caf\u00e9", "none"), ("train", "null", "cafe\u0301", "2"),
+        ("train", "-", "#N/A", "<NA>"), ("train", "None", "caf\u00e9", "none"), ("train", "null", "cafe\u0301", "2"),
     ]  # fmt: skip
     lines = [f"{i}.png, digit,s,{i},{','.join(line)}" for i, line in enumerate(cells)]
     got = m.read(_file(tmp_path, "\n".join([head, *lines]) + "\n"))
@@ -329,6 +329,23 @@ def test_texts_of_a_parquet_are_meant_as_they_are_written(tmp_path):
     got = m.read(tmp_path / "m.parquet")
     assert got.column("object").to_pylist() == ["mug", "N/A", None]
     assert got.column("label.slide").to_pylist() == ["left", "none", None]
+
+
+def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
+    head = " path, sensor,sequence ,frame_index,split,text,label.x"  # spaces around names do not count
+    good = '0.png,digit,s,0,train,"of two\nlines",1\n\n'
+    for bad, words in (
+        ("1.png,digit,s,one,train,,2", "line 5, row 1: column 'frame_index'"),
+        ("1.png,digit,s,1,tain,,2", "line 5, row 1: column 'split'"),
+        ("1.png,digit,s,1,train", "line 5: 5 cells for 7 columns, in '1.png"),
+        ("1.png,digit,s,1,train,soft, red,2", "line 5: 8 cells for 7 columns"),
+        ('1.png,digit,s,1,train,"open,2', "line 5: 6 cells for 7 columns"),
+    ):
+        with pytest.raises(m.ManifestError, match=words):
+            m.read(_file(tmp_path, f"{head}\n{good}{bad}\n2.png,digit,s,2,train,,3\n"))
+    lines = "".join(f"{i}.png,digit,s,{i},train,,{i}\n" for i in range(1, 9)) + "9.png,digit,s,9,train,,much\n"
+    with pytest.raises(m.ManifestError, match=r"line 13, row 9: column 'label.x' has 'much' among numbers"):
+        m.read(_file(tmp_path, f"{head}\n{good}{lines}"))
 
 
 @pytest.mark.parametrize(
@@ -393,13 +410,14 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
 @pytest.mark.parametrize(
     ("text", "options", "words"),
     [
-        ("sequence,text\ns0,a\ns0,b\n", {}, "row 1: sequence 's0' has another caption"),
+        ("sequence,text\n,a\n", {}, "line 2, row 0: a caption without sequence"),
+        ("sequence,text\n\ns0,a\ns0,b\n", {}, "line 4, row 1: sequence 's0' has another caption"),
         ("sequence,caption\ns0,a\n", {}, "no column 'text'; it has sequence, caption"),
         ("sequence,touch,text\ns0,x,a\n", {}, "name the key column"),
         ("sequence,text\ns9,a\n", {}, "no key 'sequence' of it is in the manifest; its first one is 's9'"),
         ("sequence,text\ns0,a\n", {"key": "tuoch"}, "no column 'tuoch'"),
         ("grip,text\ns0,a\n", {}, "has no column 'grip'"),
-        ('sequence,text\n"s0,a\n', {}, "cannot be read as a csv|in the manifest"),
+        ('sequence,text\n"s0,a\n', {}, "line 2: 1 cells for 2 columns"),
     ],
 )
 def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words):

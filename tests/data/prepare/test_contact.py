@@ -66,6 +66,14 @@ def test_a_change_of_exposure_or_tint_is_no_contact():
     assert score(gel(40, tint=(25, -15, 10)), clean) > 2 * c.DEFAULT_THRESHOLD
 
 
+def test_a_lamp_that_drifts_is_no_contact():
+    clean, lamp = gel(), np.linspace(30, -10, SHAPE[1])[:, None] * np.array([1, 0.3, -0.5])
+    drifted, pressed = (np.clip(gel(press) + lamp, 0, 255).astype(np.uint8) for press in (0, 40))
+    assert naive(drifted, clean) > 25
+    assert score(drifted, clean) < 1.5
+    assert score(pressed, clean) == pytest.approx(score(gel(40), clean), rel=0.1)
+
+
 def test_the_score_does_not_depend_on_the_resolution_or_on_which_side_is_long():
     small, large = (score(gel(30, scale=s), gel(scale=s)) for s in (2, 5))
     assert large == pytest.approx(small, rel=0.1)
@@ -117,6 +125,9 @@ def test_given_backgrounds_and_broken_files(world, tmp_path):
         assert np.isnan(scores.score[2:]).all()
         assert scores.counts == {"given": 2, "none: the frame or its background cannot be read": 3,
                                  "none: its background has other proportions": 1}  # fmt: skip
+        named = [("row 2 of", "broken.png"), ("row 3 of", "gone.png"), ("row 4 of", "c.png"), ("row 5 of", "lost.png")]
+        assert len(scores.faults) == 4
+        assert all(row in fault and name in fault for fault, (row, name) in zip(scores.faults, named, strict=True))
     some = c.contact_scores(manifest, np.array([1]))
     assert some.counts == {"not asked for": 5, "given": 1}
     assert some.score[1] == scores.score[1]
@@ -274,6 +285,13 @@ def test_one_odd_file_ends_nothing(tmp_path):
     manifest = manifests.from_columns(columns, tmp_path / "data" / "m.csv")
     scores = c.contact_scores(manifest, workers=1)
     assert np.flatnonzero(np.isnan(scores.score)).tolist() == [3, 5]
+    for number in (6, 7, 8, 9, 10):
+        (tmp_path / "data" / f"{number}.png").write_bytes(b"\x89PNG")
+    _, report = c.mark_contact(manifest, c.contact_scores(manifest))
+    lines = report.lines()
+    at = lines.index("pictures that cannot be used:")
+    assert [line.split()[1] for line in lines[at + 1 : at + 6]] == ["3", "6", "7", "8", "9"]
+    assert "7.png" in lines[at + 3] and "`anytouch data verify`" in lines[at + 6]
 
 
 # Quality ------------------------------------------------------------------------------------------------------------

@@ -268,8 +268,9 @@ def test_the_report_is_whole_as_json(make):
     loose = make(plain_rows(1200))
     for row in range(1100):
         loose.file(row).unlink()
-    about = json.loads(verify(loose, decode=False).to_json())
-    (finding,) = about["findings"]
+    report = verify(loose, decode=False)
+    (finding,) = json.loads(report.to_json())["findings"]
+    assert finding["files"] == [f"f{row}.png" for row in range(1000)] and "and more: `--out`" in report.to_markdown()
     assert finding["count"] == 1100 and finding["rows"] == list(range(1000)) and len(finding["examples"]) == 5
 
 

@@ -144,6 +144,7 @@ def test_labels_match_in_any_spelling_of_empty_spaces_and_unicode(tmp_path, read
         ("object,a,a\nmug,1,2\n", "has the column 'a' twice"),
         ("object,a\nmug,1\nmug,2\n", "line 3: mug is there twice"),
         ("object,a\n\nmug,1,2\n", "line 3: 3 cells for 2 columns"),
+        ("object,a,b\nmug,1\n", "line 2: 2 cells for 3 columns"),
         ("object,a\nmug,Wood\n\nball,wood\n", "line 4: column 'a' has 'wood', and .* line 2 has 'Wood'"),
         ("object,a\n,1\n", "line 2: there is neither an object nor a sequence"),
     ],

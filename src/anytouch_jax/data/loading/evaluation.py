@@ -15,6 +15,8 @@ from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
 from anytouch_jax.errors import UserError
 
+NAMED = 5  # bad samples that are named where bad samples are skipped
+
 
 def evaluation(
     manifest: Manifest,
@@ -26,15 +28,17 @@ def evaluation(
     unknown: Literal["error", "universal"] = "error",
     prepare: Prepare | None = None,
     like: np.ndarray | None = None,
+    skipped: list[str] | None = None,
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
     """Yield (row ids i64 (n,), TouchBatch of B rows) over `rows` in order, with the same bytes every time.
 
     Stills have T = 1; clips are the `frames` (default `model.frames`) frames that end at each row. B is
     `data.batch_size`. The last batch is filled up with its last row, so only the first n rows of a batch are valid.
-    With `data.on_bad_sample` "skip" bad rows are left out, which the row ids show. `unknown` "universal" gives unknown
-    sensors the universal tokens. `prepare` makes an array of the form of `like` from a frame u8 (h, w, 3) and its
-    background or None, in place of the resizing and the subtraction. Raises UserError: ManifestError for an unknown
-    sensor, SampleError for a bad sample, and for a row that ends no clip.
+    With `data.on_bad_sample` "skip" bad rows are left out, which the row ids show, and `skipped` gets a sentence for
+    each of the first NAMED. `unknown` "universal" gives unknown sensors the universal tokens. `prepare` makes an array
+    of the form of `like` from a frame u8 (h, w, 3) and its background or None, in place of the resizing and the
+    subtraction. Raises UserError: ManifestError for an unknown sensor, SampleError for a bad sample, and for a row that
+    ends no clip.
     """
     rows = np.asarray(rows, np.int64)
     windows = rows[:, None] if kind == "still" else _clips_ending_at(manifest, rows, frames or config.model.frames)
@@ -47,7 +51,9 @@ def evaluation(
         )
     side = config.model.image_size
     blank = np.zeros((side, side, 3), np.uint8) if like is None else like
-    return _batches(SampleReader(manifest, config), rows, windows, sensor, prepare, blank)
+    return _batches(
+        SampleReader(manifest, config), rows, windows, sensor, prepare, blank, [] if skipped is None else skipped
+    )
 
 
 def _batches(
@@ -57,15 +63,18 @@ def _batches(
     sensor: np.ndarray,
     prepare: Prepare | None,
     blank: np.ndarray,
+    skipped: list[str],
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
     data = reader.config.data
 
     def write(clip: np.ndarray, is_good: np.ndarray, start: int, slot: int) -> int:
         try:
             clip[slot] = reader.touch(windows[start + slot], None, prepare=prepare)
-        except SampleError:
+        except SampleError as error:
             if data.on_bad_sample == "error":
                 raise
+            if len(skipped) < NAMED:
+                skipped.append(str(error))
             is_good[slot] = False
         return 0
 

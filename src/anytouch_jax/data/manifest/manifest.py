@@ -10,7 +10,7 @@ import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +30,7 @@ from anytouch_jax.data.manifest.schema import (
     SPLITS,
     ManifestError,
     clean_text,
+    csv_place,
     is_text,
     listed,
     load_table,
@@ -474,11 +475,14 @@ def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, st
             fault = "twice the" if name in names else "no"
             raise UserError(f"{path} has {fault} column {name!r}; it has {listed(names)}")
     keys, texts = _text_of(table[key], f"{path}: {key!r}"), _text_of(table[text], f"{path}: {text!r}")
+    place = partial(csv_place, path) if suffix == ".csv" else f"{path}, row {{}}".format
     captions: dict[str, str] = {}
     for row, (name, caption) in enumerate(zip(keys.to_pylist(), texts.to_pylist(), strict=True)):
         caption = " ".join((caption or "").split())
+        if name is None and caption:
+            raise UserError(f"{place(row)}: a caption without {key}; fill it in")
         if name is not None and caption and captions.setdefault(name, caption) != caption:
-            raise UserError(f"{path}, row {row}: {key} {shown(name)} has another caption in an earlier row; keep one")
+            raise UserError(f"{place(row)}: {key} {shown(name)} has another caption in an earlier row; keep one")
     return captions, key
 
 

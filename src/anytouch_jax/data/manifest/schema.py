@@ -8,7 +8,9 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,8 @@ SPLITS = ("train", "val", "test", "background", "unused")
 REQUIRED = ("path", "sensor", "sequence", "frame_index", "split")
 PATHS = ("path", "image_path", "image2_path", "background_path", "field_path")
 
-EMPTY = ("", "na", "n/a", "nan", "none", "null", "-", "?")  # spellings of an unknown value, in small letters
+# Spellings of an unknown value, in small letters. Spreadsheets write #N/A, and pandas <NA>.
+EMPTY = ("", "na", "n/a", "n.a.", "#n/a", "<na>", "nan", "none", "null", "nil", "-", "--", "?")
 
 MAX_ROWS = 20_000_000  # of a manifest file
 MAX_TEXT = 10_000  # bytes of a text cell in the columns that are used
@@ -55,7 +58,7 @@ def is_manifest(path: Path) -> bool:
         names = pa.parquet.read_schema(path).names if path.suffix.lower() == ".parquet" else _csv_names(path)
     except (pa.ArrowException, UnicodeDecodeError, csv.Error):
         return False
-    return set(REQUIRED) <= set(names)
+    return set(REQUIRED) <= {name.strip() for name in names}
 
 
 def table_suffix(path: Path, name: str = "a manifest") -> str:
@@ -81,10 +84,10 @@ def load_table(path: Path) -> pa.Table:
     for name, column in columns.items():
         if name.startswith("label."):
             columns[name] = typed_label(column)
-            check_label(name, columns[name], lambda row: f"{path}, row {row}")
+            check_label(name, columns[name], partial(csv_place, path))
         elif name in (*_NAMES, "sensor", "split"):
             columns[name] = clean_text(column)
-    return typed(pa.table(columns), str(path))
+    return typed(pa.table(columns), str(path), partial(csv_place, path))
 
 
 def shown(value: object) -> str:
@@ -114,15 +117,44 @@ def reading(path: Path) -> Iterator[None]:
 def read_text_csv(path: Path) -> pa.Table:
     """Return a CSV file as a table of text columns, where an empty cell is null. Raises ManifestError."""
     with reading(path):
-        types = dict.fromkeys(_csv_names(path), _TEXT)
+        names = _csv_names(path)
+        types = dict.fromkeys(names, _TEXT)
         convert = pa.csv.ConvertOptions(column_types=types, strings_can_be_null=True, null_values=[""])
         parse = pa.csv.ParseOptions(newlines_in_values=True)
-        return pa.csv.read_csv(path, convert_options=convert, parse_options=parse)
+        try:
+            table = pa.csv.read_csv(path, convert_options=convert, parse_options=parse)
+            return table.rename_columns([name.strip() for name in table.column_names])
+        except pa.ArrowInvalid:
+            odd = ((line, cells) for line, cells in _csv_lines(path) if len(cells) != len(names))
+            line, cells = next(odd, (0, []))
+            if not line:
+                raise
+    raise ManifestError(
+        f"{path}, line {line}: {len(cells)} cells for {len(names)} columns, in {shown(','.join(cells))}; quote cells "
+        "with commas, and close each quote"
+    )
 
 
 def _csv_names(path: Path) -> list[str]:
+    return next(_csv_lines(path), (0, list[str]()))[1]
+
+
+def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the first line, from 1, and the cells of the rows of a CSV file. Blank lines are left out."""
     with path.open(encoding="utf-8-sig", newline="") as file:
-        return next(csv.reader(file), [])
+        line, rows = 1, csv.reader(file)
+        for cells in rows:
+            if cells:
+                yield line, cells
+            line = rows.line_num + 1
+
+
+def csv_place(path: Path, row: int) -> str:
+    """Return "m.csv, line 5, row 3" for errors, with the line as an editor counts it."""
+    line = ""
+    with suppress(OSError, UnicodeDecodeError, csv.Error), closing(_csv_lines(path)) as lines:
+        line = f", line {next(islice(lines, row + 1, None))[0]}"
+    return f"{path}{line}, row {row}"
 
 
 def _load_parquet(path: Path) -> pa.Table:
@@ -164,15 +196,17 @@ def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.A
     return names, blocks
 
 
-def typed(table: pa.Table, where: str) -> pa.Table:
+def typed(table: pa.Table, where: str, place: Callable[[int], str] | None = None) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
-    Columns outside SCHEMA stay unchanged. `where` names the file in errors. Raises ManifestError for a missing column
-    or value, a wrong type, an unknown split, and a stride below 1. So it does for text that is not UTF-8 or longer than
-    MAX_TEXT, and for a table without rows or with more than MAX_ROWS.
+    Columns outside SCHEMA stay unchanged. `where` names the file in errors, and `place` a row of it. Raises
+    ManifestError for a missing column or value, a wrong type, an unknown split, and a stride below 1. So it does for
+    text that is not UTF-8 or longer than MAX_TEXT, and for a table without rows or with more than MAX_ROWS.
     """
     _check_names(table.column_names, table.num_rows, where)
-    return pa.table({name: _checked(name, table[name], where) for name in table.column_names}).combine_chunks()
+    return pa.table(
+        {name: _checked(name, table[name], where, 0, place) for name in table.column_names}
+    ).combine_chunks()
 
 
 def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -245,16 +279,19 @@ def is_text(kind: pa.DataType) -> bool:
     return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
-def _checked(name: str, column: pa.ChunkedArray, where: str, first: int = 0) -> pa.ChunkedArray:
+def _checked(
+    name: str, column: pa.ChunkedArray, where: str, first: int = 0, place: Callable[[int], str] | None = None
+) -> pa.ChunkedArray:
     """Return a column with its type in SCHEMA, every value checked. Raises ManifestError, which names the row.
 
-    `first` is the number of its first row.
+    `first` is the number of its first row, and `place` names a row in errors.
     """
+    place = place or (lambda row: f"{where}, row {first + row}")
 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
         row = pc.index(bad, True).as_py()
         if row >= 0:
-            raise ManifestError(f"{where}, row {first + row}: column {shown(name)} {problem(row)}")
+            raise ManifestError(f"{place(row)}: column {shown(name)} {problem(row)}")
 
     for cast, kind in ((_plain, "UTF-8 text"), _CASTS[SCHEMA.get(name)]):
         try:
@@ -262,7 +299,7 @@ def _checked(name: str, column: pa.ChunkedArray, where: str, first: int = 0) -> 
         except pa.ArrowInvalid:
             row = _first_invalid(column, cast)
             value = "" if cast is _plain else f", is {shown(column[row].as_py())}"
-            raise ManifestError(f"{where}, row {first + row}: column {shown(name)} must be {kind}{value}") from None
+            raise ManifestError(f"{place(row)}: column {shown(name)} must be {kind}{value}") from None
         except pa.ArrowTypeError:
             raise ManifestError(f"{where}: column {name!r} must be {kind}, is {column.type}") from None
     if name in REQUIRED:

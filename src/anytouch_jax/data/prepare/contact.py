@@ -2,8 +2,8 @@
 
 The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched gel. Other changes
 are removed first. Marker dots, which shear moves, are closed in both images if the untouched gel has them. A change of
-exposure or tint is subtracted as the median of each colour. Noise is blurred. Lengths are in pixels of an image scaled
-to 160 on its long side, so thresholds do not depend on the camera's resolution.
+exposure, tint or light is subtracted as a plane for each colour. Noise is blurred. Lengths are in pixels of an image
+scaled to 160 on its long side, so thresholds do not depend on the camera's resolution.
 
 The untouched gel of a row is its `background_path`, the rows of split `background` of its unit (or else sequence), or a
 picture that the user names. Otherwise it is estimated from the frames of its recording, and compared with the estimates
@@ -30,6 +30,7 @@ import pyarrow.compute as pc
 from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_column, select_rows
 from anytouch_jax.data.manifest.schema import shown
+from anytouch_jax.data.prepare.scan import EXAMPLES
 from anytouch_jax.data.prepare.untouched_gel import (
     ALIKE,
     EDGE,
@@ -42,7 +43,9 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
 _MAX_FRAMES, _MAX_RECORDINGS = 48, 48  # of a recording, and of a unit, from which the untouched gel is estimated
+_MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
 _Scored = tuple[int, float, str]  # row, score, reason
+_Pictures = Callable[[np.ndarray], list[np.ndarray]]  # some frames of rows
 
 # Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without dots), gelslim and
 # gelsight. The one of 9dtact is below its one light press. The default of the other sensors is untested.
@@ -59,7 +62,8 @@ class ContactScores:
     """Scores f32 (rows,), NaN if unknown. `reasons` (rows,) names the source of the background, or why it failed.
 
     `recordings` have no background picture, and for `decided` of them the untouched gel was estimated. `gels` holds
-    the rows without a background picture whose untouched gel was given otherwise or estimated.
+    the rows without a background picture whose untouched gel was given otherwise or estimated. `faults` holds a
+    sentence for each of the first rows whose pictures cannot be used.
     """
 
     score: np.ndarray
@@ -67,6 +71,7 @@ class ContactScores:
     recordings: int = 0
     decided: int = 0
     gels: tuple[tuple[np.ndarray, UntouchedGel], ...] = ()
+    faults: tuple[str, ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -95,6 +100,9 @@ class ContactReport:
             f"unknown {self.unknown:,}; dropped {self.dropped:,}",
             "background: " + ", ".join(f"{reason} {count:,}" for reason, count in self.scores.counts.items()),
         ]
+        if faults := self.scores.faults:
+            more = ["  (and more: `anytouch data verify` names them)"] * (len(faults) > EXAMPLES)
+            lines += ["pictures that cannot be used:", *(f"  {fault}" for fault in faults[:EXAMPLES]), *more]
         if all_of := self.scores.recordings:
             decided = self.scores.decided
             lines += [f"untouched gel estimated for {decided:,} of {all_of:,} recordings ({decided / all_of:.0%})"]
@@ -161,7 +169,9 @@ def contact_scores(
     has_background = manifest.present("background_path")[rows]
     recordings = decided = 0
     gels: list[tuple[np.ndarray, UntouchedGel]] = []
+    faults: dict[int, str] = {}
     with ThreadPoolExecutor(workers) as pool:
+        pictures = partial(_pictures, manifest, pool, faults)
 
         def assign(score_row: Callable[[int], _Scored], some: np.ndarray) -> None:
             for start in range(0, len(some), 1024):  # millions of rows must not wait in memory
@@ -169,23 +179,24 @@ def contact_scores(
                     score[row], reasons[row] = value, reason
 
         cached = lru_cache(256)(lambda path: UntouchedGel(decode(path)))
-        assign(partial(_score_row, manifest, lambda row: cached(manifest.file(row, "background_path")), "given"),
-               rows[has_background])  # fmt: skip
+        score_given = partial(_score_row, manifest, faults, lambda row: cached(manifest.file(row, "background_path")))
+        assign(partial(score_given, "given"), rows[has_background])
         for group in _groups(manifest, rows[~has_background]):
-            gel, source = _gel_of_group(manifest, group, pool, backgrounds or {})
+            gel, source = _gel_of_group(manifest, group, pictures, backgrounds or {})
             if gel is not None:
                 gels.append((group, gel))
-                assign(partial(_score_row, manifest, gel, source), group)
+                assign(partial(_score_row, manifest, faults, gel, source), group)
                 continue
-            for recording, gel, source in _estimates(manifest, group, pool):
+            for recording, gel, source in _estimates(manifest, group, pictures):
                 recordings += 1
                 decided += gel is not None
                 if gel is None:
                     reasons[recording] = f"none: {source}"
                 else:
                     gels.append((recording, gel))
-                    assign(partial(_score_row, manifest, gel, source), recording)
-    return ContactScores(score, reasons, recordings, decided, tuple(gels))
+                    assign(partial(_score_row, manifest, faults, gel, source), recording)
+    sentences = tuple(f"{manifest.where(row)}: {faults[row]}" for row in sorted(faults)[: EXAMPLES + 1])
+    return ContactScores(score, reasons, recordings, decided, tuple(gels), sentences)
 
 
 def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -> Manifest:
@@ -222,7 +233,7 @@ def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, Unto
             kind = f"of unit {unit} " if unit else ""
             raise UserError(f"--background {word}: the manifest has no row {kind}without a background picture")
         for row in rows[np.unique(sensors[rows], return_index=True)[1]]:
-            picture = _load_or_none(manifest, row)
+            picture = _load_or_none(manifest, {}, row)
             try:
                 if picture is not None:
                     gel.score(picture)
@@ -234,14 +245,21 @@ def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, Unto
     return gels
 
 
-def _score_row(manifest: Manifest, gel: UntouchedGel | Callable[[int], UntouchedGel], source: str, row: int) -> _Scored:
+def _score_row(
+    manifest: Manifest,
+    faults: dict[int, str],
+    gel: UntouchedGel | Callable[[int], UntouchedGel],
+    source: str,
+    row: int,
+) -> _Scored:
     try:
         frame = decode(manifest.file(row))
         return row, (gel if isinstance(gel, UntouchedGel) else gel(row)).score(frame), source
-    except UserError:
-        return row, np.nan, "none: the frame or its background cannot be read"
-    except ValueError as error:
-        return row, np.nan, f"none: {error}"
+    except (UserError, ValueError) as error:
+        is_read = not isinstance(error, UserError)
+        if len(faults) < _MAX_FAULTS:
+            faults[row] = f"{shown(manifest.value(row, 'path'))}: {error}" if is_read else str(error)
+        return row, np.nan, f"none: {error if is_read else 'the frame or its background cannot be read'}"
 
 
 def _groups(manifest: Manifest, rows: np.ndarray) -> list[np.ndarray]:
@@ -253,19 +271,18 @@ def _groups(manifest: Manifest, rows: np.ndarray) -> list[np.ndarray]:
 
 
 def _gel_of_group(
-    manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor, backgrounds: Mapping[str, UntouchedGel]
+    manifest: Manifest, group: np.ndarray, pictures: _Pictures, backgrounds: Mapping[str, UntouchedGel]
 ) -> tuple[UntouchedGel | None, str]:
     """Return the untouched gel by rows of the split `background`, or else by `backgrounds`."""
     free = group[np.asarray(pc.equal(manifest.table["split"].take(group), "background"))]
-    pictures = _pictures(manifest, free, pool)
-    if pictures:
-        return UntouchedGel(np.median(pictures, axis=0).astype(np.uint8)), "rows of split background"
+    if frames := pictures(free):
+        return UntouchedGel(np.median(frames, axis=0).astype(np.uint8)), "rows of split background"
     unit = manifest.column("unit")[int(group[0])].as_py()
     return backgrounds.get(unit or "", backgrounds.get("")), "--background"
 
 
 def _estimates(
-    manifest: Manifest, group: np.ndarray, pool: ThreadPoolExecutor
+    manifest: Manifest, group: np.ndarray, pictures: _Pictures
 ) -> Iterator[tuple[np.ndarray, UntouchedGel | None, str]]:
     """Yield the rows, untouched gel and reason of each recording of a group.
 
@@ -273,8 +290,8 @@ def _estimates(
     """
 
     def estimate(rows: np.ndarray) -> tuple[UntouchedGel | None, str, tuple[int, ...]]:
-        pictures = _pictures(manifest, rows, pool)
-        return *estimate_untouched_gel(pictures), pictures[0].shape if pictures else ()
+        frames = pictures(rows)
+        return *estimate_untouched_gel(frames), frames[0].shape if frames else ()
 
     sequence = manifest.codes("sequence", own=True)[group]
     _, number, frames = np.unique(sequence, return_inverse=True, return_counts=True)
@@ -297,18 +314,22 @@ def _estimates(
             yield recording, gel, reason
 
 
-def _pictures(manifest: Manifest, rows: np.ndarray, pool: ThreadPoolExecutor) -> list[np.ndarray]:
+def _pictures(
+    manifest: Manifest, pool: ThreadPoolExecutor, faults: dict[int, str], rows: np.ndarray
+) -> list[np.ndarray]:
     """Return at most _MAX_FRAMES evenly spaced frames from `scale_picture`, those of the most common shape."""
-    loaded = pool.map(partial(_load_or_none, manifest), spread(rows, _MAX_FRAMES).tolist())
+    loaded = pool.map(partial(_load_or_none, manifest, faults), spread(rows, _MAX_FRAMES).tolist())
     pictures = [picture for picture in loaded if picture is not None and min(picture.shape[:2]) > 2 * EDGE + 2]
     shapes = Counter(picture.shape for picture in pictures)
     return [picture for picture in pictures if picture.shape == shapes.most_common(1)[0][0]]
 
 
-def _load_or_none(manifest: Manifest, row: int) -> np.ndarray | None:
+def _load_or_none(manifest: Manifest, faults: dict[int, str], row: int) -> np.ndarray | None:
     try:
         return scale_picture(decode(manifest.file(row)))
-    except UserError:
+    except UserError as error:
+        if len(faults) < _MAX_FAULTS:
+            faults[row] = str(error)
         return None
 
 

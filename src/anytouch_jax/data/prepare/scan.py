@@ -63,7 +63,7 @@ Level = Literal["error", "warning", "info"]
 
 
 class Finding(NamedTuple):
-    """One kind of fault: the row ids i64 that it concerns, and sentences about the first few."""
+    """One kind of fault: the row ids i64 that it concerns, sentences about the first few, and the first files."""
 
     kind: str
     level: Level
@@ -71,6 +71,7 @@ class Finding(NamedTuple):
     rows: np.ndarray
     examples: tuple[str, ...] = ()
     column: str | None = None
+    files: tuple[str, ...] = ()
 
 
 def finding(

@@ -17,6 +17,7 @@ import numpy as np
 LONG_SIDE = 160  # pixels of the long side on which all lengths below are measured
 DOT, DOT_DEPTH, FEWEST_DOTS = 13, 12, 20  # widest marker dot, its darkness in grey levels, dots that a marked gel shows
 BLUR, EDGE, PERCENTILE = 1.5, 4, 98  # of the difference image: blur, cut edge, score
+FIT = 20  # cells of a side of the difference image, to which a change of light is fitted
 WIDE = 8  # blur of the gel's slow changes of light
 ALIKE, DIFFERENT = 3.0, 6.5  # grey levels: frames of one state, and frames of two
 MARGIN = 0.1  # least excess of structure, as a share of the sum; measured on real and simulated recordings
@@ -45,11 +46,30 @@ def has_dots(picture: np.ndarray) -> bool:
 
 
 def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BLUR) -> np.ndarray:
-    """Return the colour difference f32 (h, w) of two pictures u8 (h, w, 3), without overall tint and noise."""
+    """Return the colour difference f32 (h, w) of two pictures u8 (h, w, 3), without light, tint and noise."""
     change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
-    change -= np.median(change[::2, ::2], axis=(0, 1))  # every other pixel is enough for a median
+    change -= _light(change)
     red, green, blue = cv2.split(np.abs(cv2.GaussianBlur(change, (0, 0), blur)))
     return cv2.max(cv2.max(red, green), blue)
+
+
+def _light(change: np.ndarray) -> np.ndarray:
+    """Return the change of light f32 (h, w, 3): for each colour a plane that fits most of the picture.
+
+    Each lamp of a sensor drifts by itself, which brightens one side. A press covers the smaller part of a picture.
+    """
+    small = cv2.resize(change, (FIT, FIT), interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    at = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
+    terms = np.stack([np.ones(FIT * FIT, np.float32), np.tile(at, FIT), np.repeat(at, FIT)], 1)
+    fits = np.ones(len(small), bool)
+    for _ in range(3):
+        chosen = terms[fits]
+        plane = np.linalg.solve(chosen.T @ chosen, chosen.T @ small[fits])
+        away = np.abs(small - terms @ plane).max(1)
+        fits = away <= np.quantile(away, 0.6)
+    height, width = change.shape[:2]
+    y, x = ((np.arange(size, dtype=np.float32) + 0.5) / size - 0.5 for size in (height, width))
+    return np.asarray(plane[0] + y[:, None, None] * plane[2] + x[:, None] * plane[1], np.float32)
 
 
 class UntouchedGel:

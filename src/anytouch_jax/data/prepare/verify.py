@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from anytouch_jax.data.prepare.licences import NO, YES, Licence, commercial_use,
 from anytouch_jax.data.prepare.scan import EXAMPLES, OK, STATES, Finding, Level, Scan, finding, scan
 
 _SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
-_JSON_ROWS = 1000  # row numbers of a finding that are written to JSON
+_LISTED = 1000  # rows of a finding that are written to JSON
 _FRAME = ("dataset", "sensor", "unit", "sequence", "frame_index", "split")
 _LEARNING = SPLITS[:3]  # the splits that must not share anything: train, val, test
 _MIN_PAIRS = 8  # different pairs of images that are needed for an opinion on swapped folders
@@ -53,12 +54,12 @@ class VerifyReport:
         return not any(finding.level == "error" for finding in self.findings)
 
     def to_json(self) -> str:
-        """Return the report as JSON, with the first thousand row numbers of each finding."""
+        """Return the report as JSON, with the row numbers and files of the first thousand rows of each finding."""
         names = ("rows", "files", "decoded", "ok", "content_hash", "split_hash", "splits", "shares")
         report: dict[str, Any] = {name: getattr(self, name) for name in names}
         report["licences"] = [licence._asdict() for licence in self.licences]
         report["findings"] = [
-            one._asdict() | {"count": len(one.rows), "rows": one.rows[:_JSON_ROWS].tolist()} for one in self.findings
+            one._asdict() | {"count": len(one.rows), "rows": one.rows[:_LISTED].tolist()} for one in self.findings
         ]
         return json.dumps(report, indent=1, ensure_ascii=False) + "\n"
 
@@ -72,6 +73,7 @@ class VerifyReport:
         ]  # fmt: skip
         for one in self.findings:
             lines += [f"* **{one.level}** `{one.kind}`: {one.sentence}", *(f"  * {text}" for text in one.examples)]
+            lines += ["  * and more: `--out` names the files"] * (0 < len(one.examples) < len(one.files))
         lines += ["" if self.findings else "No fault was found.\n"]
         lines += _table("dataset", *_SHARES)
         for name, share in self.shares.items():
@@ -116,7 +118,7 @@ def verify(
         rows=len(manifest),
         files=len(scanned.files),
         decoded=decode,
-        findings=tuple(sorted(findings, key=lambda finding: levels.index(finding.level))),
+        findings=tuple(sorted(map(partial(_with_files, manifest), findings), key=lambda one: levels.index(one.level))),
         licences=licences(manifest),
         shares=_shares(manifest),
         splits={name: counts[name] for name in SPLITS if name in counts},
@@ -124,6 +126,12 @@ def verify(
         content_hash=manifest.content_hash,
         scan=scanned,
     )
+
+
+def _with_files(manifest: Manifest, one: Finding) -> Finding:
+    """Return a finding with the files of its first rows, if it is about a column of files."""
+    rows = one.rows[:_LISTED] if one.column in manifest.table.column_names and one.column.endswith("path") else ()
+    return one._replace(files=tuple(manifest.value(row, one.column) for row in rows))
 
 
 def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding]:

@@ -206,7 +206,7 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
         raise DatasetError(f"{path} has the column {repeated[0]!r} twice")
     lines: dict[tuple[str | None, str | None], dict[str, str]] = {}
     for line, row in rows[1:]:
-        if any(row[len(names) :]):
+        if len(row) < len(names) or any(row[len(names) :]):
             raise DatasetError(f"{path}, line {line}: {len(row)} cells for {len(names)} columns; quote its commas")
         cells = dict(zip(names, row, strict=False))
         key = (_plain(cells.pop("object", None)), _plain((cells.pop("sequence", "") or "").replace("\\", "/")))

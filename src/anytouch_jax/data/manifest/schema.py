@@ -6,7 +6,7 @@ import csv
 import difflib
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from functools import partial
@@ -139,7 +139,7 @@ def _csv_names(path: Path) -> list[str]:
     return next(_csv_lines(path), (0, list[str]()))[1]
 
 
-def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+def _csv_lines(path: Path) -> Generator[tuple[int, list[str]]]:
     """Yield the number of the first line, from 1, and the cells of the rows of a CSV file. Blank lines are left out."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         line, rows = 1, csv.reader(file)

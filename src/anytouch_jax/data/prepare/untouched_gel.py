@@ -17,9 +17,11 @@ import numpy as np
 LONG_SIDE = 160  # pixels of the long side on which all lengths below are measured
 DOT, DOT_DEPTH, FEWEST_DOTS = 13, 12, 20  # widest marker dot, its darkness in grey levels, dots that a marked gel shows
 BLUR, EDGE, PERCENTILE = 1.5, 4, 98  # of the difference image: blur, cut edge, score
-FIT = 20  # cells of a side of the difference image, to which a change of light is fitted
+FIT = 12  # cells of a side of the difference image, to which a change of light is fitted
 WIDE = 8  # blur of the gel's slow changes of light
 ALIKE, DIFFERENT = 3.0, 6.5  # grey levels: frames of one state, and frames of two
+_AT = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
+_TERMS = np.stack([np.ones(FIT * FIT, np.float32), np.tile(_AT, FIT), np.repeat(_AT, FIT)], 1)  # of a plane, by cell
 MARGIN = 0.1  # least excess of structure, as a share of the sum; measured on real and simulated recordings
 
 
@@ -59,17 +61,14 @@ def _light(change: np.ndarray) -> np.ndarray:
     Each lamp of a sensor drifts by itself, which brightens one side. A press covers the smaller part of a picture.
     """
     small = cv2.resize(change, (FIT, FIT), interpolation=cv2.INTER_AREA).reshape(-1, 3)
-    at = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
-    terms = np.stack([np.ones(FIT * FIT, np.float32), np.tile(at, FIT), np.repeat(at, FIT)], 1)
-    fits = np.ones(len(small), bool)
+    most, fits = int(0.6 * len(small)), np.arange(len(small))
     for _ in range(3):
-        chosen = terms[fits]
+        chosen = _TERMS[fits]
         plane = np.linalg.solve(chosen.T @ chosen, chosen.T @ small[fits])
-        away = np.abs(small - terms @ plane).max(1)
-        fits = away <= np.quantile(away, 0.6)
+        fits = np.argpartition(np.abs(small - _TERMS @ plane).max(1), most)[:most]
     height, width = change.shape[:2]
-    y, x = ((np.arange(size, dtype=np.float32) + 0.5) / size - 0.5 for size in (height, width))
-    return np.asarray(plane[0] + y[:, None, None] * plane[2] + x[:, None] * plane[1], np.float32)
+    y, x = (((np.arange(size, dtype=np.float32) + 0.5) / size - 0.5)[:, None] for size in (height, width))
+    return np.asarray((plane[0] + y * plane[2])[:, None] + x * plane[1], np.float32)
 
 
 class UntouchedGel:

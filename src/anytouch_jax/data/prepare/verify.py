@@ -130,8 +130,9 @@ def verify(
 
 def _with_files(manifest: Manifest, one: Finding) -> Finding:
     """Return a finding with the files of its first rows, if it is about a column of files."""
-    rows = one.rows[:_LISTED] if one.column in manifest.table.column_names and one.column.endswith("path") else ()
-    return one._replace(files=tuple(manifest.value(row, one.column) for row in rows))
+    column = one.column or ""
+    rows = one.rows[:_LISTED] if column.endswith("path") and column in manifest.table.column_names else ()
+    return one._replace(files=tuple(manifest.value(row, column) for row in rows))
 
 
 def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding]:

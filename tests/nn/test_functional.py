@@ -20,10 +20,10 @@ def test_abstract_has_the_shapes_of_init_and_allocates_nothing():
 
 def test_parameters_have_the_floats_of_the_context_whatever_was_built_before():
     net = build(touch_model(embed=5))
-    for wide, expected in ((True, np.float64), (False, np.float32), (True, np.float64)):
+    for wide, expected in ((True, "float64"), (False, "float32"), (True, "float64")):
         with jax.enable_x64(wide):
             params = net.init(jax.random.key(0))
-        assert {leaf.dtype for leaf in jax.tree.leaves((params, net.abstract() if not wide else params))} == {expected}
+        assert {str(leaf.dtype) for leaf in jax.tree.leaves(params)} == {expected}
 
 
 def test_first_values():

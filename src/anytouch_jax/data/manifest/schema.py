@@ -83,8 +83,7 @@ def load_table(path: Path) -> pa.Table:
     columns = dict(zip(table.column_names, table.columns, strict=True))
     for name, column in columns.items():
         if name.startswith("label."):
-            columns[name] = typed_label(column)
-            check_label(name, columns[name], partial(csv_place, path))
+            columns[name] = typed_label(column, name, partial(csv_place, path))
         elif name in (*_NAMES, "sensor", "split"):
             columns[name] = clean_text(column)
     return typed(pa.table(columns), str(path), partial(csv_place, path))
@@ -209,16 +208,19 @@ def typed(table: pa.Table, where: str, place: Callable[[int], str] | None = None
     ).combine_chunks()
 
 
-def typed_label(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a text column as numbers or truth values if all cells are; 007 stays text, because its zeros matter."""
+def typed_label(column: pa.ChunkedArray, name: str = "", where: Callable[[int], str] | None = None) -> pa.ChunkedArray:
+    """Return a text column as numbers or truth values if all cells are; 007 stays text, because its zeros matter.
+
+    With `where`, which names a row, raises ManifestError if the column `name` has a class in two spellings, or a text
+    among nine times as many numbers.
+    """
     column = clean_text(column)
-    if pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py():
-        return column
-    for kind in (_WHOLE, pa.float64(), pa.bool_()):
-        try:
+    kinds = (_WHOLE, pa.float64(), pa.bool_())
+    for kind in () if pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py() else kinds:
+        with suppress(pa.ArrowInvalid):
             return _decimal(column).cast(kind)
-        except pa.ArrowInvalid:
-            continue
+    if where is not None:
+        _check_label(name, column, where)
     return column
 
 
@@ -237,13 +239,7 @@ def spellings(values: Iterable[str]) -> list[list[str]]:
     return [group for group in groups.values() if len(group) > 1]
 
 
-def check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]) -> None:
-    """Raise ManifestError if a label column has a class in two spellings, or a text among nine times as many numbers.
-
-    `where` names a row of the column.
-    """
-    if not pa.types.is_string(column.type):
-        return
+def _check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]) -> None:
     for first, other, *_ in spellings(column.unique().drop_null().to_pylist()):
         places = [where(pc.index(column, text).as_py()) for text in (other, first)]
         raise ManifestError(

@@ -24,7 +24,7 @@ import pyarrow as pa
 
 from anytouch_jax.data import images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
-from anytouch_jax.data.manifest.schema import EMPTY, check_label, typed_label
+from anytouch_jax.data.manifest.schema import EMPTY, typed_label
 from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
@@ -218,8 +218,8 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
             )
         lines[key] = {name: cell for name, cell in cells.items() if name}
     for name in (name for name in names if name not in (*LABEL_KEYS, *PLAIN_COLUMNS, "")):
-        column = typed_label(pa.chunked_array([pa.array([cells.get(name) for cells in lines.values()], pa.string())]))
-        check_label(name, column, lambda row: f"{path}, line {rows[row + 1][0]}")
+        column = pa.chunked_array([pa.array([cells.get(name) for cells in lines.values()], pa.string())])
+        typed_label(column, name, lambda row: f"{path}, line {rows[row + 1][0]}")
     return [name for name in names if name], lines
 
 

@@ -519,7 +519,7 @@ def test_a_full_disk_ends_a_run_before_its_first_step(tmp_path, monkeypatch):
     usage = checkpoint.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: usage._replace(free=400))
     for folder in ("new", "run"):
-        with pytest.raises(UserError, match=r"the disk is full, [\d,]+ bytes are needed and 400 are free"):
+        with pytest.raises(UserError, match=r"the disk is full. It needs [\d,]+ bytes and has 400\."):
             run(tmp_path / folder, batches=no_batches)
     monkeypatch.undo()
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["00000002"]

@@ -56,8 +56,9 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
             order = {"do": "record", "object": name}
             assert page.post("/api/0/control", json=order, headers=PAGE).status_code == 200
             assert page.post("/api/0/control", json=order, headers=PAGE).status_code == 400  # it is on
-            until(lambda about: about["recording"]["written"] >= 3)
+            until(lambda about: about["recording"]["on"] and about["recording"]["written"] >= 3)
             assert page.post("/api/0/control", json={"do": "stop"}, headers=PAGE).status_code == 200
+            until(lambda about: not about["recording"]["on"])  # packets under way are of the recording before
         orient = {"do": "orient", "rotate": 90, "flip": "across"}
         assert page.post("/api/0/control", json=orient, headers=PAGE).status_code == 200
         assert until(lambda about: about["contact"] is None)  # another orientation, another background

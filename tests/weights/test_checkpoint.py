@@ -400,7 +400,7 @@ def test_a_disk_without_space_is_refused_before_anything_is_written(tmp_path, mo
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: usage._replace(free=100))
     saving = jax.eval_shape(lambda: state_of(2))
     for attempt in (lambda: saver.check_space(saving), lambda: saver.save(2, state_of(2), {})):
-        with pytest.raises(CheckpointError, match=r"the disk is full, [\d,]+ bytes are needed and 100 are free"):
+        with pytest.raises(CheckpointError, match=r"the disk is full. It needs [\d,]+ bytes and has 100\."):
             attempt()
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: usage._replace(total=0, free=0))
     saver.check_space(saving)  # a disk that does not know its size

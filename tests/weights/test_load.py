@@ -414,6 +414,14 @@ def test_weights_that_are_not_finite_are_refused_by_name(tmp_path, form, value):
         load_model(path)
 
 
+def test_an_array_of_the_release_that_nobody_reads_is_finite_too(tmp_path):
+    weights = weights_of(STAGE1)
+    weights["touch_model.embeddings.patch_embedding.weight"].flat[0] = np.inf
+    write_safetensors(tmp_path / "w.safetensors", weights, {MODEL_KEY: to_json(STAGE1)})
+    with pytest.raises(UserError, match="patch_embedding.weight has values that are not finite"):
+        load_model(tmp_path / "w.safetensors")
+
+
 @pytest.mark.parametrize("name", ["w.pth", "w.safetensors", "w.npz"])
 def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
     texts = {"a web page": "\n<!DOCTYPE html><html>", "a Git LFS pointer": "version https://git-lfs.github.com/spec/v1"}

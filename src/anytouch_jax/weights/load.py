@@ -106,6 +106,7 @@ def load_model(
         trained, drawn, from_run = trained_sensors(file_metadata, model), True, False
         metadata = dict(file_metadata)
     check_finite(path, flatten(params))
+    check_finite(path, weights or {})  # an array that nobody reads shows a damaged file, too
     if trained is not None and "touch" in params and (from_run or not stored_rows):
         params |= {"touch": serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
     return Loaded(path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run)

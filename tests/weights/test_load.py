@@ -418,7 +418,7 @@ def test_an_array_of_the_release_that_nobody_reads_is_finite_too(tmp_path):
     weights = weights_of(STAGE1)
     weights["touch_model.embeddings.patch_embedding.weight"].flat[0] = np.inf
     write_safetensors(tmp_path / "w.safetensors", weights, {MODEL_KEY: to_json(STAGE1)})
-    with pytest.raises(UserError, match="patch_embedding.weight has values that are not finite"):
+    with pytest.raises(UserError, match=r"patch_embedding\.weight has values that are not finite"):
         load_model(tmp_path / "w.safetensors")
 
 

@@ -111,10 +111,10 @@ def cold() -> Iterator[None]:
 def traced_as(variant: Variant) -> Iterator[None]:
     """Trace with a variant's activation and precision of products."""
     gelu = partial(jax.nn.gelu, approximate=False) if variant.activation == "jax" else layers.gelu
-    functional._skeleton.cache_clear()  # it keeps modules, and they their activation
+    functional._cached_skeleton.cache_clear()  # it keeps modules, and they their activation
     with mock.patch.object(layers, "gelu", gelu), jax.default_matmul_precision(variant.precision):
         yield
-    functional._skeleton.cache_clear()
+    functional._cached_skeleton.cache_clear()
 
 
 def compiled(variant: Variant, work: Workload, state: Tree) -> Program:

@@ -339,7 +339,7 @@ def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
     with pytest.raises(UserError, match="background_path"):  # however it was trained
         embed_rows(blind, manifests.select_rows(manifest, np.array([0])), np.array([0]))
     with pytest.raises(UserError, match=r"none of the 2 rows can be read"):
-        embed_rows(blind, manifest, np.array([0, 1]), on_bad_sample="skip")
+        embed_rows(blind, manifest, np.array([0, 1]), on_bad_sample="skip", log=lambda _: None)
 
 
 def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):

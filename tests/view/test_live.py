@@ -14,6 +14,7 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
+from anytouch_jax.view import live as live_module
 from anytouch_jax.view import server
 from anytouch_jax.view.live import Live, LiveRecorder
 from anytouch_jax.view.space import FeatureMap
@@ -70,6 +71,25 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
     for row in range(len(table)):
         assert decode(table.file(row)).shape == decode(table.file(row, "background_path")).shape == (48, 48, 3)
     assert sorted(path.name[0] for path in (tmp_path / "recorded").iterdir()) == ["2", "2", "m"]  # nothing hidden
+
+
+def test_frames_before_a_full_disk_are_kept(tmp_path, monkeypatch):
+    save, saved = live_module._save, []
+
+    def full(path, picture):
+        if len(saved) == 2:
+            raise OSError(28, "No space left on device")
+        saved.append(path)
+        save(path, picture)
+
+    monkeypatch.setattr(live_module, "_save", full)
+    recorder = LiveRecorder(tmp_path, "digit")
+    recorder.start("cup", "train", None)
+    for _ in range(60):
+        recorder.add(np.zeros((8, 8, 3), np.uint8))
+    recorder.stop()
+    assert "No space left" in recorder.state()["done"] and "first 2 frames" in recorder.state()["done"]
+    assert len(list(tmp_path.glob("*_cup/*.png"))) == 2 and not list(tmp_path.glob(".*"))
 
 
 def test_a_recording_that_fails_keeps_what_there_was(tmp_path):

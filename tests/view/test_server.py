@@ -220,7 +220,7 @@ def test_a_run_while_it_trains(tmp_path):
     rest = page.get(f"/api/0/losses?after={first['next']}").json()
     assert rest["lines"] == [{"step": 3, "loss": 1.0}]
     assert page.get(f"/api/0/losses?after={rest['next']}").json()["lines"] == []
-    assert page.get("/api/0/losses?after=999").json()["lines"][0]["step"] == 1  # a file that was begun anew
+    assert page.get("/api/0/losses?after=999").json()["lines"][0]["step"] == 1  # a file that was replaced
     assert picture(page.get("/api/0/figure/reconstruction_000001.png")).shape == (8, 8, 3)
     for name in ("secret.png", "..%2f..%2fsecret.png", "no.png"):
         assert page.get(f"/api/0/figure/{name}").status_code in (400, 404)

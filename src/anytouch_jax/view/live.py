@@ -133,16 +133,12 @@ class Live:
     def orient(self, rotate: int, flip: Flip) -> None:
         """Turn the frames clockwise by `rotate` degrees, then mirror them. The background is dropped."""
         self._rotate, self._flip = rotate, flip
-        self._set_background(None)
+        self.set_background(None)
 
     def capture_background(self) -> None:
         """Take the newest frame as the untouched gel."""
         if self._raw:
-            self._set_background(self._oriented(self._raw[-1][1]))
-
-    def drop_background(self) -> None:
-        """Go on without the picture of the untouched gel."""
-        self._set_background(None)
+            self.set_background(self._oriented(self._raw[-1][1]))
 
     def packets(self) -> Iterator[bytes]:
         """Yield each newest frame for one page: length u32, JSON, length u32, JPEG, little endian."""
@@ -154,7 +150,8 @@ class Live:
                 seen, packet = self._serial, self._packet
             yield packet
 
-    def _set_background(self, picture: Array | None) -> None:
+    def set_background(self, picture: Array | None) -> None:
+        """Take a picture RGB u8 (h, w, 3) as the untouched gel, or go on without one."""
         # Frames are turned before, so the encoder's preprocessing does not.
         self.background = picture
         self._gel = None if picture is None else (scale_down(picture), UntouchedGel(picture))
@@ -239,7 +236,8 @@ class Live:
 class LiveRecorder:
     """Writes frames of recordings into a folder, and after each recording its manifest.parquet.
 
-    An unfinished recording is in a hidden folder. The manifest has whole recordings only.
+    An unfinished recording is in a hidden folder. The manifest has whole recordings only. Frames of a recording that
+    fails stay in its folder.
     """
 
     def __init__(self, out: Path, sensor: str | None) -> None:
@@ -265,7 +263,7 @@ class LiveRecorder:
         names = (begun, *(f"{begun}_{number}" for number in range(2, 100)))
         target = next(self._out / each for each in names if not (self._out / each).exists())
         self._written, self._lost, self._done = 0, 0, ""
-        waiting: queue.Queue[Array | None] = queue.Queue(_WAITING)
+        waiting: queue.Queue[Array | None] = queue.Queue()
         self._thread = threading.Thread(target=self._write, args=(waiting, target, name, split, gel), daemon=True)
         self._thread.start()
         self._queue = waiting
@@ -273,11 +271,10 @@ class LiveRecorder:
     def add(self, picture: Array) -> None:
         """Store a frame if a recording is on."""
         waiting = self._queue
-        if waiting is not None:
-            try:
-                waiting.put_nowait(picture)
-            except queue.Full:
-                self._lost += 1
+        if waiting is not None and waiting.qsize() < _WAITING:
+            waiting.put(picture)
+        elif waiting is not None:
+            self._lost += 1
 
     def stop(self) -> None:
         """End the recording, and wait until it is on the disk."""
@@ -303,6 +300,9 @@ class LiveRecorder:
             self._done = f"{self._written} frames in {target}, rows in {self._out / 'manifest.parquet'}"
         except (OSError, UserError) as error:
             self._queue, self._done = None, f"The recording failed: {error}"
+            if self._written and part.exists():
+                part.rename(target)
+                self._done += f". Its first {self._written} frames are in {target}, without rows in a manifest."
         finally:
             shutil.rmtree(part, ignore_errors=True)
 

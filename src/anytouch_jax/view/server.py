@@ -244,7 +244,7 @@ def _control(live: Live, order: Any) -> None:
     elif action == "background":
         live.capture_background()
     elif action == "no background":
-        live.drop_background()
+        live.set_background(None)
     elif action == "record" and recorder is not None and isinstance(order.get("object", ""), str):
         recorder.start(order.get("object", ""), "train", live.background)
     elif action == "stop" and recorder is not None:

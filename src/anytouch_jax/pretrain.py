@@ -39,7 +39,7 @@ SCRATCH_VOCABULARY, TOKENIZER, CHECKPOINTS = 2048, "tokenizer.json", "checkpoint
 def pretrain(
     config: Config, run: str | Path, *, init: str | Path | None = None, clip: str | Path | None = None,
     stop_after: int | None = None, log: Log = print, mesh: Mesh | None = None,
-    curve: bool = False,
+    curve: bool = False, make_loader: Callable[..., Loader] = Loader,
 ) -> FitResult:  # fmt: skip
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
@@ -47,8 +47,8 @@ def pretrain(
     also of an encoder of photographs (see `load_start`).
     `clip` is CLIP weights for the towers. Stage 1 starts the touch encoder from their image tower, as the paper does.
     A resumed run reads neither. `mesh` is the devices to train on, all of them if None. `curve` shows the loss of all
-    steps on a terminal. Raises UserError for a mistake
-    in the settings, the data or the folder.
+    steps on a terminal. `make_loader` makes the loader. Raises UserError for a mistake in the settings, the data or the
+    folder.
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
     log = log if jax.process_index() == 0 else silent
@@ -66,7 +66,7 @@ def pretrain(
     else:
         params, notes, sensors = load_start(params, config, init=init, clip=clip)
     shard = (jax.process_index(), jax.process_count())
-    loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
+    loader = make_loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
     for note in (*notes, *loader.notes):
         log(note)
     config = _with_warmup(config, run, loader)

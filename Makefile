@@ -122,8 +122,8 @@ bench-torch: $(STAMP) ## next to PyTorch, in a separate venv: [PRESET= BATCH= OU
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
 	$(PYTHON) -m experiments.benchmarks.gpu $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
-compare: $(STAMP) ## encoders of all families: what they cost, and what your files know: [ENCODERS="a=FILE b=FILE" DATA=manifest LABEL=]
-	$(PY) -m experiments.compare.run$(if $(ENCODERS), --encoders $(ENCODERS) --data $(DATA) --label $(LABEL))
+compare: $(STAMP) ## encoders of all families: what they cost, and what your files know: [ENCODERS="a=FILE b=FILE" DATA=manifest LABEL= OUT=runs/compare/compare.jsonl]
+	$(PY) -m experiments.compare.run$(if $(ENCODERS), --encoders $(ENCODERS) --data $(DATA) --label $(LABEL))$(if $(OUT), --out $(OUT))
 
 pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: [RUNS="anytouch=path static=path t3=path" STUDY= QUICK=1 OUT=]
 	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.pouring.study

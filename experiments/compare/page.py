@@ -21,7 +21,6 @@ _COSTS = (
     ("MiB", "memory", 2**20, ".0f"),
 )
 _ABOUT = (
-    "The encoders are untrained copies of the released sizes, in float32. "
     "A row is one touch, with the family's own number of frames and pixels. "
     "The operations are those of matrix products. "
     "The memory holds the parameters and all arrays of one call. "
@@ -66,11 +65,12 @@ def compare_encoders(folder: Path, data: str = NAME) -> Page:
             "No weights of the families are in this repository. With your files you get columns of accuracy: "
             '`make compare ENCODERS="a=FILE b=FILE" DATA=manifest.parquet LABEL=material`.'
         )
+    about = "those of your files" if scores else "untrained copies of the released sizes"
     return Page(
         "compare",
         "What does each family of encoders cost, and what does it know?",
-        f"{_ABOUT} The machine is {' or '.join(machines)}. Other work ran on it, and its load was {loads[0]:.0f} to "
-        f"{loads[-1]:.0f}.",
+        f"The encoders are {about}, in float32. {_ABOUT} The machine is {' or '.join(machines)}. Other work ran on it, "
+        f"and its load was {loads[0]:.0f} to {loads[-1]:.0f}.",
         head, rows, findings, (data,), "make compare",
         "Operations of a touch and the processor time that it takes.", partial(_draw, costs),
     )  # fmt: skip

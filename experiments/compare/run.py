@@ -4,6 +4,7 @@
     python -m experiments.compare.run --encoders a=FILE b=FILE --data manifest.parquet --label material
 
 Each figure is a line of `experiments/results/compare.jsonl`, and the page is made from that file alone (`--render`).
+Figures of your own encoders go to `runs/compare/compare.jsonl`, or to the file of `--out`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from experiments.pages import page
 from experiments.records import write_record
 
 PROTOCOLS = ("honest", "published")
+RESULTS, YOURS = Path("experiments/results/compare.jsonl"), Path("runs/compare/compare.jsonl")
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Options:
     label: str = "material"  # Label column for the accuracy.
     only: tuple[str, ...] = ()  # Measure only these families (default: all, or none with --encoders).
     repeats: int = 5  # Timed calls of each family.
-    out: Path = Path("experiments/results/compare.jsonl")  # The file of results.
+    out: Path | None = None  # The file of results. Your encoders have one of their own.
     render: bool = False  # Make the page from the file of results, and nothing else.
 
 
@@ -105,21 +107,23 @@ def run(options: Options) -> int:
         raise UserError(f"there is no family {unknown[0]!r}; choose from {', '.join((*FORMS, *OURS))}")
     if options.encoders and not options.data:
         raise UserError("ENCODERS needs the manifest to probe them on; add DATA=manifest.parquet")
+    out = options.out or (YOURS if options.encoders else RESULTS)
     for name in wanted:
-        write_record(options.out, f"cost/{name}", costs(untrained(name), options.repeats))
+        write_record(out, f"cost/{name}", costs(untrained(name), options.repeats))
         print(name, flush=True)
     for pair in () if options.render else options.encoders:
         name, equals, file = pair.partition("=")
         if not (equals and name and file):
             raise UserError(f"{pair!r} is no NAME=FILE; write --encoders mine=runs/stage2")
         encoder = load_encoder(file)
-        write_record(options.out, f"cost/{name}", costs(encoder, options.repeats))
+        write_record(out, f"cost/{name}", costs(encoder, options.repeats))
         for protocol in PROTOCOLS:
             score = accuracy(name, file, options.data, options.label, protocol)
-            write_record(options.out, f"accuracy/{name}/{options.label}/{protocol}", score)
-    made = compare_encoders(options.out.parent, options.out.name)
-    page.draw(made, options.out.parent / "figures" / f"{made.name}.png")
-    atomic_write(options.out.with_suffix(".md"), page.text(made))
+            write_record(out, f"accuracy/{name}/{options.label}/{protocol}", score)
+    made = compare_encoders(out.parent, out.name)
+    page.draw(made, out.parent / "figures" / f"{made.name}.png")
+    atomic_write(out.with_suffix(".md"), page.text(made))
+    print(out.with_suffix(".md"))
     return 0
 
 

@@ -51,7 +51,7 @@ def pretrain(
     folder.
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
-    log = log if jax.process_index() == 0 else silent
+    report, log = log, log if jax.process_index() == 0 else silent  # each process reads samples of its own
     resumes = bool(steps(run / CHECKPOINTS))
     _check(config, run, init, clip, resumes)
     manifest = manifests.read(config.data.manifests)
@@ -66,7 +66,7 @@ def pretrain(
     else:
         params, notes, sensors = load_start(params, config, init=init, clip=clip)
     shard = (jax.process_index(), jax.process_count())
-    loader = make_loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard)
+    loader = make_loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard, log=report)
     for note in (*notes, *loader.notes):
         log(note)
     config = _with_warmup(config, run, loader)

@@ -94,7 +94,7 @@ def test_known_contact_may_be_true_or_false_and_nothing_else(anytouch, mistake, 
     columns["label.contact"][4] = "yes"
     manifests.write(manifests.from_columns(columns, tmp_path / "words.csv"), tmp_path / "words.csv")
     named = mistake("data", "contact", tmp_path / "words.csv")
-    assert "row 4 of" in named and "'yes'" in named
+    assert "line 6 of" in named and "'yes'" in named
 
 
 def test_marks_that_are_kept_are_reported_and_cannot_be_moved(anytouch, mistake, pressed, monkeypatch):

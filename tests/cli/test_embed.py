@@ -110,11 +110,11 @@ def test_a_bad_row_of_a_manifest_is_named_however_the_run_was_trained(anytouch, 
     record.write_text(json.dumps({"checksum": zlib.crc32(body.encode()), "record": content}))
     shared = ("--model", tmp_path / "r", "--data", tmp_path / "w" / world.name)
     words = ("embed", *shared, "--out", tmp_path / "f.npz", "--batch", 4)
-    assert "row 10 of" in mistake(*words)
+    assert "line 12 of" in mistake(*words)
     done = anytouch(*words, "--on-bad-sample", "skip")
-    assert done.status == 0 and "1 skipped" in done.out and "row 10 of" in done.err
+    assert done.status == 0 and "1 skipped" in done.out and "line 12 of" in done.err
     done = anytouch("probe", "label", *shared)
-    assert done.status == 2 and "row 10 of" in done.err
+    assert done.status == 2 and "line 12 of" in done.err
 
 
 @pytest.mark.parametrize(

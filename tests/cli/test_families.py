@@ -9,13 +9,24 @@ import cv2
 import numpy as np
 import pytest
 from places import ROOT
+from safetensors.numpy import save_file
 from touch_world import make_touches
 
 from anytouch_jax import load_encoder
 from anytouch_jax.encoder import export
+from tests.weights import test_families as forms
 from tests.weights.test_start import mae
 
 OTHERS = ROOT / "tests" / "parity" / "golden_others"
+MADE = {  # small files of the other families: title, (width, depth, heads, mlp), patch, what else differs, pixels
+    "sparsh": (forms.SPARSH, (24, 1, 4, 48), 32, {"tubelet": 3, "frames": 3}, (320, 240)),
+    "sparsh_video": (forms.VIDEO, (20, 1, 5, 30), 8, {"tubelet": 2, "frames": 4, "grid": (2, 5, 5)}, (40, 40)),
+    "sitr": (forms.SITR, (18, 1, 3, 20), 8, {"grid": (1, 4, 4), "calibration": 9, "outputs": 11}, (32, 32)),
+    "t3": (forms.T3, (24, 1, 4, 48), 8, {"grid": (1, 5, 5), "trunk": 1}, (40, 40)),
+    "dinov2": (forms.AUTHORS, (30, 1, 5, 72), 56, {"grid": (1, 4, 4), "layer_scale": True}, (224, 224)),
+    "vit": (forms.VIT, (16, 1, 4, 32), 32, {"grid": (1, 7, 7)}, (224, 224)),
+    "deit": (forms.TIMM, (28, 1, 7, 60), 8, {"grid": (1, 6, 6)}, (48, 48)),
+}
 
 
 @pytest.fixture(scope="module")
@@ -25,15 +36,28 @@ def touches(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A family of single photographs, and one of clips of 4 frames that needs a background and knows sensors."""
-    folder = tmp_path_factory.mktemp("files")
+    """A file of each family. AnyTouch 2 takes clips of 4 frames, needs a background and knows sensors."""
+    folder, made = tmp_path_factory.mktemp("files"), {}
+    for name, (title, stack, *more) in MADE.items():
+        *_, arrays = forms.made(title, stack, *more)
+        file = folder / name / "model.safetensors"
+        if title == forms.T3:
+            file = forms.write_t3(folder / name, arrays)
+        else:
+            file.parent.mkdir()
+            save_file(arrays, file)
+        (folder / name / "config.json").write_text(json.dumps({"num_attention_heads": stack[2]}))
+        made[name] = file
+    (folder / "sitr" / "calibration").mkdir()
+    for number in range(10):
+        cv2.imwrite(str(folder / "sitr" / "calibration" / f"{number:04d}.png"), np.full((32, 32, 3), 80, np.uint8))
     (folder / "anytouch2").mkdir()
     shutil.copy(OTHERS / "anytouch2_checkpoint-4frames.pth", folder / "anytouch2" / "model.pth")
     (folder / "anytouch2" / "config.json").write_text(json.dumps({"num_attention_heads": 4}))
-    return {"vit_mae": mae(folder / "mae"), "anytouch2": folder / "anytouch2" / "model.pth"}
+    return made | {"vit_mae": mae(folder / "mae"), "anytouch2": folder / "anytouch2" / "model.pth"}
 
 
-FAMILIES = ("vit_mae", "anytouch2")
+FAMILIES = ("vit_mae", "anytouch2", *(pytest.param(name, marks=pytest.mark.slow) for name in MADE))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -65,7 +89,7 @@ def test_a_streamed_film_gives_the_features_of_embed(anytouch, family, files, tm
     writer.release()
     cv2.imwrite(str(gel), np.full((40, 48, 3), 90, np.uint8))
     words = ["--model", files[family], "--data", film, "--sensor", "digit", "--background", gel]
-    words += ["--frames", 4] if family == "anytouch2" else []
+    words += ["--frames", load_encoder(files[family]).form.model.frames]
     outs = [tmp_path / f"{name}.npz" for name in ("stream", "embed")]
     for name, out in zip(("stream", "embed"), outs, strict=True):
         done = anytouch(name, *words, "--out", out)
@@ -82,7 +106,7 @@ def test_an_exported_family_gives_the_features_of_the_live_one(anytouch, family,
     done = anytouch("export", "--model", files[family], "--out", out, "--frames", frames, "--platforms", "cpu")
     assert done.status == 0, done.err
     clip = np.random.default_rng(0).normal(size=(2, frames, *encoder.image_size, 3)).astype("f4")
-    sensor = "digit" if family == "anytouch2" else "universal"
+    sensor = "digit" if family in ("anytouch2", "t3") else "universal"
     live = encoder.encode_touch(clip, sensor)
     np.testing.assert_allclose(export.load(out)(clip, sensor), live, atol=1e-5 * np.abs(live).max())
     said = json.loads((tmp_path / "model.bin.json").read_text())

@@ -142,7 +142,7 @@ def test_a_bad_manifest_is_one_sentence(mistake, tmp_path, world):
         rows[1]["path"] = "../a1.png"
 
     assert "sensor" in sentence(no_sensor)
-    assert "gelsightt" in sentence(unknown_sensor) and "row 2" in sentence(unknown_sensor)
+    assert "gelsightt" in sentence(unknown_sensor) and "line 4 of" in sentence(unknown_sensor)
     assert "train" in sentence(no_train_rows)
     assert "../a1.png" in sentence(way_out)
     missing = tmp_path / "none.csv"
@@ -150,13 +150,14 @@ def test_a_bad_manifest_is_one_sentence(mistake, tmp_path, world):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_corrupt_picture_is_named_or_skipped_and_counted(anytouch, mistake, tmp_path, world):
+def test_a_corrupt_picture_is_named_and_may_be_skipped_and_counted(anytouch, mistake, tmp_path, world):
     manifest = changed(world, tmp_path / "world", lambda rows: None)
     (manifest.parent / "a1.png").write_bytes(b"not a picture")
     words = ("train", "--data", manifest, "--batch", 8, "--steps", 4, "--save-every", 4, *SMALL)
     sentence = mistake(*words, "--run", tmp_path / "strict", "--stop-after", 1)
-    assert "a1.png" in sentence and "row 1" in sentence
-    assert anytouch(*words, "--run", tmp_path / "r", "--on-bad-sample", "skip", "--stop-after", 1).status == 0
+    assert "a1.png" in sentence and "line 3 of" in sentence
+    done = anytouch(*words, "--run", tmp_path / "r", "--on-bad-sample", "skip", "--stop-after", 1)
+    assert done.status == 0 and "a1.png" in done.err and "another sample replaces it" in done.err
     line = json.loads((tmp_path / "r" / "metrics.jsonl").read_text())
     assert line["skipped"] == line["skipped_batches"] == 0 and line["skipped_samples"] >= 1 and line["loss"] > 0
 

@@ -9,6 +9,7 @@ from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.novelty import Calibration, ContactGate
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits
+from experiments.real.trust import calibration_error
 
 CLASSES, WIDTH = 4, 8
 
@@ -72,8 +73,8 @@ def test_the_temperature_that_spoiled_logits_is_found(columns, factor):
     assert abs(np.log(found / factor)) < 0.15
     right = p.argmax(1) == y
     spoiled = novelty.probabilities(factor * logits)
-    error = novelty.calibration_error(novelty.probabilities(factor * logits, found).max(1), right)
-    assert error < 0.03 < novelty.calibration_error(spoiled.max(1), right)
+    error = calibration_error(novelty.probabilities(factor * logits, found).max(1), right)
+    assert error < 0.03 < calibration_error(spoiled.max(1), right)
 
 
 def test_a_head_is_calibrated_on_new_recordings():
@@ -83,7 +84,7 @@ def test_a_head_is_calibrated_on_new_recordings():
     seen = head.assess(x)
     inside = seen.in_set[np.arange(len(y)), np.searchsorted(head.classes, y)]
     assert abs(inside.mean() - 0.85) < 0.05
-    assert novelty.calibration_error(seen.p.max(1), seen.label == y) < 0.05
+    assert calibration_error(seen.p.max(1), seen.label == y) < 0.05
     assert 0.01 < seen.novel.mean() < 0.1  # 5 % were asked for
     assert (seen.label == y)[~seen.abstains].mean() > (seen.label == y).mean() + 0.02
     assert head.assess(x + 6 * rng.standard_normal(WIDTH)).novel.mean() > 0.9

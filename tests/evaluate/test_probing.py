@@ -488,5 +488,5 @@ def test_raw_pixels_name_the_row_and_the_column_of_a_bad_picture(tmp_path):
         path = tmp_path / "manifest.csv"
         manifests.write(manifests.from_columns(columns | change, path), path)
         world = manifests.read(path)
-        with pytest.raises(UserError, match=rf"row 1 of .*manifest\.csv, column {column}: .*bad\.png"):
+        with pytest.raises(UserError, match=rf"line 3 of .*manifest\.csv, column {column}: .*bad\.png"):
             pixel_components(feature_cache.pixel_features(world), label_rows(world, "object")[0])

@@ -57,14 +57,16 @@ def test_operations_count_every_block(encoder):
     assert found["parameters"] > 0 and found["memory"] > 4 * found["parameters"] and found["pixels"] == [28, 28]
 
 
-def test_files_are_probed_by_both_protocols_and_the_page_has_their_columns(encoder, tmp_path, capsys):
+def test_files_are_probed_by_both_protocols_and_the_page_is_the_users_own(encoder, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     data = make_touches(tmp_path / "data", touches={"train": 4, "val": 2, "test": 4}, each=1)
-    out = tmp_path / "compare.jsonl"
-    options = run.Options(encoders=(f"mine={encoder}",), data=(data,), label="hardness", out=out)
+    out = tmp_path / "runs" / "compare" / "compare.jsonl"
+    options = run.Options(encoders=(f"mine={encoder}",), data=(data,), label="hardness")
     assert run.run(options) == 0, capsys.readouterr().err
     records = read_records(out)
     assert {record.get("protocol") for record in records.values()} == {"honest", "published", None}
     text = out.with_suffix(".md").read_text()
+    assert "those of your files" in text and not (tmp_path / "experiments").exists()
     assert "linear, honest, %" in text and "kNN, published, %" in text and "| mine | 1 | 28 x 28 |" in text
     with pytest.raises(UserError, match="add DATA"):
         run.run(run.Options(encoders=("mine=x",), out=out))

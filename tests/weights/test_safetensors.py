@@ -24,6 +24,15 @@ def test_a_tree_is_written_and_read_back(tmp_path):
         np.testing.assert_array_equal(first, second)
 
 
+def test_equal_weights_and_metadata_are_equal_bytes(tmp_path):
+    notes = {f"key{i}": f'"{i}"\n\u00fc\x01\x7f' for i in range(30)}
+    for name, items in (("a", notes), ("b", dict(reversed(notes.items())))):
+        write_safetensors(tmp_path / name, {"x": np.arange(5, dtype="f4"), "w": np.ones((2, 3))}, items)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    arrays, metadata = read_safetensors(tmp_path / "a")
+    assert metadata == notes and arrays["x"].tolist() == [0, 1, 2, 3, 4]
+
+
 def test_half_precision_becomes_float32(tmp_path, torch_files):
     values = np.array([1.0, -2.5, 3.140625], "f4")
     for kind in (np.float16, ml_dtypes.bfloat16):

@@ -296,7 +296,7 @@ def _numbered_frames(
     first are logged. The time stamps of a video's frames are appended to `times`.
     """
     from anytouch_jax.data import images
-    from anytouch_jax.data.loading.evaluation import NAMED
+    from anytouch_jax.data.loading.samples import NAMED
 
     if data.suffix.lower() in images.SUFFIXES and data.is_file():
         yield 0, data.name, images.decode(data)

@@ -235,14 +235,3 @@ def choose_references(groups: Array, most: int = REFERENCES) -> Array:
     """Return at most `most` row numbers, in order, evenly spread over the `groups` (n,)."""
     order = np.argsort(groups, kind="stable")
     return np.sort(order[np.unique(np.linspace(0, len(order) - 1, min(most, len(order))).astype(int))])
-
-
-def calibration_error(p: Array, correct: Array, bins: int = 15) -> float:
-    """Return the expected calibration error: the mean gap of confidence `p` (n,) and accuracy over bins of equal width.
-
-    `correct` (n,) says whether the likeliest class was right (Guo et al. 2017, Eq. 5).
-    """
-    place = np.minimum((np.asarray(p) * bins).astype(int), bins - 1)
-    sizes = np.bincount(place, minlength=bins)
-    gaps = np.bincount(place, np.asarray(correct, float) - p, minlength=bins)
-    return float(np.abs(gaps).sum() / max(sizes.sum(), 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -33,12 +34,25 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
         with atomic_path(path) as part:
             # the library ignores strides: a transposed view would be written in the wrong order
             save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, part, dict(metadata))
+            _sort_metadata(part)
             umask = os.umask(0)
             os.umask(umask)
             os.chmod(part, 0o666 & ~umask)  # the library writes a file that only its owner may read
     except Exception as error:  # the library wraps OSError in its own type
         advice = "; free some space" if "No space left" in str(error) else ""
         raise WeightsError(f"could not write {path}: {error}{advice}") from error
+
+
+def _sort_metadata(file: Path) -> None:
+    """Sort the metadata of a file: the library writes them in a random order, but equal weights are equal bytes."""
+    with file.open("r+b") as header:
+        size = int.from_bytes(header.read(8), "little")
+        entries = json.loads(header.read(size))
+        entries = {"__metadata__": dict(sorted(entries.pop("__metadata__", {}).items())), **entries}
+        text = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
+        if len(text) <= size:
+            header.seek(8)
+            header.write(text.ljust(size))
 
 
 def export_safetensors(path: str | Path, params: Any, metadata: Mapping[str, str]) -> None:

@@ -108,8 +108,10 @@ def test_a_bad_sample_is_named_or_skipped_and_counted(make, settings, read_back,
     for word in ("row 2 of", "manifest.csv", "'path'", name, words):
         assert word in message
     skipping = settings(batch_size=5, threads=threads, on_bad_sample="skip")
-    loader = Loader(manifest, skipping)
+    logged: list[str] = []
+    loader = Loader(manifest, skipping, log=logged.append)
     ((_, batch, info),) = loader.stream(0, 1)
+    assert logged == [f"{message}; another sample replaces it"]
     drawn = read_back(batch.clip)[:, 0]
     assert info["skipped_samples"] >= 1 and 2 not in drawn and set(drawn) == {0, 1, 3, 4}
     assert_same(batch, Loader(manifest, skipping).batch(0))  # the replacement is deterministic

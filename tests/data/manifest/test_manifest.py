@@ -74,7 +74,7 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
     up = m.read(tmp_path / "up.parquet")
     assert up.value(0, "path") == "deep/a.png"
     assert up.file(0) == first.file(0)
-    with pytest.raises(m.ManifestError, match=r"row 0 of .*manifest\.csv.*is not inside .*elsewhere"):
+    with pytest.raises(m.ManifestError, match=r"line 2 of .*manifest\.csv.*is not inside .*elsewhere"):
         m.write(first, tmp_path / "elsewhere" / "x.csv")
 
 
@@ -82,18 +82,18 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
     ("text", "words"),
     [
         (GOOD.replace(",split", ",slit"), ["lacks the column 'split'", "slit"]),
-        (GOOD.replace("s,2,train", "s,two,train"), ["row 1", "'frame_index'", "whole number", "'two'"]),
-        (GOOD.replace("s,2,train", "s,2.5,train"), ["row 1", "'frame_index'", "'2.5'"]),
-        (GOOD.replace("s,2,train", "s,1e30,train"), ["row 1", "'frame_index'", "'1e30'"]),
-        (GOOD.replace("s,2,train", "s,1_0,train"), ["row 1", "'frame_index'", "'1_0'"]),
-        (GOOD.replace("s,2,train", "s,0x10,train"), ["row 1", "'frame_index'", "whole number", "'0x10'"]),
-        (GOOD.replace("s,2,train", "s,,train"), ["row 1", "'frame_index' is empty"]),
-        (GOOD.replace("c.png", "  "), ["row 2", "'path' is empty"]),
-        (GOOD.replace("test", "tset"), ["row 2", "'split'", "'tset'", "background", "did you mean test?"]),
-        (GOOD.replace("test", "Validation"), ["row 2", "'split'", "'Validation'", "did you mean val?"]),
-        (GOOD.replace("test", "te st"), ["row 2", "'split'", "'te st'", "did you mean test?"]),
-        (GOOD.replace("train,2,t,0", "train,0,t,0"), ["row 1", "'stride'", "at least 1, is 0"]),
-        (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["row 0", "'commercial'", "0 or 1", "'yes'"]),
+        (GOOD.replace("s,2,train", "s,two,train"), ["line 3 of", "'frame_index'", "whole number", "'two'"]),
+        (GOOD.replace("s,2,train", "s,2.5,train"), ["line 3 of", "'frame_index'", "'2.5'"]),
+        (GOOD.replace("s,2,train", "s,1e30,train"), ["line 3 of", "'frame_index'", "'1e30'"]),
+        (GOOD.replace("s,2,train", "s,1_0,train"), ["line 3 of", "'frame_index'", "'1_0'"]),
+        (GOOD.replace("s,2,train", "s,0x10,train"), ["line 3 of", "'frame_index'", "whole number", "'0x10'"]),
+        (GOOD.replace("s,2,train", "s,,train"), ["line 3 of", "'frame_index' is empty"]),
+        (GOOD.replace("c.png", "  "), ["line 4 of", "'path' is empty"]),
+        (GOOD.replace("test", "tset"), ["line 4 of", "'split'", "'tset'", "background", "did you mean test?"]),
+        (GOOD.replace("test", "Validation"), ["line 4 of", "'split'", "'Validation'", "did you mean val?"]),
+        (GOOD.replace("test", "te st"), ["line 4 of", "'split'", "'te st'", "did you mean test?"]),
+        (GOOD.replace("train,2,t,0", "train,0,t,0"), ["line 3 of", "'stride'", "at least 1, is 0"]),
+        (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["line 2 of", "'commercial'", "0 or 1", "'yes'"]),
         (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["line 3: 10 cells for 11 columns", "b.png,"]),
         (GOOD.replace("other\n", "path\n"), ["'path' is there twice"]),
         (HEAD + "\n", ["has no rows"]),
@@ -160,7 +160,7 @@ def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):
     both = m.read([one, two])
     assert len(both) == 6
     assert both.file(4) == tmp_path / "two" / "b.png"
-    assert both.where(4) == f"row 1 of {two}"
+    assert both.where(4) == f"line 3 of {two}"
     assert both.column("label.grip").to_pylist() == [None, None, None, 0, 1, None]
     assert both.column("label.name").to_pylist() == ["x", "y, z", None, "3", "4", None]
     touch = both.codes("touch", own=True)
@@ -208,7 +208,7 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
 def test_sensor_rows(tmp_path):
     text = f"{HEAD}\na,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
     got, model = m.read(_file(tmp_path, text)), preset("tiny").model
-    with pytest.raises(m.ManifestError, match=r"row 2 of .*manifest\.csv.*unknown sensor 'newfinger'"):
+    with pytest.raises(m.ManifestError, match=r"line 4 of .*manifest\.csv.*unknown sensor 'newfinger'"):
         m.sensor_rows(got, model)
     ids, notes = m.sensor_rows(got, model, unknown="skip")
     assert ids.tolist() == [1, -1, -1, 6] and ids.dtype == np.int32
@@ -217,7 +217,7 @@ def test_sensor_rows(tmp_path):
     assert ids.tolist() == [1, -1, 9, 6] and any("universal" in note for note in notes)
     other = m.read(_file(tmp_path, text.replace("digit", "DIGIT")))
     for unknown in ("error", "skip", "universal"):
-        with pytest.raises(m.ManifestError, match=r"row 0 of .*column 'sensor': sensor 'DIGIT': it is called digit"):
+        with pytest.raises(m.ManifestError, match=r"line 2 of .*column 'sensor': sensor 'DIGIT': it is called digit"):
             m.sensor_rows(other, model, unknown=unknown)
     ids, notes = m.sensor_rows(got, model, np.array([0, 3]))
     assert ids.tolist() == [1, -1, -1, 6] and notes == []
@@ -259,7 +259,7 @@ def test_clips_are_what_the_words_say(tmp_path, length, scale):
 def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
     got = m.read(_file(tmp_path, f"{HEAD}\na,digit,s,0,train\nb,digit,r,7,train\nc,digit,r,7,train\n"))
     assert len(got.clips(1)) == 3
-    with pytest.raises(m.ManifestError, match=r"row 2 of .* repeats frame_index 7 of sequence 'r' \(row 1\)"):
+    with pytest.raises(m.ManifestError, match=r"line 4 of .* repeats frame_index 7 of sequence 'r', as in line 3 of"):
         got.clips(2)
 
 
@@ -335,8 +335,8 @@ def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
     head = " path, sensor,sequence ,frame_index,split,text,label.x"  # spaces around names do not count
     good = '0.png,digit,s,0,train,"of two\nlines",1\n\n'
     for bad, words in (
-        ("1.png,digit,s,one,train,,2", "line 5, row 1: column 'frame_index'"),
-        ("1.png,digit,s,1,tain,,2", "line 5, row 1: column 'split'"),
+        ("1.png,digit,s,one,train,,2", "line 5 of .*csv: column 'frame_index'"),
+        ("1.png,digit,s,1,tain,,2", "line 5 of .*csv: column 'split'"),
         ("1.png,digit,s,1,train", "line 5: 5 cells for 7 columns, in '1.png"),
         ("1.png,digit,s,1,train,soft, red,2", "line 5: 8 cells for 7 columns"),
         ('1.png,digit,s,1,train,"open,2', "line 5: 6 cells for 7 columns"),
@@ -344,15 +344,15 @@ def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
         with pytest.raises(m.ManifestError, match=words):
             m.read(_file(tmp_path, f"{head}\n{good}{bad}\n2.png,digit,s,2,train,,3\n"))
     lines = "".join(f"{i}.png,digit,s,{i},train,,{i}\n" for i in range(1, 9)) + "9.png,digit,s,9,train,,much\n"
-    with pytest.raises(m.ManifestError, match=r"line 13, row 9: column 'label.x' has 'much' among numbers"):
+    with pytest.raises(m.ManifestError, match=r"line 13 of .*csv: column 'label.x' has 'much' among numbers"):
         m.read(_file(tmp_path, f"{head}\n{good}{lines}"))
 
 
 @pytest.mark.parametrize(
     ("cells", "words"),
     [
-        (["Wood", "clay", "wood"], "row 2: column 'label.x' has 'wood', and .* row 0 has 'Wood'"),
-        ([*map(str, range(9)), "12,5"], "row 9: column 'label.x' has '12,5' among numbers"),
+        (["Wood", "clay", "wood"], "line 4 of .*csv: column 'label.x' has 'wood', and line 2 of .* has 'Wood'"),
+        ([*map(str, range(9)), "12,5"], "line 11 of .*csv: column 'label.x' has '12,5' among numbers"),
     ],
 )
 def test_a_label_column_of_a_csv_that_contradicts_itself_names_its_rows(tmp_path, cells, words):
@@ -410,8 +410,8 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
 @pytest.mark.parametrize(
     ("text", "options", "words"),
     [
-        ("sequence,text\n,a\n", {}, "line 2, row 0: a caption without sequence"),
-        ("sequence,text\n\ns0,a\ns0,b\n", {}, "line 4, row 1: sequence 's0' has another caption"),
+        ("sequence,text\n,a\n", {}, "line 2 of .*csv: a caption without sequence"),
+        ("sequence,text\n\ns0,a\ns0,b\n", {}, "line 4 of .*csv: sequence 's0' has another caption"),
         ("sequence,caption\ns0,a\n", {}, "no column 'text'; it has sequence, caption"),
         ("sequence,touch,text\ns0,x,a\n", {}, "name the key column"),
         ("sequence,text\ns9,a\n", {}, "no key 'sequence' of it is in the manifest; its first one is 's9'"),
@@ -433,9 +433,10 @@ def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words
     [
         ({"split": None}, "lacks the column 'split'"),
         ({"frame_index": ["one", "two"]}, "'frame_index' must be a whole"),
-        ({"frame_index": [1.5, 2.0]}, "row 0: column 'frame_index'"), ({"sensor": [1, 2]}, "'sensor' must be text"),
+        ({"frame_index": [1.5, 2.0]}, "row 0 of .*: column 'frame_index'"),
+        ({"sensor": [1, 2]}, "'sensor' must be text"),
         ({"path": [["a"], ["b"]]}, "'path' must be text"), ({"commercial": [2, 0]}, "'commercial' must be a 0 or 1"),
-        ({"path": ["a", None]}, "row 1: column 'path' is empty"),
+        ({"path": ["a", None]}, "row 1 of .*parquet: column 'path' is empty"),
         ({"split": [b"train", b"test"]}, "'split' must be text"),
     ],
 )  # fmt: skip
@@ -470,7 +471,7 @@ GOOD_COLUMNS |= {"split": ["train"] * 2, "object": ["mug"] * 2, "label.x": ["u",
 @pytest.mark.parametrize("name", ["path", "split", "object", "label.x", "note"])
 def test_text_of_a_parquet_that_is_not_utf8_is_named(tmp_path, name):
     pa.parquet.write_table(_with_broken_text(GOOD_COLUMNS, name), tmp_path / "m.parquet")
-    with pytest.raises(m.ManifestError, match=f"row 1: column '{name}' must be UTF-8 text"):
+    with pytest.raises(m.ManifestError, match=f"row 1 of .*parquet: column '{name}' must be UTF-8 text"):
         m.read(tmp_path / "m.parquet")
 
 
@@ -478,7 +479,7 @@ def test_text_of_a_parquet_that_is_not_utf8_is_named(tmp_path, name):
 def test_a_huge_cell_is_named_and_never_printed(tmp_path, name):
     columns = GOOD_COLUMNS | {name: ["train", "Z" * 1_000_000]}
     pa.parquet.write_table(pa.table(columns), tmp_path / "m.parquet")
-    with pytest.raises(m.ManifestError, match=f"row 1: column '{name}' has a text of 1000000 bytes") as error:
+    with pytest.raises(m.ManifestError, match=f"row 1 of .*: column '{name}' has a text of 1000000 bytes") as error:
         m.read(tmp_path / "m.parquet")
     assert len(str(error.value)) < 400
     columns[name] = ["train", "Z" * 9_000]  # is read, and shortened in messages
@@ -543,9 +544,9 @@ def test_a_description_in_blocks_equals_the_whole_table(tmp_path, monkeypatch):
     columns["sequence"][30] = columns["sequence"][20]
     columns["split"][30] = columns["split"][20]
     for name, value, words in (
-        ("frame_index", None, r"row 30 of .*m\.parquet repeats frame_index \d of sequence 'r\d' \(row 20\)"),
-        ("split", "tset", r"m\.parquet, row 33: column 'split' .* did you mean test"),
-        ("path", None, r"m\.parquet, row 33: column 'path' is empty"),
+        ("frame_index", None, r"row 30 of .*m\.parquet repeats frame_index \d of sequence 'r\d', as in row 20 of"),
+        ("split", "tset", r"row 33 of .*m\.parquet: column 'split' .* did you mean test"),
+        ("path", None, r"row 33 of .*m\.parquet: column 'path' is empty"),
     ):
         changed = columns | (
             {} if value is None and name != "path" else {name: [*columns[name][:33], value, *columns[name][34:]]}

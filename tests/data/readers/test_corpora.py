@@ -112,3 +112,9 @@ def test_any_webdataset_is_read_with_a_sensor(tmp_path):
     (tmp_path / "shards" / "01.tar").write_bytes(b"no tar" * 200)
     with pytest.raises(UserError, match=r"01\.tar is no whole tar"):
         table_of(tmp_path, "webdataset", sensor="digit")
+    deep: object = 0
+    for _ in range(80):
+        deep = [deep]
+    write_tar(tmp_path / "shards" / "01.tar", {"x": (1, {"hardness": deep})})
+    with pytest.raises(UserError, match=r"01\.tar, x\.json has more than 64 levels of JSON"):
+        table_of(tmp_path, "webdataset", sensor="digit", val=0.0, test=0.5)

@@ -106,9 +106,15 @@ def test_films_of_freetacman(read, tmp_path):
         film.release()
     times = tmp_path / "Cast" / "Cast_1_tactile_left_timestamps.txt"
     times.write_text("".join(f"{100 + i / 30}\n" for i in range(5)))
+    poses = "".join(f"{i},{0.1 * i},{40 - i},up\n" for i in range(5))
+    (tmp_path / "Cast" / "Cast_1_traj.csv").write_text(f"timestamp,TCP_x,gripper_distance,note\n{poses}")
     with pytest.raises(UserError, match="--export"):
         read("freetacman")
     table = read("freetacman", export=True)
     assert len(table.rows) == 5 and set(table["unit"]) == {"tactile_left"} and set(table["object"]) == {"Cast"}
     assert table["time"][4] == pytest.approx(100 + 4 / 30) and "film of another camera" in table.reasons
+    assert (
+        table["label.gripper_distance"] == [40, 39, 38, 37, 36]
+        and "label.note" not in table.report.manifest.table.column_names
+    )
     assert len(table.clips(3)) == 3

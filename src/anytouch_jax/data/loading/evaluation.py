@@ -10,12 +10,10 @@ import numpy as np
 
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
-from anytouch_jax.data.loading.samples import Prepare, SampleError, SampleReader
+from anytouch_jax.data.loading.samples import NAMED, Prepare, SampleError, SampleReader
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
 from anytouch_jax.errors import UserError
-
-NAMED = 5  # bad samples that are named where bad samples are skipped
 
 
 def evaluation(

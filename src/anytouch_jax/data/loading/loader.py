@@ -15,7 +15,7 @@ import numpy as np
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data.loading.pools import CLIP, STILL, MatchPool, Pool, find_pools
-from anytouch_jax.data.loading.samples import SampleReader, fill_slot
+from anytouch_jax.data.loading.samples import NAMED, SampleReader, fill_slot
 from anytouch_jax.data.loading.sampling import BOTH, TEXT, VISION, Shard, StepSchedule, uniform_per_step
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches, run_jobs
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -35,8 +35,9 @@ class Loader:
 
     `notes` are sentences for the user (rows left out, no clips, no pairs). `tokenizer` is the one in use, or None.
     The image and text slots are a multiple of `devices`. With `shard` (index, count) this process reads and returns
-    its part of every batch; the parts joined in order are the whole batch. Raises UserError: ManifestError for an
-    empty split or an unknown sensor, SampleError (from `batch` and `stream`) for a bad sample.
+    its part of every batch; the parts joined in order are the whole batch. `log` gets a sentence for each of the first
+    NAMED samples that are replaced. Raises UserError: ManifestError for an empty split or an unknown sensor,
+    SampleError (from `batch` and `stream`) for a bad sample.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Loader:
         tokenizer: Tokenizer | None = None,
         devices: int = 1,
         shard: tuple[int, int] = (0, 1),
+        log: Callable[[str], None] = lambda _: None,
     ) -> None:
         if devices < 1:
             raise UserError(f"devices must be 1 or more, not {devices}")
@@ -63,7 +65,7 @@ class Loader:
                 )
         for name, number in (("devices", devices), ("batch_size", size)):
             self._shard.check(number, name)
-        self._reader = SampleReader(manifest, config)
+        self._reader, self._log, self._replaced = SampleReader(manifest, config), log, set[str]()
         self._pools, self._match_pools, self._sensor, self.tokenizer, self.notes = find_pools(
             manifest, config, tokenizer, devices
         )
@@ -171,7 +173,8 @@ class Loader:
             if mine == [None, None, None]:
                 continue
             write = partial(self._write_align, batch, pool, stratum, touch, image, text)
-            job = partial(fill_slot, write, len(pool.members[stratum]), step, slot, self.config, index, epoch)
+            size = len(pool.members[stratum])
+            job = partial(fill_slot, write, size, step, slot, self.config, index, epoch, self._name_replaced)
             jobs.append(job if touch is not None else partial(_uncounted, job))
         return BatchJobs(batch, jobs, {"images": len(with_image), "texts": len(with_text)})
 
@@ -192,8 +195,15 @@ class Loader:
             write = partial(self._write_match, batch, pool, mine, gallery)
             # Slots of matching come after those of alignment, so that their replacements are drawn apart.
             place, size = self.config.data.batch_size + slot, len(pool.matches.anchors)
-            jobs.append(partial(fill_slot, write, size, step, place, self.config, index, epoch))
+            jobs.append(partial(fill_slot, write, size, step, place, self.config, index, epoch, self._name_replaced))
         return BatchJobs(batch, jobs)
+
+    def _name_replaced(self, error: str) -> None:
+        """Log a sample that was replaced, once, if it is one of the first few."""
+        if len(self._replaced) < NAMED and error not in self._replaced:
+            self._replaced.add(error)
+            more = "" if len(self._replaced) < NAMED else ". `anytouch data verify` names all"
+            self._log(f"{error}; another sample replaces it{more}")
 
     def _gallery_sensor(self, step: int, pool: MatchPool) -> int | None:
         """Return the one sensor of all positives of a step, drawn as a partner is, for negatives of that sensor."""

@@ -16,6 +16,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.errors import UserError
 
 TRIES = 20  # bad samples in a row before a slot gives up
+NAMED = 5  # bad samples that are named where bad samples are skipped
 _REPLACE, _SUBTRACT = 51, 52  # tags of the random streams of replacements and of subtracted backgrounds
 
 
@@ -123,12 +124,14 @@ def read_image(
 
 
 def fill_slot(
-    write: Callable[[int, int], None], size: int, step: int, slot: int, config: Config, index: int, epoch: int
-) -> int:
+    write: Callable[[int, int], None], size: int, step: int, slot: int, config: Config, index: int, epoch: int,
+    skipped: Callable[[str], None] = lambda _: None,
+) -> int:  # fmt: skip
     """Write sample `index` of `size` into a slot by `write(index, epoch)`, and return how many were skipped.
 
     With `data.on_bad_sample` "skip" a bad sample is replaced by another of the same `size`, drawn from (seed, step,
-    slot, attempt). Raises SampleError: at once with "error", else after TRIES bad samples in a row.
+    slot, attempt). Then `skipped` gets its error. Raises SampleError: at once with "error", else after TRIES bad
+    samples in a row.
     """
     for attempt in range(TRIES):
         try:
@@ -138,6 +141,7 @@ def fill_slot(
             if config.data.on_bad_sample == "error":
                 raise
             last = error
+            skipped(str(error))
         rng = np.random.default_rng([config.run.seed % 2**63, _REPLACE, step, slot, attempt])
         index = int(rng.integers(size))
     raise SampleError(

@@ -30,11 +30,11 @@ from anytouch_jax.data.manifest.schema import (
     SPLITS,
     ManifestError,
     clean_text,
-    csv_place,
     is_text,
     listed,
     load_table,
     parquet_blocks,
+    place_of,
     read_text_csv,
     reading,
     shown,
@@ -65,8 +65,8 @@ class Manifest:
         return int(self.table.num_rows)
 
     def where(self, row: int) -> str:
-        """Return "row 3 of /data/manifest.csv", for errors."""
-        return f"row {self.number[row]} of {self.files[self.source[row]]}"
+        """Return "line 5 of /data/m.csv", or "row 3 of /data/m.parquet", for errors."""
+        return place_of(self.files[self.source[row]], int(self.number[row]))
 
     def column(self, name: str) -> pa.ChunkedArray:
         """Return the column `name`, all null for an optional one that is absent. Raises ManifestError for others."""
@@ -172,12 +172,12 @@ class Manifest:
 
     def _repeat_error(self, first: int, second: int) -> ManifestError:
         frame, sequence = self.value(second, "frame_index"), self.value(second, "sequence")
-        return _repeats(self.where(second), int(self.number[first]), frame, sequence)
+        return _repeats(self.where(first), self.where(second), frame, sequence)
 
 
-def _repeats(where: str, first: int, frame: int, sequence: str) -> ManifestError:
+def _repeats(first: str, second: str, frame: int, sequence: str) -> ManifestError:
     return ManifestError(
-        f"{where} repeats frame_index {frame} of sequence {sequence!r} (row {first}); a sequence has one row a frame"
+        f"{second} repeats frame_index {frame} of sequence {sequence!r}, as in {first}; a sequence has one row a frame"
     )
 
 
@@ -207,9 +207,8 @@ def summarise_file(path: str | Path, length: int = 3) -> Summary:
         table = read(path).table
         names, blocks = table.column_names, table_blocks(table)
     try:
-        return summarise(
-            names, blocks, length, lambda first, second, *it: _repeats(f"row {second} of {file}", first, *it)
-        )
+        place = partial(place_of, file)
+        return summarise(names, blocks, length, lambda first, second, *it: _repeats(place(first), place(second), *it))
     except OverflowError as error:
         raise ManifestError(f"{file}: {error}") from None
 
@@ -235,7 +234,7 @@ def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
     except (pa.ArrowException, ValueError, OverflowError) as error:
         raise ManifestError(f"{file}: the columns make no table: {error}") from None
-    return _join([typed(table, str(file))], (file,))
+    return _join([typed(table, file)], (file,))
 
 
 def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
@@ -475,7 +474,7 @@ def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, st
             fault = "twice the" if name in names else "no"
             raise UserError(f"{path} has {fault} column {name!r}; it has {listed(names)}")
     keys, texts = _text_of(table[key], f"{path}: {key!r}"), _text_of(table[text], f"{path}: {text!r}")
-    place = partial(csv_place, path) if suffix == ".csv" else f"{path}, row {{}}".format
+    place = partial(place_of, path)
     captions: dict[str, str] = {}
     for row, (name, caption) in enumerate(zip(keys.to_pylist(), texts.to_pylist(), strict=True)):
         caption = " ".join((caption or "").split())

@@ -8,9 +8,8 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
-from functools import partial
-from itertools import islice
+from contextlib import contextmanager, suppress
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +48,7 @@ Cast = Callable[[pa.ChunkedArray], pa.ChunkedArray]
 
 
 class ManifestError(UserError):
-    """A manifest that cannot be used; the message names the file, the column and the row (counted from 0)."""
+    """A manifest that cannot be used; the message names the file, the column, and the line or row (`place_of`)."""
 
 
 def is_manifest(path: Path) -> bool:
@@ -79,14 +78,14 @@ def load_table(path: Path) -> pa.Table:
         with reading(path):
             return _load_parquet(path)
     table = read_text_csv(path)
-    _check_names(table.column_names, table.num_rows, str(path))
+    _check_names(table.column_names, table.num_rows, path)
     columns = dict(zip(table.column_names, table.columns, strict=True))
     for name, column in columns.items():
         if name.startswith("label."):
-            columns[name] = typed_label(column, name, partial(csv_place, path))
+            columns[name] = typed_label(column, name, partial(place_of, path))
         elif name in (*_NAMES, "sensor", "split"):
             columns[name] = clean_text(column)
-    return typed(pa.table(columns), str(path), partial(csv_place, path))
+    return typed(pa.table(columns), path)
 
 
 def shown(value: object) -> str:
@@ -148,25 +147,31 @@ def _csv_lines(path: Path) -> Generator[tuple[int, list[str]]]:
             line = rows.line_num + 1
 
 
-def csv_place(path: Path, row: int) -> str:
-    """Return "m.csv, line 5, row 3" for errors, with the line as an editor counts it."""
-    line = ""
-    with suppress(OSError, UnicodeDecodeError, csv.Error), closing(_csv_lines(path)) as lines:
-        line = f", line {next(islice(lines, row + 1, None))[0]}"
-    return f"{path}{line}, row {row}"
+def place_of(path: Path, row: int) -> str:
+    """Return "line 5 of m.csv", as an editor counts lines, or "row 3 of m.parquet", counted from 0, for errors."""
+    if path.suffix.lower() == ".csv":
+        with suppress(OSError, UnicodeDecodeError, csv.Error, IndexError):
+            return f"line {_csv_line_numbers(path, path.stat().st_mtime_ns)[row + 1]} of {path}"
+    return f"row {row} of {path}"
+
+
+@lru_cache(4)
+def _csv_line_numbers(path: Path, changed: int) -> np.ndarray:
+    """Return the first line of each row of a CSV file, i64 (1 + rows,). `changed` is the time of its last change."""
+    return np.fromiter((line for line, _ in _csv_lines(path)), np.int64)
 
 
 def _load_parquet(path: Path) -> pa.Table:
     with pa.parquet.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
-    _check_names(names, rows, str(path))
+    _check_names(names, rows, path)
     size = max(1, _PART // rows)
 
     def load(start: int) -> list[pa.ChunkedArray]:
         part = names[start : start + size]
         with pa.parquet.ParquetFile(path) as file:  # two threads cannot share a file
             table = file.read(part, use_threads=False)
-        return pa.table({name: _checked(name, table[name], str(path)) for name in part}).combine_chunks().columns
+        return pa.table({name: _checked(name, table[name], path) for name in part}).combine_chunks().columns
 
     with ThreadPoolExecutor(_READERS) as pool:
         columns = [column for part in pool.map(load, range(0, len(names), size)) for column in part]
@@ -182,30 +187,28 @@ def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.A
     with reading(path):
         file = pa.parquet.ParquetFile(path, pre_buffer=False)
         names = file.schema_arrow.names
-        _check_names(names, file.metadata.num_rows, str(path))
+        _check_names(names, file.metadata.num_rows, path)
 
     def blocks(name: str) -> Iterator[pa.Array]:
         first = 0
         with reading(path):
             for batch in file.iter_batches(BLOCK, columns=[name], use_threads=False):
-                column = _checked(name, pa.chunked_array([batch.column(name)]), str(path), first)
+                column = _checked(name, pa.chunked_array([batch.column(name)]), path, first)
                 first += len(column)
                 yield from column.chunks
 
     return names, blocks
 
 
-def typed(table: pa.Table, where: str, place: Callable[[int], str] | None = None) -> pa.Table:
+def typed(table: pa.Table, path: Path) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
-    Columns outside SCHEMA stay unchanged. `where` names the file in errors, and `place` a row of it. Raises
-    ManifestError for a missing column or value, a wrong type, an unknown split, and a stride below 1. So it does for
-    text that is not UTF-8 or longer than MAX_TEXT, and for a table without rows or with more than MAX_ROWS.
+    Columns outside SCHEMA stay unchanged. `path` is the table's file, for errors. Raises ManifestError for a missing
+    column or value, a wrong type, an unknown split, and a stride below 1. So it does for text that is not UTF-8 or
+    longer than MAX_TEXT, and for a table without rows or with more than MAX_ROWS.
     """
-    _check_names(table.column_names, table.num_rows, where)
-    return pa.table(
-        {name: _checked(name, table[name], where, 0, place) for name in table.column_names}
-    ).combine_chunks()
+    _check_names(table.column_names, table.num_rows, path)
+    return pa.table({name: _checked(name, table[name], path) for name in table.column_names}).combine_chunks()
 
 
 def typed_label(column: pa.ChunkedArray, name: str = "", where: Callable[[int], str] | None = None) -> pa.ChunkedArray:
@@ -255,19 +258,19 @@ def _check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]
         raise ManifestError(f"{where(words[0])}: column {name!r} has {cell} among numbers; write a number or nothing")
 
 
-def _check_names(names: Sequence[str], rows: int, where: str) -> None:
+def _check_names(names: Sequence[str], rows: int, path: Path) -> None:
     repeated = [name for name, count in Counter(names).items() if count > 1]
     missing = [name for name in REQUIRED if name not in names]
     if repeated:
-        raise ManifestError(f"{where}: column {shown(repeated[0])} is there twice")
+        raise ManifestError(f"{path}: column {shown(repeated[0])} is there twice")
     if len(names) == 1 and ";" in names[0]:
-        raise ManifestError(f"{where} has semicolons between its columns; save it with commas")
+        raise ManifestError(f"{path} has semicolons between its columns; save it with commas")
     if missing:
-        raise ManifestError(f"{where} lacks the column {', '.join(map(repr, missing))}; it has {listed(names)}")
+        raise ManifestError(f"{path} lacks the column {', '.join(map(repr, missing))}; it has {listed(names)}")
     if not rows:
-        raise ManifestError(f"{where} has no rows")
+        raise ManifestError(f"{path} has no rows")
     if rows > MAX_ROWS:
-        raise ManifestError(f"{where} has {rows:,} rows, more than {MAX_ROWS:,}; split it into several manifests")
+        raise ManifestError(f"{path} has {rows:,} rows, more than {MAX_ROWS:,}; split it into several manifests")
 
 
 def is_text(kind: pa.DataType) -> bool:
@@ -275,19 +278,16 @@ def is_text(kind: pa.DataType) -> bool:
     return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
-def _checked(
-    name: str, column: pa.ChunkedArray, where: str, first: int = 0, place: Callable[[int], str] | None = None
-) -> pa.ChunkedArray:
-    """Return a column with its type in SCHEMA, every value checked. Raises ManifestError, which names the row.
+def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> pa.ChunkedArray:
+    """Return a column with its type in SCHEMA, every value checked. Raises ManifestError, which names the place.
 
-    `first` is the number of its first row, and `place` names a row in errors.
+    `first` is the number of its first row in the file `path`.
     """
-    place = place or (lambda row: f"{where}, row {first + row}")
 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
         row = pc.index(bad, True).as_py()
         if row >= 0:
-            raise ManifestError(f"{place(row)}: column {shown(name)} {problem(row)}")
+            raise ManifestError(f"{place_of(path, first + row)}: column {shown(name)} {problem(row)}")
 
     for cast, kind in ((_plain, "UTF-8 text"), _CASTS[SCHEMA.get(name)]):
         try:
@@ -295,9 +295,9 @@ def _checked(
         except pa.ArrowInvalid:
             row = _first_invalid(column, cast)
             value = "" if cast is _plain else f", is {shown(column[row].as_py())}"
-            raise ManifestError(f"{place(row)}: column {shown(name)} must be {kind}{value}") from None
+            raise ManifestError(f"{place_of(path, first + row)}: column {shown(name)} must be {kind}{value}") from None
         except pa.ArrowTypeError:
-            raise ManifestError(f"{where}: column {name!r} must be {kind}, is {column.type}") from None
+            raise ManifestError(f"{path}: column {name!r} must be {kind}, is {column.type}") from None
     if name in REQUIRED:
         refuse(pc.is_null(column), lambda _: "is empty")
     if pa.types.is_string(column.type) and (name in SCHEMA or name.startswith("label.")):

@@ -375,7 +375,7 @@ class _Run:
         for row, column in job.images:
             try:
                 data = image_bytes(self.manifest, row, column)
-                jpegs.append(small_jpeg(data, f"{column} of row {row}", self.side))
+                jpegs.append(small_jpeg(data, column, self.side))
             except (OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or error
                 raise UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}") from None
@@ -537,14 +537,14 @@ def _article(manifest: Manifest, caption: Caption, number: int) -> str:
     for image_row, column in images:
         word = "touch" if column == "path" else "photograph"
         try:
-            jpeg = small_jpeg(image_bytes(manifest, image_row, column), f"{column} of row {image_row}", _SHEET_SIDE)
+            jpeg = small_jpeg(image_bytes(manifest, image_row, column), column, _SHEET_SIDE)
         except (OSError, ValueError) as error:
             parts.append(f"<p>{html.escape(str(error))}</p>")
             continue
         data = base64.b64encode(jpeg).decode()
         parts.append(f'<figure><img src="data:image/jpeg;base64,{data}" alt="{word}"><figcaption>{word}</figure>')
     notes = [f"phrase: {job.phrase}"] if job.phrase else []
-    notes += [f"{manifest.value(row, 'dataset')}, row {manifest.number[row]}, {len(job.rows)} rows share it"]
+    notes += [f"{manifest.value(row, 'dataset')}, {manifest.where(row)}, {len(job.rows)} rows share it"]
     parts += [f"<div><p><label><input type=checkbox> {number}. <b>{html.escape(caption.object)}</b></label></p>"]
     parts += [f"<p>{html.escape(caption.text)}</p>", *(f"<p><small>{html.escape(note)}</small></p>" for note in notes)]
     return f"<article>{''.join(parts)}</div></article>"

@@ -209,10 +209,8 @@ def _field(content: Any, field: str, topic: str) -> Any:
 
 READERS = {
     "bags": DatasetReader(
-        _bags,
-        "<recording>.mcap, <recording>.bag, or a folder with metadata.yaml",
-        "nothing, unless their owner asks for it",
-        "as their owner says",
+        _bags, "<recording>.mcap, <recording>.bag, or a folder with metadata.yaml",
+        "nothing, unless their owner asks for it", "as their owner says",
         uses=("val", "test", "sensor", "keys", "values", "export"),
     ),
-}
+}  # fmt: skip

@@ -7,7 +7,6 @@ an object store, and only their metadata are read.
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from pathlib import Path
@@ -16,8 +15,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet
 
+from anytouch_jax.config import parse_json
 from anytouch_jax.data.manifest.files import ShardError, tar_members
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
+from anytouch_jax.errors import UserError
 
 _CC_BY, _TACTILE_MNIST = "CC-BY-4.0", "CC-BY-2.0"
 SOURCES = {  # of gelsight-mini-pretrain, and the licence of each by its read-me
@@ -73,8 +74,7 @@ def _gelsight_mini(index: DatasetIndex) -> None:
                 frame_index=frame if is_film else 0, object=row.get("obj_name"), unit=side,
                 split=split if split in ("train", "val") else "test" if split.startswith("test")
                 else index.split_of(capture),
-                license=licence, commercial=licence in ("MIT", "BSD-3-Clause") or (licence.startswith("CC-BY-") and "NC"
-                not in licence),
+                license=licence, commercial=licence != "not stated" and "NC" not in licence,
                 **{f"label.{ours}": _plain(row.get(name)) for name, ours in _LABELS.items()},
             )  # fmt: skip
 
@@ -140,11 +140,11 @@ def _tars(index: DatasetIndex, sensor_of: Any) -> None:
 def _parsed(data: bytes, where: str) -> dict[str, Any]:
     """Return the simple values of a JSON object. Raises DatasetError."""
     try:
-        values = json.loads(data)
+        values = parse_json(data)
         while isinstance(values, str):  # T3's writer encodes twice
-            values = json.loads(values)
-    except ValueError as error:
-        raise DatasetError(f"{where} is no JSON: {error}") from None
+            values = parse_json(values)
+    except UserError as error:
+        raise DatasetError(f"{where} {error}; correct it or download it again") from None
     if not isinstance(values, dict):
         return {}
     return {str(name): _plain(value) for name, value in values.items() if isinstance(value, str | int | float)}
@@ -165,27 +165,18 @@ def _one_type(index: DatasetIndex) -> None:
 
 READERS = {
     "gelsight_mini_pretrain": DatasetReader(
-        _gelsight_mini,
-        "<source>/train-00000.parquet",
-        "the data set card of yxma/gelsight-mini-pretrain, and each source",
-        "by row",
-        "https://huggingface.co/datasets/yxma/gelsight-mini-pretrain",
-        uses=("val", "test", "url"),
+        _gelsight_mini, "<source>/train-00000.parquet",
+        "the data set card of yxma/gelsight-mini-pretrain, and each source", "by row",
+        "https://huggingface.co/datasets/yxma/gelsight-mini-pretrain", uses=("val", "test", "url"),
     ),
     "fota": DatasetReader(
-        _fota,
-        "<data set>/train/data-000000.tar",
+        _fota, "<data set>/train/data-000000.tar",
         "Zhao et al., Transferable Tactile Transformers for Representation Learning Across Diverse Sensors and Tasks, "
-        "CoRL 2024",
-        "MIT",
-        "https://huggingface.co/datasets/alanz-mit/FoundationTactile",
-        uses=("val", "test", "url", "sensor"),
+        "CoRL 2024", "MIT",
+        "https://huggingface.co/datasets/alanz-mit/FoundationTactile", uses=("val", "test", "url", "sensor"),
     ),
     "webdataset": DatasetReader(
-        _webdataset,
-        "<folder>/000000.tar",
-        "nothing, unless their owner asks for it",
-        "as their owner says",
+        _webdataset, "<folder>/000000.tar", "nothing, unless their owner asks for it", "as their owner says",
         uses=("val", "test", "url", "sensor"),
     ),
-}
+}  # fmt: skip

@@ -1,8 +1,9 @@
 """Touches with measured forces and poses: TacBench as Sparsh publishes it, ToucHD-Force, FreeTacMan.
 
 Layouts are those of public code: the loaders of github.com/facebookresearch/sparsh (`data/digit/utils.py` and its
-read-me), `data/downstream_dataset.py` of github.com/GeWu-Lab/AnyTouch2, and `data_collection/start_collect.py` of
-github.com/OpenDriveLab/FreeTacMan. Pickles may hold plain values and arrays of NumPy alone: no other code is run.
+read-me), `data/downstream_dataset.py` of github.com/GeWu-Lab/AnyTouch2, and `start_collect.py` and `pose_to_joint.py`
+in `data_collection` of github.com/OpenDriveLab/FreeTacMan, with the names of files on its data set card. Pickles may
+hold plain values and arrays of NumPy alone: no other code is run.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.data.images import ImageError
+from anytouch_jax.data.manifest.schema import is_text, read_text_csv, typed_label
 from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
@@ -189,7 +191,8 @@ def _touchd(index: DatasetIndex) -> None:
 def _freetacman(index: DatasetIndex) -> None:
     """FreeTacMan's demonstrations: <task>/<task>_<n>_<camera>.mp4, with <...>_timestamps.txt if they are there.
 
-    Cameras called tactile are read, or those of the option `keys`. A demonstration is an object's recording.
+    Cameras called tactile are read, or those of the option `keys`. A demonstration is an object's recording. The number
+    columns of <task>_<n>_traj.csv, such as `gripper_distance`, become labels if it has a row a frame.
     """
     wanted = index.options.keys or ("tactile",)
     for folder, folders, files in index.tracked(list(index.walk())):
@@ -209,10 +212,20 @@ def _freetacman(index: DatasetIndex) -> None:
             frames = index.frames(place)
             times: Any = _times(index.root / folder / f"{stem}_timestamps.txt", len(frames))
             task, camera = folder.split("/")[-1] or stem.split("_")[0], next(key for key in wanted if key in stem)
+            demonstration = stem.partition(f"_{camera}")[0]
             index.add_recording(
-                frames, place, split=index.split_of(stem.partition(f"_{camera}")[0]), sensor="freetacman", object=task,
-                sequence=place, unit=stem[stem.index(camera) :], time=times,
+                frames, place, split=index.split_of(demonstration), sensor="freetacman", object=task, sequence=place,
+                unit=stem[stem.index(camera) :], time=times,
+                **_poses(index.root / folder / f"{demonstration}_traj.csv", len(frames)),
             )  # fmt: skip
+
+
+def _poses(path: Path, count: int) -> dict[str, list[Any]]:
+    """Return the number columns of a trajectory as labels, {} if there are not `count` rows. Raises ManifestError."""
+    if not path.is_file() or (table := read_text_csv(path)).num_rows != count:
+        return {}
+    columns = {name: typed_label(table[name]) for name in table.column_names}
+    return {f"label.{name}": column.to_pylist() for name, column in columns.items() if not is_text(column.type)}
 
 
 def _times(path: Path, count: int) -> list[float] | None:
@@ -226,33 +239,21 @@ def _times(path: Path, count: int) -> list[float] | None:
 
 READERS = {
     "tacbench_force": DatasetReader(
-        _force,
-        "<indenter>/batch_1/dataset_digit_00.pkl and dataset_slip_forces.pkl",
-        _SPARSH,
-        "CC-BY-NC-4.0",
-        "https://huggingface.co/datasets/facebook/digit-force-estimation",
-        uses=("export",),
+        _force, "<indenter>/batch_1/dataset_digit_00.pkl and dataset_slip_forces.pkl", _SPARSH, "CC-BY-NC-4.0",
+        "https://huggingface.co/datasets/facebook/digit-force-estimation", uses=("export",),
     ),
     "tacbench_pose": DatasetReader(
-        _pose,
-        "train/<object>/bag_00.pkl",
-        _SPARSH,
-        "CC-BY-NC-4.0",
-        "https://huggingface.co/datasets/facebook/digit-pose-estimation",
-        uses=("export",),
+        _pose, "train/<object>/bag_00.pkl", _SPARSH, "CC-BY-NC-4.0",
+        "https://huggingface.co/datasets/facebook/digit-pose-estimation", uses=("export",),
     ),
     "touchd_force": DatasetReader(
-        _touchd,
-        "all_data_direction.json and <object_speed>/<sensor>/image_1.png",
+        _touchd, "all_data_direction.json and <object_speed>/<sensor>/image_1.png",
         "AnyTouch 2: General Optical Tactile Representation Learning For Dynamic Tactile Perception, ICLR 2026",
         url="https://huggingface.co/datasets/BAAI/ToucHD-Force",
     ),
     "freetacman": DatasetReader(
-        _freetacman,
-        "<task>/<task>_1_tactile.mp4",
+        _freetacman, "<task>/<task>_1_tactile.mp4",
         "Wu et al., FreeTacMan: Robot-free Visuo-Tactile Data Collection System for Contact-rich Manipulation, 2025",
-        "MIT",
-        "https://huggingface.co/datasets/OpenDriveLab/FreeTacMan",
-        uses=("val", "test", "keys", "export"),
+        "MIT", "https://huggingface.co/datasets/OpenDriveLab/FreeTacMan", uses=("val", "test", "keys", "export"),
     ),
-}
+}  # fmt: skip

@@ -190,11 +190,8 @@ def write_features(root: Path, name: str, features: np.ndarray, index: np.ndarra
 
 READERS = {
     "lerobot": DatasetReader(
-        _lerobot,
-        "meta/info.json and data/chunk-000/file-000.parquet",
-        "the data set's own card",
-        "as their owner says",
-        "https://github.com/huggingface/lerobot",
+        _lerobot, "meta/info.json and data/chunk-000/file-000.parquet", "the data set's own card",
+        "as their owner says", "https://github.com/huggingface/lerobot",
         uses=("val", "test", "sensor", "keys", "values", "export"),
     ),
-}
+}  # fmt: skip

@@ -136,20 +136,14 @@ def _camera_views(
 
 READERS = {
     "objectfolder": DatasetReader(
-        _rendered,
-        "obj1.0/<id>/<n>.png or obj2.0/touch/<id>/<n>.png",
-        "Gao et al., ObjectFolder, CoRL 2021; ObjectFolder 2.0, CVPR 2022",
-        "CC-BY-4.0",
-        "https://github.com/rhgao/ObjectFolder",
-        uses=("lists",),
+        _rendered, "obj1.0/<id>/<n>.png or obj2.0/touch/<id>/<n>.png",
+        "Gao et al., ObjectFolder, CoRL 2021; ObjectFolder 2.0, CVPR 2022", "CC-BY-4.0",
+        "https://github.com/rhgao/ObjectFolder", uses=("lists",),
     ),
     "objectfolder_real": DatasetReader(
-        _real,
-        "tactile/<object>/<trial>/gelsight/<n>.png",
+        _real, "tactile/<object>/<trial>/gelsight/<n>.png",
         "Gao et al., The ObjectFolder Benchmark: Multisensory Learning with Neural and Real Objects, CVPR 2023",
-        "CC-BY-4.0",
-        "https://objectfolder.stanford.edu/objectfolder-real-download",
-        uses=("val", "test", "lists"),
+        "CC-BY-4.0", "https://objectfolder.stanford.edu/objectfolder-real-download", uses=("val", "test", "lists"),
         paper=1_165_000,
     ),
-}
+}  # fmt: skip

@@ -19,7 +19,7 @@ from tests.weights.test_start import mae
 
 OTHERS = ROOT / "tests" / "parity" / "golden_others"
 MADE = {  # small files of the other families: title, (width, depth, heads, mlp), patch, what else differs, pixels
-    "sparsh": (forms.SPARSH, (24, 1, 4, 48), 32, {"tubelet": 3, "frames": 3}, (320, 240)),
+    "sparsh": (forms.SPARSH, (24, 1, 4, 48), 16, {"tubelet": 3, "frames": 3}, (320, 240)),
     "sparsh_video": (forms.VIDEO, (20, 1, 5, 30), 8, {"tubelet": 2, "frames": 4, "grid": (2, 5, 5)}, (40, 40)),
     "sitr": (forms.SITR, (18, 1, 3, 20), 8, {"grid": (1, 4, 4), "calibration": 9, "outputs": 11}, (32, 32)),
     "t3": (forms.T3, (24, 1, 4, 48), 8, {"grid": (1, 5, 5), "trunk": 1}, (40, 40)),
@@ -76,7 +76,9 @@ def test_probes_and_retrieval_of_a_family(anytouch, family, files, touches, tmp_
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_regression_tasks_of_a_family(anytouch, family, files, touches):
-    done = anytouch("probe", "tasks", "--model", files[family], "--data", touches, "--tasks", "force", "--frames", 4)
+    frames = 1 if family == "sparsh" else 4  # its pairs are 5 frames apart, more than these recordings have
+    words = ("--model", files[family], "--data", touches, "--tasks", "force", "--frames", frames)
+    done = anytouch("probe", "tasks", *words)
     assert done.status == 0 and "force" in done.out, done.err
 
 

@@ -72,8 +72,13 @@ def test_an_unknown_name_is_answered_with_the_known_ones(packaged):
 def test_a_repository_of_the_hub_is_loaded(tmp_path, monkeypatch, address, revision):
     folder, asked = write_encoder(tmp_path / "snapshot"), []
 
+    needed = ["preprocessor_config.json", "model.safetensors.index.json", "sparsh.ckpt", "encoders/digit.pth"]
+    needed += ["calibration/0000.png", "config.json", "tokenizer.json", "model.safetensors"]
+
     def snapshot_download(repository, *, revision, allow_patterns):
         asked.append((repository, revision))
+        names = [*needed, "flax_model.msgpack", "picture.png"]
+        assert list(huggingface_hub.utils.filter_repo_objects(names, allow_patterns=allow_patterns)) == needed
         return str(folder)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)

@@ -31,7 +31,7 @@ FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, m
 WEIGHTS, CARD = "model.safetensors", "config.json"
 PARTS = ("touch", "text", "logit_scale")  # for features, zero-shot questions and the start of a run
 _HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
-_FILES = ["*.safetensors", "*.safetensors.index.json", "*.pth", "*.pt", "*.bin", "config.json", "tokenizer.json"]
+_FILES = ["*.safetensors", "*.pth", "*.pt", "*.bin", "*.ckpt", "*.json", "calibration/*.png"]
 
 
 def list_encoders() -> list[str]:

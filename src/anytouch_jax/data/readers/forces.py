@@ -1,8 +1,8 @@
 """Touches with measured forces and poses: TacBench as Sparsh publishes it, ToucHD-Force, FreeTacMan.
 
 Layouts are those of public code: the loaders of github.com/facebookresearch/sparsh (`data/digit/utils.py` and its
-read-me), `data/downstream_dataset.py` of github.com/GeWu-Lab/AnyTouch2, and `start_collect.py` and `pose_to_joint.py`
-in `data_collection` of github.com/OpenDriveLab/FreeTacMan, with the names of files on its data set card. Pickles may
+read-me) and `data/downstream_dataset.py` of github.com/GeWu-Lab/AnyTouch2. That of FreeTacMan is in `start_collect.py`
+and `pose_to_joint.py` of github.com/OpenDriveLab/FreeTacMan. Its data set card has the names of files. Pickles may
 hold plain values and arrays of NumPy alone: no other code is run.
 """
 
@@ -213,10 +213,10 @@ def _freetacman(index: DatasetIndex) -> None:
             times: Any = _times(index.root / folder / f"{stem}_timestamps.txt", len(frames))
             task, camera = folder.split("/")[-1] or stem.split("_")[0], next(key for key in wanted if key in stem)
             demonstration = stem.partition(f"_{camera}")[0]
+            poses: Any = _poses(index.root / folder / f"{demonstration}_traj.csv", len(frames))
             index.add_recording(
                 frames, place, split=index.split_of(demonstration), sensor="freetacman", object=task, sequence=place,
-                unit=stem[stem.index(camera) :], time=times,
-                **_poses(index.root / folder / f"{demonstration}_traj.csv", len(frames)),
+                unit=stem[stem.index(camera) :], time=times, **poses,
             )  # fmt: skip
 
 

@@ -115,6 +115,13 @@ def test_an_exported_family_gives_the_features_of_the_live_one(anytouch, family,
     assert "float32" in said["input"] and said["preparation"]["mean"]
 
 
+def test_a_family_without_sensors_ignores_the_sensor_and_says_so_once(files):
+    encoder, logged = load_encoder(files["vit_mae"]), list[str]()
+    assert [encoder.sensor_row("digit", logged.append) for _ in range(3)] == [0, 0, 0]
+    (sentence,) = logged
+    assert "the sensor 'digit' is ignored" in sentence
+
+
 def test_a_run_starts_from_a_family(anytouch, files, touches, tmp_path):
     size = "--model.image-size 28 --model.patch 7 --model.touch.width 16 --model.touch.depth 2 --model.touch.heads 2"
     size += " --model.touch.mlp 32 --model.norm-eps 1e-12 --model.decoder.width 8 --model.decoder.depth 1"

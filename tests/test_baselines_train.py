@@ -9,11 +9,11 @@ import pytest
 from runs import arrays_of, read_metrics, run_config, train
 from touch_world import make_touches
 
-from anytouch_jax.config import baselines
+from anytouch_jax.config import presets
 from anytouch_jax.encoder.encoder import load_encoder
 
 STILLS = np.random.default_rng(0).integers(0, 256, (2, 28, 28, 3), np.uint8)
-EVERY = [(name, stage) for name, one in baselines.BASELINES.items() for stage in one.stages]
+EVERY = [(name, stage) for name, one in presets.BASELINES.items() for stage in one.stages]
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def data(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "stage"), EVERY)
 def test_a_baseline_trains_and_embeds(data, tmp_path, name, stage):
-    config = baselines.apply(name, run_config(data, stage, batch=4, steps=4))
+    config = presets.apply_baseline(name, run_config(data, stage, batch=4, steps=4))
     # The parameters of one still and one clip step are what two steps of the alternating order move.
     result = train(replace(config, optim=replace(config.optim, warmup=1)), tmp_path / "r", stop_after=2)
     lines = read_metrics(tmp_path / "r")

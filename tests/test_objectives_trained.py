@@ -13,7 +13,7 @@ from used_parameters import used_parameters
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
-from anytouch_jax.config import Config, baselines
+from anytouch_jax.config import Config, presets
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.optim import match_rules
 from anytouch_jax.weights.tree import flatten
@@ -69,7 +69,7 @@ def check(config: Config, every: bool = True) -> None:
 
 PARTS = [{}, {"decoder_sensor_tokens": True}, {"patch_encoder": "sensor"}, {"patch_encoder": "convolutional"}]
 HEADS = [("paper", "mlp"), ("paper", "cosine"), ("paper", "none"), ("release", "linear"), ("release", "cosine")]
-BASELINES = [(name, stage) for name, baseline in baselines.BASELINES.items() for stage in baseline.stages]
+BASELINES = [(name, stage) for name, baseline in presets.BASELINES.items() for stage in baseline.stages]
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -93,6 +93,6 @@ def test_parts_of_the_network(part):
 
 @pytest.mark.parametrize(("name", "stage"), BASELINES)
 def test_baselines(name, stage):
-    config = baselines.apply(name, tiny_config(stage))
+    config = presets.apply_baseline(name, tiny_config(stage))
     if name == "anytouch" or config != tiny_config(stage):  # equal configurations are checked once
         check(config, every=False)

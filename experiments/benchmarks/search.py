@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.evaluate.search import load_index
+from anytouch_jax.encoder.search import load_index
 from anytouch_jax.evaluate.statistics import markdown_table
 from experiments.command import run_script
 

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import softmax
 
-from anytouch_jax.evaluate import heads, logistic, statistics
+from anytouch_jax.encoder.search import nearest
+from anytouch_jax.evaluate import logistic, statistics
 from experiments.real.recordings import Recordings
 
 Array = np.ndarray
@@ -68,7 +69,7 @@ def neighbour_scores(x: Array, y: Array, classes: int, fit: Array, weights: Arra
     """Return (k, shares of the classes among the k nearest train frames (n, classes))."""
     centred = x - x[fit].mean(0)
     unit = centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-12)
-    near, cosine = heads.nearest(unit[fit], unit, max(NEIGHBOURS))
+    near, cosine = nearest(unit[fit], unit, max(NEIGHBOURS))
     results = []
     for k in NEIGHBOURS:
         votes = np.zeros((len(x), classes))

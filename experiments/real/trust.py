@@ -20,6 +20,7 @@ import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder import health, novelty
+from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, probing, splits, tasks
 from anytouch_jax.evaluate.statistics import Array, markdown_table
@@ -76,7 +77,7 @@ def calibration_error(p: Array, correct: Array, bins: int = 15) -> float:
     return float(np.abs(gaps).sum() / max(sizes.sum(), 1))
 
 
-def fitted(x: Array, y: Array, rows: tasks.TaskRows, keep: Array, options: TrustOptions) -> heads.LinearHead:
+def fitted(x: Array, y: Array, rows: tasks.TaskRows, keep: Array, options: TrustOptions) -> LinearHead:
     """Return a calibrated head of the train rows in `keep`, bool (n,)."""
     fit, val = (np.flatnonzero((rows.split == name) & keep) for name in ("train", "val"))
     names, numbers = np.unique(y, return_inverse=True)

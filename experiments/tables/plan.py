@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
-from anytouch_jax.config import UNIVERSAL, Config, Stack, baselines, preset
+from anytouch_jax.config import UNIVERSAL, Config, Stack, preset, presets
 
 SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")  # in the order in which Table 1 adds them
 UNSEEN = "duragel"
@@ -197,7 +197,7 @@ def training(
     size: Size, recipe: str, seed: int, *, sensors: Sequence[str] = SENSORS, aligned: bool = True,
     extra: Sequence[str] = (), data: dict[str, Any] | None = None,
 ) -> Training:  # fmt: skip
-    """Return the last stage of a recipe (`anytouch_jax.config.baselines`) on the data of `sensors`.
+    """Return the last stage of a recipe (`anytouch_jax.config.presets`) on the data of `sensors`.
 
     `aligned` adds the touches that several sensors share.
 
@@ -205,10 +205,10 @@ def training(
     """
     manifests = (*(f"own/{name}" for name in sensors), *(ALIGNED if aligned else ()), *extra)
     last: Training | None = None
-    for stage in baselines.find(recipe).stages:
+    for stage in presets.find_baseline(recipe).stages:
         config = _config(size, stage, seed, sensors, manifests)
         config = replace(config, data=replace(config.data, **(data or {})))
-        last = Training(baselines.apply(recipe, config), last)
+        last = Training(presets.apply_baseline(recipe, config), last)
     if last is None:
         raise ValueError(f"{recipe} is not trained")
     return last

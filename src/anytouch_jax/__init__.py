@@ -21,7 +21,7 @@ _HOMES = {
     "train.optim": "optimizer",
     "train.loop": "fit",
     "pretrain": "pretrain",
-    "evaluate.heads": "ProbeHead load_head",
+    "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",
     "data.loading.loader": "Loader",
     "data.manifest.manifest": "Manifest",
@@ -30,6 +30,7 @@ _HOMES = {
     "encoder.encoder": "Encoder load_encoder random_encoder",
     "encoder.family": "FamilyEncoder",
     "encoder.examples": "example_touches",
+    "encoder.linear_head": "load_head",
     "encoder.preprocess": "Preprocess",
 }
 _ALIASES = {  # public names that say more outside their module

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from runs import run_config, train
 
-from anytouch_jax.evaluate.heads import load_head
+from anytouch_jax.encoder.linear_head import load_head
 
 
 def write_video(path, frames, codec="MJPG"):

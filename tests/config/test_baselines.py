@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from anytouch_jax.cli import app, train
-from anytouch_jax.config import Config, baselines, from_json, preset, to_json
+from anytouch_jax.config import Config, from_json, preset, presets, to_json
 from anytouch_jax.errors import UserError
 
 NAMES = (
@@ -55,14 +55,14 @@ def flat(value: object, prefix: str = "") -> dict[str, object]:
 
 
 def differences(name: str, config: Config) -> dict[str, object]:
-    before, after = flat(config), flat(baselines.apply(name, config))
+    before, after = flat(config), flat(presets.apply_baseline(name, config))
     assert before.keys() == after.keys()
     return {key: after[key] for key in after if after[key] != before[key]}
 
 
 def test_the_names_are_those_of_the_tables() -> None:
-    assert tuple(sorted(baselines.BASELINES)) == tuple(sorted(NAMES))
-    for name, one in baselines.BASELINES.items():
+    assert tuple(sorted(presets.BASELINES)) == tuple(sorted(NAMES))
+    for name, one in presets.BASELINES.items():
         assert one.name == name and len(one.about) > 8
         assert {stage for known, stage in CHANGED if known == name} == set(one.stages)
 
@@ -82,26 +82,26 @@ def test_pretrained_towers_without_vision_have_no_lora() -> None:
 def test_the_two_names_of_the_paper_for_a_static_model_are_one_recipe() -> None:
     for stage in (1, 2):
         config = preset("tiny", stage=stage)
-        assert baselines.apply("static_only", config) == baselines.apply("no_dynamic", config)
+        assert presets.apply_baseline("static_only", config) == presets.apply_baseline("no_dynamic", config)
 
 
-@pytest.mark.parametrize("name", list(baselines.BASELINES))
+@pytest.mark.parametrize("name", list(presets.BASELINES))
 def test_a_stage_that_a_recipe_lacks_is_refused(name: str) -> None:
-    one = baselines.BASELINES[name]
+    one = presets.BASELINES[name]
     for stage in {1, 2} - set(one.stages):
         with pytest.raises(UserError, match=f"baseline {name} (has no stage {stage}|is not trained)"):
-            baselines.apply(name, preset("tiny", stage=stage))
+            presets.apply_baseline(name, preset("tiny", stage=stage))
     assert one.starts_from_stage1 == (one.stages == (1, 2))
 
 
 def test_unknown_names_are_one_sentence() -> None:
     with pytest.raises(UserError, match=r"no baseline is called 'clip'\. Choose one of anytouch, no_pretraining"):
-        baselines.apply("clip", preset("tiny"))
+        presets.apply_baseline("clip", preset("tiny"))
 
 
 def test_every_recipe_is_written_and_read() -> None:
     for name, stage in CHANGED:
-        config = baselines.apply(name, preset("tiny", stage=stage))
+        config = presets.apply_baseline(name, preset("tiny", stage=stage))
         assert from_json(to_json(config)) == config
 
 

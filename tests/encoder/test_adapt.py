@@ -13,7 +13,7 @@ from runs import run_config, train
 from touch_world import make_touches
 
 from anytouch_jax.cli import app
-from anytouch_jax.config import baselines, from_json, to_json
+from anytouch_jax.config import from_json, presets, to_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder import adapt as module
 from anytouch_jax.encoder.adapt import adapt, choose_frames, save
@@ -124,7 +124,7 @@ def test_a_sensor_outside_the_table_gets_a_new_row(run, table, tmp_path):
 
 def test_a_model_without_universal_tokens_starts_from_the_mean_of_its_sensors(run, table, tmp_path):
     params, text, _ = checkpoint.load_params(run)
-    config = baselines.apply("no_universal", from_json(text))
+    config = presets.apply_baseline("no_universal", from_json(text))
     other = stored(tmp_path / "own", config, params, seen=["gelsight", "digit"])
     tokens = np.asarray(adapt(other, table, "my_gel", frames=0).params["touch"]["sensor_tokens"])
     np.testing.assert_allclose(tokens[10], params["touch"]["sensor_tokens"][:2].mean(0), rtol=1e-6)
@@ -199,7 +199,7 @@ def test_models_that_cannot_be_adapted_say_so(run, table, tmp_path):
     only = stored(tmp_path / "bare", config, {"decoder": params["decoder"]})
     with pytest.raises(UserError, match="no touch encoder"):
         adapt(only, table, "gelslim", frames=0)
-    t3 = baselines.apply("t3", config)
+    t3 = presets.apply_baseline("t3", config)
     other = stored(tmp_path / "t3", t3, build(t3.model).init(jax.random.key(0)), seen=["digit"])
     with pytest.raises(UserError, match="without tokens"):
         adapt(other, table, "gelslim", frames=0)

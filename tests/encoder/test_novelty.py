@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anytouch_jax.encoder import novelty
+from anytouch_jax.encoder import linear_head, novelty
 from anytouch_jax.encoder.novelty import Calibration, ContactGate
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits
@@ -132,8 +132,8 @@ def test_a_sensor_that_was_not_named_is_reported():
 
 def test_a_saved_head_keeps_its_calibration(tmp_path):
     head = calibrated(*touches(np.random.default_rng(6), 60))
-    heads.save_head(tmp_path / "h.npz", head)
-    again, x = heads.load_head(tmp_path / "h.npz"), touches(np.random.default_rng(7), 20)[0]
+    linear_head.save_head(tmp_path / "h.npz", head)
+    again, x = linear_head.load_head(tmp_path / "h.npz"), touches(np.random.default_rng(7), 20)[0]
     for one, two in zip(head.assess(x), again.assess(x), strict=True):
         np.testing.assert_array_equal(one, two)
     assert (again.calibration.sensors == head.calibration.sensors).all()
@@ -149,17 +149,17 @@ def test_a_saved_head_keeps_its_calibration(tmp_path):
 )  # fmt: skip
 def test_a_damaged_calibration_is_refused(tmp_path, name, value):
     head = calibrated(*touches(np.random.default_rng(6), 60))
-    heads.save_head(tmp_path / "h.npz", head)
+    linear_head.save_head(tmp_path / "h.npz", head)
     arrays = dict(np.load(tmp_path / "h.npz"))
     del arrays[f"calibration/{name}"]
     np.savez(tmp_path / "h.npz", **arrays, **({} if value is None else {f"calibration/{name}": value}))
     with pytest.raises(UserError, match=r"h\.npz is not the head"):
-        heads.load_head(tmp_path / "h.npz")
+        linear_head.load_head(tmp_path / "h.npz")
 
 
 def test_a_head_without_calibration_says_so():
     head = calibrated(*touches(np.random.default_rng(6), 60))
-    bare = heads.LinearHead(**{**vars(head), "calibration": None})
+    bare = linear_head.LinearHead(**{**vars(head), "calibration": None})
     with pytest.raises(UserError, match="no calibration"):
         bare.assess(np.zeros((1, WIDTH)))
     assert Calibration.from_arrays({}, WIDTH) is None

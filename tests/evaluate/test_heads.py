@@ -11,6 +11,7 @@ import optax
 import pytest
 from task_world import blobs
 
+from anytouch_jax.encoder import linear_head, search
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads
 from anytouch_jax.evaluate.heads import GradientRecipe, LinearModel, ProbeHead, fit_head, linear_path
@@ -139,7 +140,7 @@ def test_ridge_equals_its_normal_equations():
 def test_nearest_equals_sorting_everything(k, columns):
     rng = np.random.default_rng(0)
     train, scored = (rng.normal(size=(n, 16)).astype(np.float32) for n in (columns, 9))
-    ids, cosines = heads.nearest(train, scored, k)
+    ids, cosines = search.nearest(train, scored, k)
     expected = np.argsort(-(scored @ train.T), axis=1)[:, :k]
     np.testing.assert_array_equal(ids, expected)
     np.testing.assert_allclose(cosines, np.take_along_axis(scored @ train.T, expected, 1), rtol=1e-5)
@@ -241,8 +242,8 @@ def test_a_saved_head_gives_the_same_predictions(tmp_path, classes):
     names = np.array(["a", "b", "c"][:classes])
     (model,) = linear_path(x, y, [0.01])
     about = {"label": "shape", "pooling": "mean", "frames": 3, "fingerprint": "f"}
-    heads.save_head(tmp_path / "h.npz", heads.linear_head(model, names, **about))
-    head = heads.load_head(tmp_path / "h.npz")
+    linear_head.save_head(tmp_path / "h.npz", heads.linear_head(model, names, **about))
+    head = linear_head.load_head(tmp_path / "h.npz")
     labels, p = head(x)
     np.testing.assert_array_equal(labels, names[model(x)])
     np.testing.assert_allclose(p.sum(1), 1, atol=1e-6)
@@ -257,12 +258,12 @@ def test_heads_of_the_first_release_still_load(tmp_path):
     arrays = {"classes": np.array(["a", "b"]), "weights": np.ones((2, 1)), "bias": np.zeros(1), "mean": np.zeros(2),
               "scale": np.ones(2), "label": "l", "pooling": "both", "frames": 1, "mark": "12ab"}  # fmt: skip
     np.savez(tmp_path / "h.npz", format="anytouch_jax.head.1", **arrays)
-    head = heads.load_head(tmp_path / "h.npz")
+    head = linear_head.load_head(tmp_path / "h.npz")
     assert head.fingerprint == "12ab" and head([[3.0, 0.0], [-3.0, 0.0]])[0].tolist() == ["b", "a"]
     np.savez(tmp_path / "other.npz", format="another")
     for name in ("other.npz", "gone.npz"):
         with pytest.raises(UserError, match=name):
-            heads.load_head(tmp_path / name)
+            linear_head.load_head(tmp_path / name)
     for name, value in (
         ("weights", np.full((2, 1), np.nan)), ("weights", np.ones((3, 1))), ("scale", np.zeros(2)),
         ("mean", np.zeros(0)), ("classes", np.zeros(2)), ("bias", np.array("0")), ("frames", np.zeros(3)),
@@ -271,7 +272,7 @@ def test_heads_of_the_first_release_still_load(tmp_path):
     ):  # fmt: skip
         np.savez(tmp_path / "h.npz", **{"format": "anytouch_jax.head.1", **arrays, name: value})
         with pytest.raises(UserError, match=r"h\.npz is not the head of a probe"):
-            heads.load_head(tmp_path / "h.npz")
+            linear_head.load_head(tmp_path / "h.npz")
 
 
 def test_the_middle_of_equals_is_selected():

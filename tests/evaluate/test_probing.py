@@ -20,10 +20,10 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.readers import IndexOptions, index
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
+from anytouch_jax.encoder.linear_head import load_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, heads
 from anytouch_jax.evaluate.feature_cache import RAW, FeatureSource, FeatureStore, pixel_components
-from anytouch_jax.evaluate.heads import load_head
 from anytouch_jax.evaluate.probing import (
     label_rows,
     probe_benchmark,

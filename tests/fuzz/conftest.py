@@ -15,7 +15,7 @@ from weights_world import params_of, save_run
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
-from anytouch_jax.evaluate.heads import LinearHead, save_head
+from anytouch_jax.encoder.linear_head import LinearHead, save_head
 from tests.fuzz.harness import total, try_all
 
 

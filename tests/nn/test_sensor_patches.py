@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_models import full_model, tiny_config, touch_model
 
-from anytouch_jax.config import baselines
+from anytouch_jax.config import presets
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.compatible import serve_unseen
 from anytouch_jax.weights.convert import to_release
@@ -127,6 +127,6 @@ def test_a_model_that_saw_no_known_sensor_stays_as_it_is():
 
 
 def test_t3_is_a_model_that_is_built():
-    model = baselines.apply("t3", tiny_config(1)).model
+    model = presets.apply_baseline("t3", tiny_config(1)).model
     assert param_shapes(model)["touch/patch/kernel"] == (10, 3, 147, 16)
     assert param_shapes(model)["touch/sensor_tokens"] == (10, 0, 16)

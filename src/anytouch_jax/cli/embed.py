@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.embed import Features
     from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.encoder.linear_head import LinearHead
     from anytouch_jax.encoder.novelty import ContactGate
     from anytouch_jax.encoder.preprocess import Preprocess
-    from anytouch_jax.evaluate.heads import LinearHead
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ def run(options: EmbedOptions) -> int:
 def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean", "both"], LinearHead | None]:
     """Return the encoder, the pooling and the head that `options` name. Raises UserError if they do not fit."""
     from anytouch_jax.encoder.encoder import check_frames, load_encoder
-    from anytouch_jax.evaluate.heads import load_head
+    from anytouch_jax.encoder.linear_head import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     head = None if options.head is None else load_head(options.head)

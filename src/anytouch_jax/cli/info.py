@@ -281,7 +281,7 @@ def _arrays(path: Path) -> list[str]:
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}. Write it again.") from None
     if {"format", "mark", "classes"} <= arrays.keys():
-        from anytouch_jax.evaluate.heads import load_head
+        from anytouch_jax.encoder.linear_head import load_head
 
         head = load_head(path)
         return [

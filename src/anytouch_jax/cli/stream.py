@@ -12,8 +12,8 @@ from anytouch_jax.cli.output import check_folder, log, refuse_unused
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
+    from anytouch_jax.encoder.linear_head import LinearHead
     from anytouch_jax.encoder.stream import Embedded
-    from anytouch_jax.evaluate.heads import LinearHead
 
 
 @dataclass(frozen=True, kw_only=True)

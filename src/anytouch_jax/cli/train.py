@@ -20,8 +20,8 @@ from anytouch_jax.config import (
     OptimConfig,
     PresetName,
     RunConfig,
-    baselines,
     preset,
+    presets,
 )
 from anytouch_jax.config.parsing import NotNegative
 from anytouch_jax.errors import UserError
@@ -145,12 +145,12 @@ def _configure(options: TrainOptions) -> Config:
         "run.save_every": options.save_every, "run.tensorboard": options.tensorboard,
     }  # fmt: skip
     config = _preset(options).with_settings({name: value for name, value in short.items() if value is not None})
-    return baselines.apply(options.baseline, config)
+    return presets.apply_baseline(options.baseline, config)
 
 
 def _refuse_unread(options: TrainOptions, config: Config) -> None:
     """Raise UserError for options that do not go together, and for settings that this stage does not read."""
-    baseline = baselines.find(options.baseline)
+    baseline = presets.find_baseline(options.baseline)
     if options.stage == 2 and options.init and not baseline.starts_from_stage1:
         raise UserError(f"baseline {baseline.name} has no stage 1. Remove --init.")
     if options.stage == 1 and options.towers == "pretrained" and not options.clip_weights:
@@ -163,7 +163,7 @@ def _refuse_unread(options: TrainOptions, config: Config) -> None:
         unread = dict.fromkeys(reads, "in stage 2 of the paper recipe")
         if options.clip_weights:
             unread["model.temperature"] = "with --clip-weights, which has its own"
-    usual = baselines.apply(options.baseline, _preset(options))
+    usual = presets.apply_baseline(options.baseline, _preset(options))
     for field, reason in unread.items():
         value = attrgetter(field)
         if value(config) != value(usual):

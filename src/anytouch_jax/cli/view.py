@@ -71,7 +71,7 @@ def _is_camera(path: Path, live: bool) -> bool:
 
 def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Live:
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.evaluate.heads import load_head
+    from anytouch_jax.encoder.linear_head import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
     from anytouch_jax.view.live import Live
 

@@ -1,4 +1,4 @@
-"""Heads on frozen features: linear, nearest-neighbour, ridge and gradient-trained; and saved linear heads.
+"""Heads on frozen features: linear, nearest-neighbour, ridge and gradient-trained.
 
 A head is fitted once for all its options, from which a protocol selects one. The options are penalties (linear, ridge),
 numbers of neighbours (kNN) or epochs (the authors' gradient-trained layer).
@@ -9,21 +9,20 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-import numpy.typing as npt
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.arrays import binary_scale, unit_rows
-from anytouch_jax.encoder.novelty import Assessment, Calibration
+from anytouch_jax.encoder.linear_head import LinearHead
+from anytouch_jax.encoder.novelty import Calibration
+from anytouch_jax.encoder.search import nearest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import logistic
 from anytouch_jax.evaluate.logistic import Logistic
 from anytouch_jax.evaluate.statistics import Array
-from anytouch_jax.files import atomic_path, read_arrays
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Pooling
@@ -35,7 +34,6 @@ Predict = Callable[[Array], list[Array]]  # features (m, d) -> class numbers or 
 PENALTIES = (1.0, 0.1, 0.01, 0.001, 0.0001)  # of logistic regression
 RIDGE = (100.0, 10.0, *PENALTIES)
 NEIGHBOURS = (20, 10, 5, 1)
-FORMATS = ("anytouch_jax.head.2", "anytouch_jax.head.1")  # the second has no calibration
 
 
 @dataclass(frozen=True)
@@ -184,33 +182,6 @@ def fit_ridge(x: Array, y: Array, penalties: Sequence[float], scaling: Scaling =
     return predict
 
 
-def nearest(z_train: Array, z_rows: Array, k: int) -> tuple[Array, Array]:
-    """Return row numbers in `z_train` and cosines of the k nearest of each unit row of `z_rows`, nearest first."""
-    # scikit-learn's NearestNeighbors, brute force, takes 1.5 (euclidean) to 6 times longer (cosine) on 100,000 rows.
-    k = min(k, len(z_train))
-    ids, cosines = np.empty((len(z_rows), k), np.int64), np.empty((len(z_rows), k), np.float32)
-    for start in range(0, len(z_rows), 512):
-        part = slice(start, start + 512)
-        ids[part], cosines[part] = _largest(z_rows[part] @ z_train.T, k)
-    return ids, cosines
-
-
-def _largest(values: Array, k: int, block: int = 64) -> tuple[Array, Array]:
-    """Return columns and values of the k largest of each row, largest first."""
-    # They lie in the k blocks of columns with the largest maxima. Partitioning whole rows takes ten times longer.
-    blocks = values.shape[1] // block
-    columns = np.broadcast_to(np.arange(values.shape[1]), values.shape)
-    if blocks > 2 * k:
-        whole = values[:, : blocks * block].reshape(len(values), blocks, block)
-        best = np.argpartition(-whole.max(2), k - 1, axis=1)[:, :k]
-        inside = (best[:, :, None] * block + np.arange(block)).reshape(len(values), -1)
-        columns = np.concatenate([inside, columns[:, blocks * block :]], axis=1)
-    candidates = np.take_along_axis(values, columns, 1)
-    near = np.argpartition(-candidates, k - 1, axis=1)[:, :k]
-    near = np.take_along_axis(near, np.argsort(-np.take_along_axis(candidates, near, 1), axis=1, kind="stable"), 1)
-    return np.take_along_axis(columns, near, 1), np.take_along_axis(candidates, near, 1)
-
-
 def vote(labels: Array, cosines: Array, classes: int) -> Array:
     """Return the most frequent class of each row of `labels` (n, k); of equals the one of larger summed cosine."""
     votes = np.zeros((len(labels), classes))
@@ -272,64 +243,6 @@ def _gradient_step(recipe: GradientRecipe, classes: int) -> tuple[Callable[..., 
     return tuple(jax.enable_x64(False)(function) for function in (tx.init, jax.jit(step)))  # whatever JAX_ENABLE_X64
 
 
-@dataclass(frozen=True, eq=False)
-class LinearHead:
-    """A saved linear classifier of features, with its calibration (None in files of older versions).
-
-    `classes` (K,) str; `weights` (d, columns) and `bias` (columns,), one column for two classes, else K; features minus
-    `mean` (d,) are divided by `scale` (d,). It predicts `label` from features of `frames` a touch and `pooling` by the
-    encoder with that `fingerprint`.
-    """
-
-    classes: Array
-    weights: Array
-    bias: Array
-    mean: Array
-    scale: Array
-    label: str
-    pooling: Pooling
-    frames: int
-    fingerprint: str
-    calibration: Calibration | None = None
-
-    def __call__(self, features: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return the likeliest class (n,) str and probabilities f32 (n, K) of features (n, d)."""
-        temperature = 1.0 if self.calibration is None else self.calibration.temperature
-        p = novelty.probabilities(self.scaled(features) @ self.weights + self.bias, temperature)
-        return self.classes[p.argmax(1)], p
-
-    def scaled(self, features: npt.ArrayLike) -> Array:
-        """Return features (n, d) minus the mean, over the scale. Raises UserError for another shape."""
-        x = np.asarray(features, np.float32)
-        if x.ndim != 2 or x.shape[1] != len(self.mean):
-            raise UserError(f"This head reads features (n, {len(self.mean)}), not {x.shape}.")
-        return (x - self.mean) / self.scale
-
-    def assess(self, features: npt.ArrayLike) -> Assessment:
-        """Return what the head predicts for features (n, d), and whether to believe it.
-
-        Raises UserError for a head without calibration.
-        """
-        label, p = self(features)
-        known = self.calibration
-        if known is None:
-            raise UserError("This head has no calibration. Save it again with `anytouch probe label --save`.")
-        distance = known.novelty(self.scaled(features))
-        return Assessment(label, p, 1 - p <= known.set_limit, distance, distance > known.novelty_limit)
-
-    def check(self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean") -> None:
-        """Raise UserError unless the head was fitted on features of that encoder, pooling and number of frames."""
-        pairs = (("pooling", self.pooling, pooling), ("frames", self.frames, frames), ("join", "mean", join))
-        wrong = [f"--{name} {own}" for name, own, other in pairs if own != other]
-        if wrong:
-            raise UserError(f"The head was fitted on other features. Give {' '.join(wrong)}.")
-        if fingerprint != self.fingerprint:
-            raise UserError(
-                f"The head was fitted on features of another encoder ({self.fingerprint}) than {source} "
-                f"({fingerprint}). Fit one with `anytouch probe label --save`."
-            )
-
-
 def calibrate(
     head: LinearHead, features: Array, y: Array, groups: Array, sensors: Array, fit: Array, val: Array,
     folds: Iterable[tuple[Array, Array]], penalty: float, *, coverage: float = novelty.COVERAGE,
@@ -383,56 +296,3 @@ def linear_head(
     classes = np.asarray(names)[model.classes].astype(str)
     arrays = (classes, model.fit.weights, model.fit.bias, model.mean, model.scale)
     return LinearHead(*arrays, label, pooling, frames, fingerprint)
-
-
-def save_head(path: str | Path, head: LinearHead) -> None:
-    """Write a head as `.npz` atomically. Raises OSError."""
-    known = head.calibration
-    arrays = {"mark" if name == "fingerprint" else name: value for name, value in vars(head).items()}
-    del arrays["calibration"]
-    arrays |= {} if known is None else known.arrays()
-    with atomic_path(path) as part, open(part, "wb") as file:
-        np.savez(file, format=FORMATS[known is None], **arrays)
-
-
-def load_head(path: str | Path) -> LinearHead:
-    """Load the head that `anytouch probe label --save` wrote. Raises UserError for any other file."""
-    if not Path(path).is_file():
-        raise UserError(f"There is no head {path}. `anytouch probe label --save` writes one.")
-    try:
-        arrays: dict[str, Any] = read_arrays(path)
-        for name in ("format", "label", "pooling", "mark"):
-            if arrays[name].shape != () or arrays[name].dtype.kind != "U" or arrays[name].dtype.itemsize > 4096:
-                raise ValueError(f"{name} is not a short text")
-            arrays[name] = str(arrays[name])
-        if arrays.pop("format") not in FORMATS:
-            raise ValueError("it has no format of a head")
-        known = Calibration.from_arrays(arrays, len(arrays["mean"]))
-        arrays = {name: value for name, value in arrays.items() if not name.startswith("calibration/")}
-        head = LinearHead(frames=int(arrays.pop("frames")), fingerprint=arrays.pop("mark"), calibration=known, **arrays)
-        _check_head(head)
-        return head
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else error
-        raise UserError(
-            f"{path} is not the head of a probe ({reason}). `anytouch probe label --save` writes one."
-        ) from None
-
-
-def _check_head(head: LinearHead) -> None:
-    """Raise ValueError for arrays of a head that do not fit together or are not finite."""
-    count, width = len(head.classes), len(head.mean)
-    columns = 1 if count == 2 else count
-    shapes = {"classes": (count,), "weights": (width, columns), "bias": (columns,), "mean": (width,), "scale": (width,)}
-    for name, shape in shapes.items():
-        array = getattr(head, name)
-        if array.shape != shape or array.dtype.kind != ("U" if name == "classes" else "f"):
-            raise ValueError(f"{name} is {array.dtype} {array.shape}, not of shape {shape}")
-        if name != "classes" and not np.isfinite(array).all():
-            raise ValueError(f"{name} has values that are not finite")
-    if count < 2 or not width or not (head.scale > 0).all() or not (head.label and head.fingerprint):
-        raise ValueError("it needs two classes, features, scales above 0, a label and the mark of an encoder")
-    if len(set(head.classes)) < count:
-        raise ValueError("it has a class twice")
-    if head.pooling not in ("class", "mean", "both") or not 0 < head.frames < 1 << 20:
-        raise ValueError(f"it has pooling {head.pooling[:40]} and {head.frames} frames")

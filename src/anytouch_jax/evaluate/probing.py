@@ -25,11 +25,12 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.embed import Join, Pooling
+from anytouch_jax.encoder.linear_head import LinearHead, save_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, logistic, splits, statistics, tasks
 from anytouch_jax.evaluate import heads as probe_heads
 from anytouch_jax.evaluate.feature_cache import RANDOM, RAW, FeatureSource, Order
-from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearHead, LinearModel, ProbeHead, Scaling
+from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearModel, ProbeHead, Scaling
 from anytouch_jax.evaluate.splits import SIDES, LabelledFeatures, RowRoles, Selection, Split
 from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows
@@ -343,7 +344,7 @@ def probe_label(
             assert tested.fitted is not None
             head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
             head = _calibrated(head, x, rows, results[0].penalty or 1.0, coverage, false_alarms, log)
-            probe_heads.save_head(save, head)
+            save_head(save, head)
             log(f"{save}: the linear head")
     if leave_out is None:
         results.append(majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))

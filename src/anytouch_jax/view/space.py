@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.encoder.search import load_index, nearest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.geometry import tsne
-from anytouch_jax.evaluate.heads import nearest
-from anytouch_jax.evaluate.search import load_index
 from anytouch_jax.files import read_arrays
 from anytouch_jax.view.tables import Table
 

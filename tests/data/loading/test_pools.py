@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anytouch_jax.config import baselines, from_json, to_json
+from anytouch_jax.config import from_json, presets, to_json
 from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.errors import UserError
@@ -167,7 +167,7 @@ def batches(loader, steps=24):
 
 
 def changed(config, name):
-    return baselines.apply(name, config)
+    return presets.apply_baseline(name, config)
 
 
 def test_tlv_link_draws_only_samples_with_all_three(make, settings, read_back):

@@ -7,8 +7,7 @@ import pytest
 from anytouch_jax.data import tokenizer as text
 from anytouch_jax.sim.world import captions
 from anytouch_jax.sim.world.captions import caption
-from anytouch_jax.sim.world.materials import MATERIALS
-from anytouch_jax.sim.world.objects import PRIMITIVE_KINDS, catalogue, hardness_of, roughness_of
+from anytouch_jax.sim.world.objects import MATERIALS, PRIMITIVE_KINDS, catalogue, hardness_of, roughness_of
 from anytouch_jax.sim.world.primitives import PRIMITIVES
 
 THINGS = catalogue(0, 300)

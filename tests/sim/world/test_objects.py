@@ -7,8 +7,18 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.world import objects
-from anytouch_jax.sim.world.materials import HARD, MATERIALS, SOFT, hardness_class
-from anytouch_jax.sim.world.objects import catalogue, combinations, draw_object, hardness_of, hold_out, roughness_of
+from anytouch_jax.sim.world.objects import (
+    HARD,
+    MATERIALS,
+    SOFT,
+    catalogue,
+    combinations,
+    draw_object,
+    hardness_class,
+    hardness_of,
+    hold_out,
+    roughness_of,
+)
 from anytouch_jax.sim.world.primitives import PRIMITIVES
 from anytouch_jax.sim.world.shapes import Shape, height, relief
 from anytouch_jax.sim.world.textures import GRAINS, TEXTURES

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from anytouch_jax.encoder.search import load_index
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.search import load_index
 
 
 def write(path, values, **more):

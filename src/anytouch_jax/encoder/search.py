@@ -11,14 +11,41 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.heads import nearest
-from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.files import read_arrays
 
+Array = npt.NDArray[Any]
 SHOWN = ("path", "frame_index", "sensor", "unit", "sequence", "object")  # keys of a hit, besides labels
+
+
+def nearest(z_train: Array, z_rows: Array, k: int) -> tuple[Array, Array]:
+    """Return row numbers in `z_train` and cosines of the k nearest of each unit row of `z_rows`, nearest first."""
+    # scikit-learn's NearestNeighbors, brute force, takes 1.5 (euclidean) to 6 times longer (cosine) on 100,000 rows.
+    k = min(k, len(z_train))
+    ids, cosines = np.empty((len(z_rows), k), np.int64), np.empty((len(z_rows), k), np.float32)
+    for start in range(0, len(z_rows), 512):
+        part = slice(start, start + 512)
+        ids[part], cosines[part] = _largest(z_rows[part] @ z_train.T, k)
+    return ids, cosines
+
+
+def _largest(values: Array, k: int, block: int = 64) -> tuple[Array, Array]:
+    """Return columns and values of the k largest of each row, largest first."""
+    # They lie in the k blocks of columns with the largest maxima. Partitioning whole rows takes ten times longer.
+    blocks = values.shape[1] // block
+    columns = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    if blocks > 2 * k:
+        whole = values[:, : blocks * block].reshape(len(values), blocks, block)
+        best = np.argpartition(-whole.max(2), k - 1, axis=1)[:, :k]
+        inside = (best[:, :, None] * block + np.arange(block)).reshape(len(values), -1)
+        columns = np.concatenate([inside, columns[:, blocks * block :]], axis=1)
+    candidates = np.take_along_axis(values, columns, 1)
+    near = np.argpartition(-candidates, k - 1, axis=1)[:, :k]
+    near = np.take_along_axis(near, np.argsort(-np.take_along_axis(candidates, near, 1), axis=1, kind="stable"), 1)
+    return np.take_along_axis(columns, near, 1), np.take_along_axis(candidates, near, 1)
 
 
 @dataclass(frozen=True, eq=False)

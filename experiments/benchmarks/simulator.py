@@ -33,11 +33,10 @@ from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult, press
 from anytouch_jax.sim.contact.shear import Shear, shear_step
 from anytouch_jax.sim.recorder import Recorder
 from anytouch_jax.sim.scene import Scenes, draw_recording, draw_touch, objects_and_splits
-from anytouch_jax.sim.sensing import calibration, optics, units
+from anytouch_jax.sim.sensing import calibration, optics, sensors
 from anytouch_jax.sim.sensing.calibration import COARSE, INDENTERS, PITCH, Presses
 from anytouch_jax.sim.sensing.optics import render
-from anytouch_jax.sim.sensing.sensors import SENSORS
-from anytouch_jax.sim.sensing.units import identity_unit
+from anytouch_jax.sim.sensing.sensors import SENSORS, identity_unit
 
 Fields = npt.NDArray[Any]
 Surface = Callable[[Fields, Fields], Fields]
@@ -464,7 +463,7 @@ def _constant(presses: Presses) -> Renderer:
 def _ours(name: str, presses: Presses, *, shadow: bool = True) -> Renderer:
     """Height map -> contact -> picture by the project's renderer, with the real background at full size."""
     sensor, indenter = SENSORS[name], INDENTERS[name]
-    unit, size = units.identity_unit(sensor), presses.background.shape[:2]
+    unit, size = sensors.identity_unit(sensor), presses.background.shape[:2]
     behind = jnp.asarray(presses.background.transpose(2, 0, 1), jnp.float32) / 255
     cut = jax.jit(lambda c, r: calibration.ball_cut(c * PITCH, r * PITCH, indenter, size, PITCH))
 

@@ -16,8 +16,7 @@ import numpy as np
 from jax import Array
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.sensing.sensors import SENSORS
-from anytouch_jax.sim.sensing.units import Unit, draw_unit
+from anytouch_jax.sim.sensing.sensors import SENSORS, Unit, draw_unit
 
 POUR, WAIT, RETRACT = 0, 1, 2
 ACTIONS = ("pour", "wait", "retract")

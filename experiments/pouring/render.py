@@ -17,8 +17,7 @@ from jax import Array
 from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Gel, PressResult
 from anytouch_jax.sim.sensing import optics
-from anytouch_jax.sim.sensing.sensors import SENSORS, look
-from anytouch_jax.sim.sensing.units import gel_to_object, unit_gel
+from anytouch_jax.sim.sensing.sensors import SENSORS, gel_to_object, look, unit_gel
 from experiments.pouring.physics import Load, Setup
 
 SENSOR = SENSORS["gelsight_mini"]

@@ -23,10 +23,11 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.config import preset
-from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_encoder, random_encoder
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots
 from anytouch_jax.train.mesh import enable_compilation_cache
+from experiments.image_tower import image_tower_encoder
 from experiments.pouring import bounds as pouring_bounds
 from experiments.pouring import policy as pouring_policy
 from experiments.pouring import table

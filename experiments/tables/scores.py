@@ -18,7 +18,7 @@ from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows, text_column
-from anytouch_jax.encoder.encoder import Encoder, image_tower_encoder, load_encoder, random_encoder
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
 from anytouch_jax.evaluate.feature_cache import (
@@ -32,6 +32,7 @@ from anytouch_jax.evaluate.probing import probe_tasks
 from anytouch_jax.evaluate.retrieval import contact_vector
 from anytouch_jax.evaluate.tasks import Task
 from anytouch_jax.files import atomic_write
+from experiments.image_tower import image_tower_encoder
 from experiments.tables import cuts, plan, real
 from experiments.tables.plan import Leaf, Training
 

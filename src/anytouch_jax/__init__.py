@@ -27,9 +27,8 @@ _HOMES = {
     "data.manifest.manifest": "Manifest",
     "weights.registry": "list_encoders",
     "weights.tree": "interpolate",
-    "encoder.encoder": "Encoder load_encoder random_encoder",
+    "encoder.encoder": "Encoder example_touches load_encoder random_encoder",
     "encoder.family": "FamilyEncoder",
-    "encoder.examples": "example_touches",
     "encoder.linear_head": "load_head",
     "encoder.preprocess": "Preprocess",
 }

@@ -49,9 +49,9 @@ def test_a_graph_finds_almost_the_same(tmp_path):
 
 
 def test_a_hostile_file_is_refused(tmp_path):
-    with pytest.raises(UserError, match="finite features"):
+    with pytest.raises(UserError, match="not finite"):
         load_index(write(tmp_path / "f.npz", np.full((2, 3), np.inf)))
-    with pytest.raises(UserError, match="keys must be one"):
+    with pytest.raises(UserError, match="its keys"):
         load_index(write(tmp_path / "f.npz", np.ones((2, 3)), **{"key/path": np.array(["a"])}))
     np.savez(tmp_path / "p.npz", features=np.array([{"a": 1}], dtype=object))
     with pytest.raises(UserError, match="not a features file"):

@@ -13,8 +13,7 @@ from anytouch_jax.sim import recorder as record
 from anytouch_jax.sim import scene
 from anytouch_jax.sim.recorder import SPACING, ClipInput, Recorder
 from anytouch_jax.sim.scene import Scenes
-from anytouch_jax.sim.sensing.sensors import SENSORS
-from anytouch_jax.sim.sensing.units import identity_unit
+from anytouch_jax.sim.sensing.sensors import SENSORS, identity_unit
 
 SURFACES = jax.jit(record.surfaces)
 DIGIT = SENSORS["digit"]

@@ -21,7 +21,7 @@ class ContactOptions:
     Example: anytouch data contact ycb_slide.parquet --drop --out ycb_touched.parquet --picture contact.png
 
     The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown. Pictures of the
-    untouched gel that had to be estimated are stored beside it, as the background_path of their rows.
+    untouched gel that had to be estimated are stored next to it, as the background_path of their rows.
     """
 
     manifest: Positional[Path]  # Manifest to mark (.csv, .parquet).

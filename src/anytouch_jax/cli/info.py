@@ -250,23 +250,23 @@ def _manifest(path: Path) -> list[str]:
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.manifest.schema import listed
 
-    found = manifests.summarise_file(path)
+    summary = manifests.summarise_file(path)
 
     def counts(name: str) -> str:
-        shown, distinct = found.counts[name]
+        shown, distinct = summary.counts[name]
         return listed([f"{value[:40]} {rows:,}" for value, rows in shown], distinct)
 
     optional = ("image_path", "text", "background_path", "touch", "object", "field_path")
-    filled = [f"{name} {found.filled[name]:,}" for name in optional if name in found.filled]
-    labels = [name.removeprefix("label.") for name in found.filled if name.startswith("label.")]
+    filled = [f"{name} {summary.filled[name]:,}" for name in optional if name in summary.filled]
+    labels = [name.removeprefix("label.") for name in summary.filled if name.startswith("label.")]
     return [
-        f"{path}: a manifest of {found.rows:,} rows in {found.recordings:,} recordings, {found.clips:,} clips of three "
+        f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, {summary.clips:,} clips of three "
         "frames",
         f"splits: {counts('split')}",
         f"sensors: {counts('sensor')}",
         f"rows with {', '.join(filled) or 'no optional column'}",
         f"labels: {listed(labels) or 'none'}",
-        f"content {found.digest[:12]}",
+        f"content {summary.digest[:12]}",
     ]
 
 

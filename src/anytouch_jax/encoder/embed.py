@@ -16,7 +16,7 @@ from anytouch_jax.bars import tracked
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path
+from anytouch_jax.files import atomic_path, read_arrays
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
@@ -199,3 +199,22 @@ def save_npz(path: str | Path, features: Features, metadata: dict[str, str]) -> 
     arrays |= features.predictions | keys | described
     with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, **arrays)
+
+
+def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
+    """Return the features and the metadata of a file of `save_npz`. Raises UserError for any other file."""
+    try:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is not a features file of `anytouch embed`: {error}") from None
+    values, rows = (arrays.get(name, np.zeros(0, str)) for name in ("features", "rows"))
+    numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
+    if values.ndim != 2 or not numeric or not len(rows) or rows.shape != values.shape[:1]:
+        raise UserError(f"{path} needs numeric arrays features (n, d) and rows (n,), not {values.shape}, {rows.shape}.")
+    if not values.shape[1] or not np.isfinite(values).all():
+        raise UserError(f"{path}: the array features has no columns, or values that are not finite (NaN or infinite).")
+    keys = {name.removeprefix("key/"): array for name, array in arrays.items() if name.startswith("key/")}
+    if any(array.shape != rows.shape for array in keys.values()):
+        raise UserError(f"{path}: its keys (key/path and others) must be one for each of the {len(rows)} rows.")
+    about = {name.removeprefix("about/"): str(array)[:200] for name, array in arrays.items() if name[:6] == "about/"}
+    return Features(values, rows, keys), about

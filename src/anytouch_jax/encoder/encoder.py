@@ -8,17 +8,15 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
-import jax
 import numpy as np
 
+from anytouch_jax.data.images import decode
 from anytouch_jax.encoder.base import (
     Encoder,
-    bare_model,
     check_frames,
-    precision,
     random_encoder,
     touch_features,
     touch_only,
@@ -26,15 +24,14 @@ from anytouch_jax.encoder.base import (
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
-from anytouch_jax.nn.clip import merge_lora
-from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import load, registry
 from anytouch_jax.weights.families import Size, load_family
 
 __all__ = [
-    "Encoder", "check_frames", "find_tokenizer", "image_tower_encoder", "load_encoder", "random_encoder",
+    "Encoder", "ExampleTouch", "check_frames", "example_touches", "find_tokenizer", "load_encoder", "random_encoder",
     "touch_features",
 ]  # fmt: skip
+FOLDER = Path(__file__).parent / "examples"  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg of the untouched gel
 
 
 def load_encoder(
@@ -43,7 +40,7 @@ def load_encoder(
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
     Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, ViT-MAE, ViT and DeiT). `heads` is
-    their number of attention heads, where neither the file nor a config.json beside it has it. `image_size` (a side, or
+    their number of attention heads, where neither the file nor a config.json next to it has it. `image_size` (a side, or
     height and width) changes the size of their images. Then the result is a `FamilyEncoder`.
 
     Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
@@ -79,19 +76,20 @@ def find_tokenizer(path: Path) -> Path | None:
     return next((folder / "tokenizer.json" for folder in folders if (folder / "tokenizer.json").is_file()), None)
 
 
-def image_tower_encoder(path: str | Path) -> Encoder:
-    """Load the image tower of a stage-2 run (LoRA merged) or of CLIP weights as a touch encoder: no tactile training.
+class ExampleTouch(NamedTuple):
+    """A touch by one sensor: `frame` and `background` are RGB u8 (h, w, 3), `press` names the touched place."""
 
-    A still gives the tower's embedding of that image, a clip that of its mean frame (the rows CLIP of Tables 1 to 4).
-    There are no sensor tokens. Raises UserError without an image tower.
-    """
-    loaded = load.load_model(path)
-    model, params = loaded.config.model, loaded.params
-    if model.image is None or "image" not in params:
-        raise UserError(f"{path} has no image tower; give a stage-2 run with one, or CLIP weights")
-    tower = merge_lora(params, model.lora_alpha)["image"]
-    bare = replace(bare_model(model), touch=model.image, sensor_tokens=0, patch_encoder="shared", pre_norm=True)
-    with precision(loaded.config):
-        fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
-    touch = load.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
-    return Encoder(replace(loaded.config, model=bare), touch, f"{path} (image tower)")
+    press: str
+    sensor: str
+    frame: np.ndarray
+    background: np.ndarray
+
+
+def example_touches() -> list[ExampleTouch]:
+    """Return simulated touches: each of a few presses by several sensors. They are in the public domain (CC0)."""
+    files = sorted(file for file in FOLDER.glob("*.jpg") if not file.stem.endswith("-background"))
+    touches = []
+    for file in files:
+        press, sensor = file.stem.split("-")
+        touches.append(ExampleTouch(press, sensor, decode(file), decode(file.with_stem(f"{file.stem}-background"))))
+    return touches

@@ -187,8 +187,8 @@ class FamilyEncoder(Encoder):
         clips = self._clips(clips)
         if clips.shape[1] > 1:
             raise UserError(f"{self.family.title} gives the tokens of one frame, not of {clips.shape[1]}")
-        found = self._run(params, clips[:, 0], rows)
-        return {"hidden": found.hidden, "normed": found.normed, "patches": found.normed[:, self.form.start :]}[
+        output = self._run(params, clips[:, 0], rows)
+        return {"hidden": output.hidden, "normed": output.normed, "patches": output.normed[:, self.form.start :]}[
             self.family.tokens
         ].astype(jnp.float32)
 
@@ -217,8 +217,8 @@ class FamilyEncoder(Encoder):
             )
         network, more = self.part, () if self.calibration is None else (jnp.asarray(self.calibration),)
         if self.family.name != "t3" or len(self.form.model.sensors) <= 2:
-            found: VitOutput = network.apply(params, clips, rows, *more)
-            return found
+            output: VitOutput = network.apply(params, clips, rows, *more)
+            return output
 
         names = self.form.model.sensors
         other = names.index(_FALLBACK) if _FALLBACK in names else 0
@@ -229,17 +229,17 @@ class FamilyEncoder(Encoder):
                 name: x if name in families.SHARED else jax.tree.map(lambda x: x[item[1]], x)
                 for name, x in params.items()
             }
-            found: VitOutput = network.apply(own, item[0][None], item[1][None])
-            return VitOutput(*(x[0] for x in found))
+            output: VitOutput = network.apply(own, item[0][None], item[1][None])
+            return VitOutput(*(x[0] for x in output))
 
         return jax.lax.map(one, (clips, rows))
 
 
-def pooled(family: Family, form: VitConfig, found: VitOutput, pooling: Pooling) -> jax.Array:
+def pooled(family: Family, form: VitConfig, output: VitOutput, pooling: Pooling) -> jax.Array:
     """Return features (B, E) from the tokens of a family: its own feature, the mean of the patches, or both."""
-    patches = found.projected if family.feature == "projected" else found.normed
+    patches = output.projected if family.feature == "projected" else output.normed
     mean = jnp.mean(patches[:, form.start :], axis=1)
-    own = {"class": found.normed, "mean": found.normed}.get(family.feature, found.projected)[:, 0]
+    own = {"class": output.normed, "mean": output.normed}.get(family.feature, output.projected)[:, 0]
     if family.feature == "unit":
         own = losses.normalise(own)
     own = mean if family.feature == "mean" else own
@@ -279,15 +279,15 @@ def _resized(image: np.ndarray, size: Size, kernel: str) -> np.ndarray:
     """Resize by Pillow, with its antialiasing; floats stay floats."""
     if image.shape[:2] == size:
         return image
-    how = {"bilinear": Image.Resampling.BILINEAR, "bicubic": Image.Resampling.BICUBIC}[kernel]
+    resampling = {"bilinear": Image.Resampling.BILINEAR, "bicubic": Image.Resampling.BICUBIC}[kernel]
     if image.dtype == np.uint8:
-        return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize((size[1], size[0]), how))
+        return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize((size[1], size[0]), resampling))
     planes = (Image.fromarray(np.ascontiguousarray(image[..., colour])) for colour in range(3))
-    return np.stack([np.asarray(plane.resize((size[1], size[0]), how)) for plane in planes], axis=-1)
+    return np.stack([np.asarray(plane.resize((size[1], size[0]), resampling)) for plane in planes], axis=-1)
 
 
 def family_encoder(model: FamilyModel, source: str, path: Path) -> FamilyEncoder:
-    """Return the encoder of what a file of a family has. SITR's calibration images may stand beside it."""
+    """Return the encoder of what a file of a family has. SITR's calibration images may be next to it."""
     background = model.preparation.background
     encoder = FamilyEncoder(
         Config(model.form.model, data=DataConfig(background=background)), nest(model.params), source,

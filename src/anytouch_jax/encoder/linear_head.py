@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,6 +65,47 @@ class LinearHead:
             raise UserError("This head has no calibration. Save it again with `anytouch probe label --save`.")
         distance = known.novelty(self.scaled(features))
         return Assessment(label, p, 1 - p <= known.set_limit, distance, distance > known.novelty_limit)
+
+    def calibrated(
+        self, logits: Array, y: Array, held_out: Array, features: Array, groups: Array, sensors: Array, fit: Array,
+        val: Array, *, coverage: float = novelty.COVERAGE, false_alarms: float = novelty.FALSE_ALARMS,
+    ) -> LinearHead:  # fmt: skip
+        """Return the head with a calibration from `logits` (n, columns) of rows that no fit saw.
+
+        `y` (n,) str and `held_out` (n,) are their classes and groups. `features` (N, d), `groups` (N,) and `sensors`
+        (N,) are of all rows, of which `fit` were fitted on and `val` were not. Raises UserError without a row of a
+        known class.
+        """
+        known = np.isin(y, self.classes)
+        if not known.any():
+            raise UserError("No row is left to calibrate on. Give rows of split val, or classes of several groups.")
+        z, held_out = logits[known].astype(np.float64), held_out[known]
+        truth = np.searchsorted(self.classes, y[known])
+        temperature = novelty.fit_temperature(z, truth, held_out)
+        p = novelty.probabilities(z, temperature)
+        limit = novelty.conformal_limit(1 - p[np.arange(len(truth)), truth], held_out, coverage)
+        chosen = fit[novelty.choose_references(groups[fit])]
+        both = np.concatenate([fit, val])
+        whitening = novelty.fit_whitening(self.scaled(features[fit]))
+        references, x = (self.scaled(features[some]) @ whitening for some in (chosen, both))
+        scores = novelty.novelty_scores(x, references, groups[both], groups[chosen])
+        novel = novelty.conformal_limit(scores, groups[both], 1 - false_alarms)
+        limits = (coverage, limit, false_alarms, novel, len(np.unique(held_out)))
+        return replace(self, calibration=Calibration(temperature, *limits, whitening, references, sensors[chosen]))
+
+    def promises(self) -> list[str]:
+        """Return sentences on what the limits of the calibration promise, and on those that need more groups."""
+        known = self.calibration
+        if known is None:
+            return []
+        return [known.summary()] + [
+            f"{share:.0%} takes {int(np.ceil(share / (1 - share) - 1e-9))} groups or more. With fewer {what}."
+            for limit, share, what in (
+                (known.set_limit, known.coverage, "sets hold every class"),
+                (known.novelty_limit, 1 - known.false_alarms, "no touch is novel"),
+            )
+            if np.isinf(limit)
+        ]
 
     def check(self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean") -> None:
         """Raise UserError unless the head was fitted on features of that encoder, pooling and number of frames."""

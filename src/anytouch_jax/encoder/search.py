@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.encoder.arrays import unit_rows
+from anytouch_jax.encoder.embed import read_npz
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import read_arrays
 
 Array = npt.NDArray[Any]
 SHOWN = ("path", "frame_index", "sensor", "unit", "sequence", "object")  # keys of a hit, besides labels
@@ -50,9 +50,10 @@ def _largest(values: Array, k: int, block: int = 64) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class TouchIndex:
-    """Unit features f32 (n, d) with their `keys` (n,) and what made them (`about`: weights, pooling, frames)."""
+    """Unit features f32 (n, d), their `rows` and `keys` (n,), and metadata (`about`: weights, pooling, frames)."""
 
     values: Array
+    rows: Array
     keys: dict[str, Array]
     about: dict[str, str]
     source: str = "the index"
@@ -71,9 +72,9 @@ class TouchIndex:
         count, query = min(count, len(self.values)), unit_rows(features)
         if self.graph is None:
             return nearest(self.values, query, count)
-        found = [self.graph.search(row, count) for row in query]
-        ids = np.stack([np.asarray(each.keys, np.int64) for each in found])
-        return ids, np.stack([1 - np.asarray(each.distances, np.float32) for each in found])
+        results = [self.graph.search(row, count) for row in query]
+        ids = np.stack([np.asarray(each.keys, np.int64) for each in results])
+        return ids, np.stack([1 - np.asarray(each.distances, np.float32) for each in results])
 
     def check(self, source: str, fingerprint: str) -> None:
         """Raise UserError unless the index was made by the encoder with that fingerprint."""
@@ -91,19 +92,10 @@ class TouchIndex:
 
 def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
     """Return the index of a features file. Raises UserError for another file, and without usearch if `approximate`."""
-    try:
-        arrays = read_arrays(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} is not a features file of `anytouch embed`: {error}") from None
-    values = arrays.get("features", np.zeros(0))
-    keys = {name.removeprefix("key/"): array for name, array in arrays.items() if name.startswith("key/")}
-    if values.ndim != 2 or values.dtype.kind != "f" or not values.size or not np.isfinite(values).all():
-        raise UserError(f"{path} needs finite features (n, d), not {values.dtype} {values.shape}. Embed again.")
-    if any(array.shape != values.shape[:1] for array in keys.values()):
-        raise UserError(f"{path}: its keys must be one for each of the {len(values)} rows. Embed again.")
-    about = {name.removeprefix("about/"): str(array)[:200] for name, array in arrays.items() if name[:6] == "about/"}
-    unit = unit_rows(values).astype(np.float32)
-    return TouchIndex(unit, keys, about, str(path), _graph(unit) if approximate else None)
+    features, about = read_npz(path)
+    unit = unit_rows(features.values).astype(np.float32)
+    graph = _graph(unit) if approximate else None
+    return TouchIndex(unit, features.rows, features.keys, about, str(path), graph)
 
 
 def _graph(values: Array) -> Any:

@@ -20,7 +20,7 @@ from anytouch_jax.config import preset
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, save_npz, text_column
+from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, read_npz, save_npz, text_column
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import Scaling
@@ -128,29 +128,18 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
     Raises UserError for another file, for features of another manifest (by `key/path`), and, when they are read, for
     clips of another length (by `about/frames`) and for missing rows.
     """
-    try:
-        arrays = read_arrays(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} is not an npz file of plain arrays: {error}") from error
-    values, rows = (arrays.get(name, np.zeros(0, str)) for name in ("features", "rows"))
-    numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
-    if values.ndim != 2 or not numeric or not len(rows) or rows.shape != values.shape[:1]:
-        raise UserError(f"{path} needs numeric arrays features (n, d) and rows (n,), not {values.shape}, {rows.shape}.")
-    if not values.shape[1] or not np.isfinite(values).all():
-        raise UserError(f"{path}: the array features has no columns, or values that are not finite (NaN or infinite).")
+    features, about = read_npz(path)
+    values, rows, length = features.values, features.rows, about.get("frames")
     if len(np.unique(rows)) < len(rows) or rows.min() < 0 or rows.max() >= len(table):
         raise UserError(f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}.")
-    paths = arrays.get("key/path")
-    if any(array.shape != rows.shape for name, array in arrays.items() if name.startswith("key/")):
-        raise UserError(f"{path}: its keys (key/path and others) must be one for each of the {len(rows)} rows.")
+    paths = features.keys.get("path")
     if paths is not None and (paths != text_column(table, "path")[rows]).any() and len(table.files) == 1:
         raise UserError(f"{path} holds features of another manifest. Its paths differ from those of these rows.")
     order = np.argsort(rows)
     rows, values = rows[order], values[order].astype(np.float32)
 
     def compute(wanted: Array, frames: int) -> Array:
-        length = arrays.get("about/frames")
-        if length is not None and str(length) != str(frames):
+        if length not in (None, str(frames)):
             raise UserError(f"{path} holds features of {length} frames a touch, not {frames}. Give --frames {length}.")
         missing = len(np.setdiff1d(wanted, rows))
         if missing:

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from anytouch_jax.bars import tracked
-from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.arrays import binary_scale, unit_rows
 from anytouch_jax.encoder.linear_head import LinearHead
-from anytouch_jax.encoder.novelty import Calibration
 from anytouch_jax.encoder.search import nearest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import logistic
@@ -168,18 +166,14 @@ def _mean_and_scale(x: Array, weights: Array | None = None, scaling: Scaling = "
 def fit_ridge(x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "column") -> Predict:
     """Return a function from features (m, d) to ridge predictions (m,), one array a penalty.
 
-    One eigendecomposition of the covariance serves all penalties. A penalty is added to the mean squared error.
+    A penalty is added to the mean squared error. One covariance serves all.
     """
+    from sklearn.linear_model import Ridge  # here, so that other heads are fitted without it
+
     mean, scale = _mean_and_scale(x, scaling=scaling)
-    scaled = (x - mean).astype(np.float64) / scale
-    values, vectors = np.linalg.eigh(scaled.T @ scaled / len(x))
-    target = vectors.T @ (scaled.T @ (y - y.mean()) / len(x))
-
-    def predict(rows: Array) -> list[Array]:
-        turned = (rows - mean).astype(np.float64) / scale @ vectors
-        return [turned @ (target / (np.maximum(values, 0) + penalty)) + y.mean() for penalty in penalties]
-
-    return predict
+    model = Ridge(len(x) * np.asarray(penalties), solver="cholesky")
+    model.fit((x - mean).astype(np.float64) / scale, np.repeat(y[:, None], len(penalties), 1))
+    return lambda rows: list(model.predict((rows - mean).astype(np.float64) / scale).reshape(len(rows), -1).T)
 
 
 def vote(labels: Array, cosines: Array, classes: int) -> Array:
@@ -245,14 +239,14 @@ def _gradient_step(recipe: GradientRecipe, classes: int) -> tuple[Callable[..., 
 
 def calibrate(
     head: LinearHead, features: Array, y: Array, groups: Array, sensors: Array, fit: Array, val: Array,
-    folds: Iterable[tuple[Array, Array]], penalty: float, *, coverage: float = novelty.COVERAGE,
-    false_alarms: float = novelty.FALSE_ALARMS,
+    folds: Iterable[tuple[Array, Array]], penalty: float, **shares: float,
 ) -> LinearHead:  # fmt: skip
     """Return the head with a calibration from rows that it was not fitted on.
 
     `features` (N, d), class names `y` (N,) str, `groups` (N,) and `sensors` (N,) are of all rows. `fit` and `val` are
     row numbers. `folds` yields rows of `fit` to fit on and left out: heads fitted again with `penalty` predict these.
-    Rows of a class that a fit lacks are not used. Raises UserError if none is left.
+    `shares` are those of `LinearHead.calibrated`. Rows of a class that a fit lacks are not used. Raises UserError if
+    none is left.
     """
     count, logits, used = len(head.classes), [head.scaled(features[val]) @ head.weights + head.bias], [val]
     numbers = np.searchsorted(head.classes, y)
@@ -269,24 +263,8 @@ def calibrate(
             several[:, classes] = partial
         logits.append(several)
         used.append(kept)
-    rows, z = np.concatenate(used), np.concatenate(logits).astype(np.float64)
-    known = np.isin(y[rows], head.classes)
-    rows, z = rows[known], z[known]
-    if not len(rows):
-        raise UserError("No row is left to calibrate on. Give rows of split val, or classes of several groups.")
-    truth = numbers[rows]
-    temperature = novelty.fit_temperature(z, truth, groups[rows])
-    p = novelty.probabilities(z, temperature)
-    limit = novelty.conformal_limit(1 - p[np.arange(len(truth)), truth], groups[rows], coverage)
-    chosen = fit[novelty.choose_references(groups[fit])]
-    both = np.concatenate([fit, val])
-    whitening = novelty.fit_whitening(head.scaled(features[fit]))
-    references, x = (head.scaled(features[some]) @ whitening for some in (chosen, both))
-    scores = novelty.novelty_scores(x, references, groups[both], groups[chosen])
-    novel = novelty.conformal_limit(scores, groups[both], 1 - false_alarms)
-    recordings = len(np.unique(groups[rows]))
-    limits = (coverage, limit, false_alarms, novel, recordings)
-    return replace(head, calibration=Calibration(temperature, *limits, whitening, references, sensors[chosen]))
+    rows = np.concatenate(used)
+    return head.calibrated(np.concatenate(logits), y[rows], groups[rows], features, groups, sensors, fit, val, **shares)
 
 
 def linear_head(

@@ -343,7 +343,9 @@ def probe_label(
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
             assert tested.fitted is not None
             head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
-            head = _calibrated(head, x, rows, results[0].penalty or 1.0, coverage, false_alarms, log)
+            head = _calibrated(
+                head, x, rows, results[0].penalty or 1.0, log, coverage=coverage, false_alarms=false_alarms
+            )
             save_head(save, head)
             log(f"{save}: the linear head")
     if leave_out is None:
@@ -353,29 +355,18 @@ def probe_label(
     return results
 
 
-def _calibrated(
-    head: LinearHead, x: Array, rows: TaskRows, penalty: float, coverage: float, false_alarms: float, log: Log
-) -> LinearHead:
+def _calibrated(head: LinearHead, x: Array, rows: TaskRows, penalty: float, log: Log, **shares: float) -> LinearHead:
     """Return the head with its calibration, and log what it says; without one if the data do not allow it."""
     fit, val = (np.flatnonzero(rows.split == name) for name in ("train", "val"))
     try:
         folds = splits.group_folds(fit, rows.groups, np.unique(rows.labels, return_inverse=True)[1], splits.FOLDS)
         head = probe_heads.calibrate(
-            head, x, rows.labels, rows.groups, rows.sensors, fit, val, folds, penalty, coverage=coverage,
-            false_alarms=false_alarms,
-        )  # fmt: skip
+            head, x, rows.labels, rows.groups, rows.sensors, fit, val, folds, penalty, **shares
+        )
     except UserError as error:
         log(f"The head has no calibration: {error}")
-        return head
-    known = head.calibration
-    assert known is not None
-    log(known.summary())
-    for limit, share, what in (
-        (known.set_limit, coverage, "sets hold every class"),
-        (known.novelty_limit, 1 - false_alarms, "no touch is novel"),
-    ):
-        if np.isinf(limit):
-            log(f"{share:.0%} takes {int(np.ceil(share / (1 - share) - 1e-9))} groups or more. With fewer {what}.")
+    for sentence in head.promises():
+        log(sentence)
     return head
 
 

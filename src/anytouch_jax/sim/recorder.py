@@ -19,8 +19,7 @@ from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
-from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, look
-from anytouch_jax.sim.sensing.units import gel_to_object, rotated, stack_trees, unit_gel
+from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, gel_to_object, look, rotated, stack_trees, unit_gel
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from anytouch_jax.config.parsing import Below1, Count, NotNegative, Share, check
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.sensing.sensors import SENSORS
-from anytouch_jax.sim.sensing.units import THINNEST, Unit, draw_drift, draw_unit
+from anytouch_jax.sim.sensing.sensors import SENSORS, THINNEST, Unit, draw_drift, draw_unit
 from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
 
 Array = np.ndarray

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from anytouch_jax.encoder.search import load_index, nearest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.geometry import tsne
-from anytouch_jax.files import read_arrays
 from anytouch_jax.view.tables import Table
 
 Array = npt.NDArray[Any]
@@ -31,9 +30,7 @@ class FeatureMap:
 
     def __init__(self, path: Path, tables: list[Table]) -> None:
         self.name, self.index = path.name, load_index(path)
-        self._rows = read_arrays(path, only=lambda name: name == "rows").get("rows", np.zeros(0, np.int64))
-        if self._rows.shape != self.index.values.shape[:1] or self._rows.dtype.kind not in "iu":
-            raise UserError(f"{path} needs whole rows (n,), one for each feature. Embed again.")
+        self._rows = self.index.rows
         self.table = next((number for number, table in enumerate(tables) if self._has_rows_of(table)), None)
         self.map = lru_cache(len(METHODS))(self._map)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.sim.contact import mechanics, shear
-from anytouch_jax.sim.sensing.units import unit_gel
+from anytouch_jax.sim.sensing.sensors import unit_gel
 from experiments.pouring import physics, render
 from experiments.pouring.physics import Load, Task
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.sensing import optics, units
+from anytouch_jax.sim.sensing import optics, sensors
 from anytouch_jax.sim.sensing.sensors import SENSORS, Markers
 
 SIZE = (48, 64)
@@ -19,7 +19,7 @@ SLIM, DIGIT = SENSORS["gelslim"], SENSORS["digit"]
 PITCH = SLIM.field[0] / 36
 GRID = (36, 48)
 KEY = jax.random.key(0)
-PLAIN = units.identity_unit(SLIM)
+PLAIN = sensors.identity_unit(SLIM)
 MARKED = PLAIN._replace(marked=np.float32(1))
 
 
@@ -47,7 +47,7 @@ def levels(image):
 
 
 def test_no_displacement_is_the_background():
-    drawn = units.draw_unit(SLIM, np.random.default_rng(0))._replace(marked=np.float32(1))
+    drawn = sensors.draw_unit(SLIM, np.random.default_rng(0))._replace(marked=np.float32(1))
     for unit in (PLAIN, MARKED, drawn):
         behind = optics.background(SLIM, unit, KEY, resolution=SIZE)
         apart = np.abs(levels(draw(FLAT, STILL, unit, KEY)) - levels(behind))  # another program rounds otherwise
@@ -136,7 +136,7 @@ def test_turned_lights_shade_and_shadow_a_slope_as_they_would_a_turned_one():
 
 def test_markers_follow_the_skin_and_come_back_after_one_step_of_the_lattice():
     unit = MARKED._replace(marker_phase=np.array([0.3, 0.1], np.float32))
-    rest = optics.render(FLAT, STILL, PITCH, DIGIT, units.identity_unit(DIGIT), resolution=SIZE)
+    rest = optics.render(FLAT, STILL, PITCH, DIGIT, sensors.identity_unit(DIGIT), resolution=SIZE)
     assert rest.shape == (*SIZE, 3)  # a sensor without markers draws none
     ink = Markers(pitch=2.0, radius=0.4)
     x, y = (jnp.asarray(a) for a in np.meshgrid(np.linspace(-5, 5, 101), np.linspace(-5, 5, 101)))
@@ -168,15 +168,15 @@ def test_noise_has_the_stated_spread_and_is_a_function_of_the_key():
 
 def test_a_batch_is_its_frames():
     rng = np.random.default_rng(3)
-    several = [units.draw_unit(SLIM, rng) for _ in range(2)]
+    several = [sensors.draw_unit(SLIM, rng) for _ in range(2)]
     dents, keys = jnp.stack([bump(2.0), bump(0, -2.0)]), jax.random.split(KEY, 2)
-    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), units.stack_trees(several), keys)
+    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), sensors.stack_trees(several), keys)
     for i in range(2):
         np.testing.assert_allclose(levels(together[i]), levels(draw(dents[i], STILL, several[i], keys[i])), atol=1)
 
 
 def test_a_backdrop_made_beforehand_gives_the_same_picture():
-    unit = units.draw_unit(SLIM, np.random.default_rng(4))
+    unit = sensors.draw_unit(SLIM, np.random.default_rng(4))
     behind = optics.backdrop(SLIM, unit, SIZE)
     given = optics.render(bump(), None, PITCH, SLIM, unit, KEY, resolution=SIZE, behind=behind)
     made = optics.render(bump(), None, PITCH, SLIM, unit, KEY, resolution=SIZE)
@@ -235,7 +235,7 @@ def test_steep_and_broken_surfaces_stay_pictures():
 
 def test_a_gel_pressed_deeply_all_over_is_no_darker_than_the_deepest_dent_of_the_calibration():
     sensor = SENSORS["gelsight_mini"]
-    unit = units.identity_unit(sensor)
+    unit = sensors.identity_unit(sensor)
     draw = jax.jit(lambda d: optics.render(d, None, 0.15, sensor, unit, resolution=(48, 64)))
     images = [np.asarray(draw(jnp.full((96, 128), depth))).astype(float) for depth in (0.0, 0.1, 3.0, 6.0)]
     np.testing.assert_allclose(images[2], images[3], atol=1)  # the rounding of slopes that should be zero

@@ -11,7 +11,7 @@ import pytest
 
 from anytouch_jax import config
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.sensing import calibration, sensors, shading, units
+from anytouch_jax.sim.sensing import calibration, sensors, shading
 from anytouch_jax.sim.sensing.sensors import SENSORS, Light, Lights
 
 LIT = [name for name, sensor in SENSORS.items() if isinstance(sensor.look, Lights)]
@@ -134,58 +134,58 @@ def test_tilt_is_the_sine_and_is_cut():
 
 
 def test_a_unit_follows_from_the_seed_alone():
-    first, again, other = (units.draw_unit(DIGIT, np.random.default_rng(s)) for s in (3, 3, 4))
+    first, again, other = (sensors.draw_unit(DIGIT, np.random.default_rng(s)) for s in (3, 3, 4))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     differs = [name for name, a, b in zip(first._fields, first, other, strict=True) if not np.array_equal(a, b)]
     assert set(differs) >= {"tint", "gain", "uneven", "thickness", "modulus", "zoom", "rotation", "offset", "noise",
                             "base", "focus", "specks", "grain", "lights", "quality", "marker_pitch"}  # fmt: skip
     streams = [np.random.default_rng(5) for _ in SENSORS]
     for sensor, stream in zip(SENSORS.values(), streams, strict=True):
-        units.draw_unit(sensor, stream)
+        sensors.draw_unit(sensor, stream)
     assert len({stream.uniform() for stream in streams}) == 1, "every sensor takes as many draws"
 
 
 def test_units_stay_inside_the_field_and_carry_markers_by_share():
     sensor = SENSORS["gelsight_mini"]
     rng = np.random.default_rng(6)
-    drawn = [units.draw_unit(sensor, rng) for _ in range(300)]
+    drawn = [sensors.draw_unit(sensor, rng) for _ in range(300)]
     for unit in drawn:
         reach = np.abs(unit.window) + unit.zoom * np.array(sensor.field[::-1]) / 2
         assert (reach <= np.array(sensor.field[::-1]) / 2 + 1e-4).all()
         assert set(np.abs(unit.mirror)) == {1}
         assert unit.tint.min() > 0 and unit.modulus > 0 and unit.thickness > 0 and unit.noise > 0
     assert abs(np.mean([u.marked for u in drawn]) - 0.5) < 0.1
-    assert not any(units.draw_unit(DIGIT, rng).marked for _ in range(20)), "a DIGIT has no markers"
+    assert not any(sensors.draw_unit(DIGIT, rng).marked for _ in range(20)), "a DIGIT has no markers"
     assert all(a.dtype == np.float32 for a in drawn[0])
     assert np.std([u.base.mean() for u in drawn]) > 0.005, "units are untouched gels of several real ones"
 
 
 def test_the_light_drifts_little_from_frame_to_frame_and_more_from_the_background():
-    drawn = np.stack([units.draw_drift(10, np.random.default_rng(seed)) for seed in range(300)])
+    drawn = np.stack([sensors.draw_drift(10, np.random.default_rng(seed)) for seed in range(300)])
     assert drawn.shape == (300, 10, 3, 3) and drawn.dtype == np.float32
     since, steps = np.median(np.abs(drawn[:, 0])), np.median(np.abs(np.diff(drawn, axis=1)))
     assert 0.005 < since < 0.02 and 0.001 < steps < 0.4 * since
 
 
 def test_the_mounting_and_its_inverse():
-    unit = units.draw_unit(DIGIT, np.random.default_rng(7))
+    unit = sensors.draw_unit(DIGIT, np.random.default_rng(7))
     x, y = jnp.array([0.0, 3.0, -2.0]), jnp.array([0.0, 1.0, 5.0])
-    back = units.gel_to_object(unit, x, y)
-    there = np.stack(units.rotated(*back, unit.rotation)) + unit.offset[:, None]
+    back = sensors.gel_to_object(unit, x, y)
+    there = np.stack(sensors.rotated(*back, unit.rotation)) + unit.offset[:, None]
     np.testing.assert_allclose(there, np.stack([x, y]), atol=1e-5)
-    np.testing.assert_allclose(units.gel_to_object(unit, *unit.offset), [0, 0], atol=1e-6)
-    quarter = units.identity_unit(DIGIT)._replace(rotation=np.float32(np.pi / 2))
-    np.testing.assert_allclose(units.gel_to_object(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
-    np.testing.assert_array_equal(units.gel_to_object(units.identity_unit(DIGIT), x, y), [x, y])
+    np.testing.assert_allclose(sensors.gel_to_object(unit, *unit.offset), [0, 0], atol=1e-6)
+    quarter = sensors.identity_unit(DIGIT)._replace(rotation=np.float32(np.pi / 2))
+    np.testing.assert_allclose(sensors.gel_to_object(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
+    np.testing.assert_array_equal(sensors.gel_to_object(sensors.identity_unit(DIGIT), x, y), [x, y])
 
 
 def test_stacked_units_vmap():
     rng = np.random.default_rng(8)
-    several = [units.draw_unit(DIGIT, rng) for _ in range(3)]
-    stacked = units.stack_trees(several)
+    several = [sensors.draw_unit(DIGIT, rng) for _ in range(3)]
+    stacked = sensors.stack_trees(several)
     assert stacked.uneven.shape == (3, 5, 3)
-    moved = jax.vmap(lambda u: jnp.stack(units.gel_to_object(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
-    np.testing.assert_allclose(moved[2], units.gel_to_object(several[2], 1.0, 2.0), rtol=1e-6)
+    moved = jax.vmap(lambda u: jnp.stack(sensors.gel_to_object(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
+    np.testing.assert_allclose(moved[2], sensors.gel_to_object(several[2], 1.0, 2.0), rtol=1e-6)
 
 
 def test_the_side_of_a_dent_that_turns_away_from_a_light_is_in_its_shadow():

@@ -8,7 +8,7 @@ from anytouch_jax.data import tokenizer as text
 from anytouch_jax.sim.world import captions
 from anytouch_jax.sim.world.captions import caption
 from anytouch_jax.sim.world.objects import MATERIALS, PRIMITIVE_KINDS, catalogue, hardness_of, roughness_of
-from anytouch_jax.sim.world.primitives import PRIMITIVES
+from anytouch_jax.sim.world.shapes import PRIMITIVES
 
 THINGS = catalogue(0, 300)
 # What a caption would give away: kinds of primitive and things, materials, and all about the touch itself.

@@ -19,8 +19,7 @@ from anytouch_jax.sim.world.objects import (
     hold_out,
     roughness_of,
 )
-from anytouch_jax.sim.world.primitives import PRIMITIVES
-from anytouch_jax.sim.world.shapes import Shape, height, relief
+from anytouch_jax.sim.world.shapes import PRIMITIVES, Shape, height, relief
 from anytouch_jax.sim.world.textures import GRAINS, TEXTURES
 
 THINGS = catalogue(0)

@@ -8,10 +8,9 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.scene import Scenes, draw_touch
-from anytouch_jax.sim.world import primitives
+from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import catalogue
-from anytouch_jax.sim.world.primitives import PRIMITIVES, STROKES, floor
-from anytouch_jax.sim.world.shapes import Shape, base, height, layers, relief, unroll
+from anytouch_jax.sim.world.shapes import PRIMITIVES, STROKES, Shape, base, floor, height, layers, relief, unroll
 from anytouch_jax.sim.world.textures import TEXTURES
 
 
@@ -94,7 +93,7 @@ def test_the_ring_is_a_torus():
 
 def test_the_thread_winds():
     shape = Shape("screw", size=4.0)
-    pitch = primitives.thread_pitch(4.0)
+    pitch = shapes.thread_pitch(4.0)
     y = np.linspace(-3, 3, 200)
     crest = height(shape, np.zeros(200), y)
     np.testing.assert_allclose(height(shape, np.zeros(200), y + pitch), crest, atol=1e-9)
@@ -110,7 +109,7 @@ def test_the_thread_winds():
 def test_letters_stand_on_a_plate(letter):
     shape = Shape("letters", size=10.0, letter=letter)
     z = relief(shape, 128, 0.15)
-    assert z.max() == 0 and z[0, 0] == pytest.approx(-primitives.STROKE_RISE, abs=0.01)
+    assert z.max() == 0 and z[0, 0] == pytest.approx(-shapes.STROKE_RISE, abs=0.01)
     share = (z > -0.1).mean()
     assert 0.03 < share < 0.2
     others = [relief(dataclasses.replace(shape, letter=o), 128, 0.15) for o in STROKES if o != letter]

@@ -19,8 +19,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact.mechanics import KPA_MM2, Gel
 from anytouch_jax.sim.sensing import shading
-from anytouch_jax.sim.sensing.sensors import Markers, Sensor, look
-from anytouch_jax.sim.sensing.units import Unit, rotated
+from anytouch_jax.sim.sensing.sensors import Markers, Sensor, Unit, look, rotated
 
 Array = jax.Array
 Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: value, slope

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.world.objects import Object
-from anytouch_jax.sim.world.primitives import floor
-from anytouch_jax.sim.world.shapes import Shape, base, layers, unroll
+from anytouch_jax.sim.world.shapes import Shape, base, floor, layers, unroll
 
 Image = npt.NDArray[np.float32]  # (H, W) or (H, W, 3)
 Planes = tuple[Image, Image, Image]  # x, y, z or red, green, blue: separate planes are faster than a last axis of 3

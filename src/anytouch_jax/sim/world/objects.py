@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.world.primitives import PRIMITIVES, STROKES
-from anytouch_jax.sim.world.shapes import Shape
+from anytouch_jax.sim.world.shapes import PRIMITIVES, STROKES, Shape
 from anytouch_jax.sim.world.textures import TEXTURES
 
 # In kPa: a finger dents softer materials, and a hand cannot deform harder ones.

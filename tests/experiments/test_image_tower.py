@@ -11,11 +11,11 @@ from runs import run_config, train
 from tiny_models import full_model
 
 from anytouch_jax.config import to_json
-from anytouch_jax.encoder.encoder import image_tower_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.weights import checkpoint, convert, safetensors
+from experiments.image_tower import image_tower_encoder
 from tests.support.release_keys import release_names
 
 RNG = np.random.default_rng(0)

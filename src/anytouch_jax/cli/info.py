@@ -260,8 +260,8 @@ def _manifest(path: Path) -> list[str]:
     filled = [f"{name} {summary.filled[name]:,}" for name in optional if name in summary.filled]
     labels = [name.removeprefix("label.") for name in summary.filled if name.startswith("label.")]
     return [
-        f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, {summary.clips:,} clips of three "
-        "frames",
+        f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, {summary.clips:,} clips of "
+        "three frames",
         f"splits: {counts('split')}",
         f"sensors: {counts('sensor')}",
         f"rows with {', '.join(filled) or 'no optional column'}",

@@ -103,7 +103,7 @@ def run(options: RetrieveOptions) -> int:
             except UserError as error:
                 log(f"no control by {name}: {error}")
     scores = retrieval.cross_sensor_retrieval(table, values, rows, metrics={VECTOR: "euclidean"}, **settings)
-    head = ("features", "query", "gallery", "centred", "top-1", "95 %", "top-5", "chance", "of", "queries")
+    head = ("features", "query", "gallery", "centred", "recall@1", "95 %", "recall@5", "chance", "of", "queries")
     print_table(markdown_table(head, [_cells(score) for score in scores]))
     for note in dict.fromkeys(note for score in scores for note in score.notes):
         log(note)

@@ -8,6 +8,7 @@ Background only is the untouched gel. Mean touch is the mean of all features.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import statistics
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore, encoder_features
-from anytouch_jax.evaluate.probing import probe_tasks
+from anytouch_jax.evaluate.probing import interval_text, probe_tasks
 from anytouch_jax.evaluate.statistics import Array, GroupSums
 
 REAL, SHUFFLED, SHIFTED, BACKGROUND, MEAN = (
@@ -107,17 +108,14 @@ def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
 
 
 def _background_features(table: Manifest, encoder: Encoder, **encoding: Any) -> Callable[[Array, int], Array]:
-    pictures: dict[Path, Array] = {}
+    @lru_cache(256)  # many rows share one
+    def gel(file: Path) -> Array:
+        picture = decode(file)
+        return encoder.prepare(picture, picture if encoder.subtracts else None)
 
     def empty(clips: Array, rows: Array) -> Array:
-        result = np.empty_like(clips)
-        for place, row in enumerate(rows.tolist()):
-            file = table.file(row, "background_path")
-            if file not in pictures:
-                gel = decode(file)
-                pictures[file] = encoder.prepare(gel, gel if encoder.subtracts else None)
-            result[place] = pictures[file]
-        return result
+        gels = np.stack([gel(table.file(row, "background_path")) for row in rows.tolist()])
+        return np.broadcast_to(gels[:, None], clips.shape)
 
     def compute(rows: Array, frames: int) -> Array:
         return embed_rows(encoder, table, rows, frames, edit=empty, log=lambda _: None, **encoding)[1]
@@ -149,10 +147,8 @@ def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
             least = min(without, key=lambda gain: gain["difference"])
             points = f"{100 * least['difference']:.1f} points ({100 * least['low']:.1f} to {100 * least['high']:.1f})"
             sentence = f"Touch matters for {key[0]}: it adds {points} to {least['control']}"
-            late = own.get(SHIFTED)
-            if (
-                late is not None and late["low"] is not None and (late["low"], late["high"]) != (0, 0)
-            ):  # no other moment
+            late = own.get(SHIFTED, {"low": None})
+            if late["low"] is not None and (late["low"], late["high"]) != (0, 0):  # there is another moment
                 sentence += ", and the moment matters" if late["low"] > 0 else ", and any moment of a recording serves"
         else:
             failed = ", ".join(gain["control"] for gain in without if gain not in above)
@@ -163,9 +159,8 @@ def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
 
 def gains_table(gains: Sequence[dict[str, Any]]) -> str:
     """Return the paired differences as a Markdown table, in points of 100."""
-    rows = []
-    for gain in gains:
-        interval = "-" if gain["low"] is None else f"{100 * gain['low']:.1f} to {100 * gain['high']:.1f}"
-        rows.append((gain["task"], gain["head"], f"real above {gain['control']}", f"{100 * gain['difference']:.1f}",
-                     interval))  # fmt: skip
+    rows = [
+        (gain["task"], gain["head"], f"real above {gain['control']}", f"{100 * gain['difference']:.1f}",
+         interval_text(gain["low"], gain["high"])) for gain in gains
+    ]  # fmt: skip
     return statistics.markdown_table(("task", "head", "compared", "points", "95 %"), rows)

@@ -30,7 +30,6 @@ from anytouch_jax.files import read_arrays
 
 Order = Literal["right", "shuffled", "repeated"]
 Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
-Size = tuple[int, int]  # rows, columns
 
 RAW, RANDOM = "raw pixels", "random encoder"
 VERSION = 3  # of the features; a change to their computation raises it
@@ -205,16 +204,13 @@ def image_digest(table: Manifest, count: int = 32) -> str:
     return digest.hexdigest()
 
 
-def raw_pixels(frame: Array, background: Array | None, size: Size = SMALL) -> Array:
-    """Return pixels in colour and their difference from the background (0 if it is None), averaged down to `size`.
+def raw_pixels(frame: Array, background: Array | None) -> Array:
+    """Return pixels in colour and their difference from the background (0 if it is None), averaged down to SMALL.
 
-    `frame`, `background`: u8 RGB (h, w, 3) -> f32 (2 * rows * columns * 3,) in 0..1. Raises UserError if shapes differ.
+    `frame`, `background`: u8 RGB (h, w, 3) -> f32 (2 * 24 * 32 * 3,) in 0..1.
     """
-    if frame.ndim != 3 or frame.shape[-1] != 3 or (background is not None and frame.shape != background.shape):
-        others = "" if background is None else f" and background {background.shape}"
-        raise UserError(f"Frame {frame.shape}{others} must have one shape (h, w, 3).")
-    pixels = _small(frame, size)
-    return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background, size)])
+    pixels = _small(frame)
+    return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background)])
 
 
 def _pair_reader(table: Manifest, prepare: Callable[[Array], Any]) -> Callable[[int], tuple[Any, Any]]:
@@ -235,13 +231,13 @@ def _pair_reader(table: Manifest, prepare: Callable[[Array], Any]) -> Callable[[
     return read
 
 
-def background_difference(table: Manifest, rows: Array, size: Size = SMALL) -> Array:
-    """Return frames minus their backgrounds in RGB, averaged down to `size`: f32 (n, 3 * rows * columns) in -1..1.
+def background_difference(table: Manifest, rows: Array) -> Array:
+    """Return frames minus their backgrounds in RGB, averaged down to SMALL: f32 (n, 24 * 32 * 3) in -1..1.
 
     Raises UserError that names a row without a background, or whose background has other proportions.
     """
-    read = _pair_reader(table, lambda image: (_small(image, size), image.shape[1] / image.shape[0]))
-    values = np.zeros((len(rows), size[0] * size[1] * 3), np.float32)
+    read = _pair_reader(table, lambda image: (_small(image), image.shape[1] / image.shape[0]))
+    values = np.zeros((len(rows), SMALL[0] * SMALL[1] * 3), np.float32)
     for place, row in enumerate(map(int, rows)):
         (frame, proportion), background = read(row)
         if background is None:
@@ -272,9 +268,9 @@ def _same_size(image: Array) -> Array:
     return np.asarray(cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
 
 
-def _small(image: Array, size: Size) -> Array:
-    """Return area averages, f32 (rows * columns * 3,) in 0..1, of a picture u8 (h, w, 3)."""
-    return cv2.resize(image.astype(np.float32) / 255, size[::-1], interpolation=cv2.INTER_AREA).ravel()
+def _small(image: Array) -> Array:
+    """Return area averages, f32 (24 * 32 * 3,) in 0..1, of a picture u8 (h, w, 3)."""
+    return cv2.resize(image.astype(np.float32) / 255, SMALL[::-1], interpolation=cv2.INTER_AREA).ravel()
 
 
 def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:

@@ -274,14 +274,14 @@ def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
         "chance_mae": result.baseline_mae, "train": result.n_train, "test": result.n_test, "groups": result.test_groups,
     })  # fmt: skip
     if result.measured:
-        line["MAE 95 %"] = _interval(result.mae_low, result.mae_high, 1.0, 3)
+        line["MAE 95 %"] = interval_text(result.mae_low, result.mae_high, 1.0, 3)
     else:
         refits = f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}" if result.seeds else "-"
         line |= {"balanced": _share(result.balanced_accuracy), "refits": refits, "classes": str(len(result.classes))}
     line["penalty or k"] = "-" if result.penalty is None else f"{result.penalty:g} ({result.chosen_on})"
     parts = [
         {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol, "score": _share(part.accuracy),
-         "95 %": _interval(part.low, part.high), "test (groups)": str(part.n_test)}
+         "95 %": interval_text(part.low, part.high), "test (groups)": str(part.n_test)}
         for part in result.parts
     ]  # fmt: skip
     return [line, *parts]
@@ -289,10 +289,14 @@ def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
 
 def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
     """Return the cells of a result of `probe_tasks` that every table has."""
-    cells = {"score": _share(row["mean"]), "95 %": _interval(row["low"], row["high"]), "chance": _share(row["chance"])}
+    cells = {
+        "score": _share(row["mean"]),
+        "95 %": interval_text(row["low"], row["high"]),
+        "chance": _share(row["chance"]),
+    }
     if row["metric"] == "r2":
         mae, chance = (f"{row[name]:.3g} {row['unit']}".strip() for name in ("mae", "chance_mae"))
-        interval = _interval(row["low"], row["high"], 1.0, 3)
+        interval = interval_text(row["low"], row["high"], 1.0, 3)
         cells = {"score": f"R2 {row['mean']:.3f}, {mae}", "95 %": interval, "chance": chance}
     return cells | {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
 
@@ -301,7 +305,8 @@ def _share(value: float | None) -> str:
     return "-" if value is None or np.isnan(value) else f"{100 * value:.1f} %"
 
 
-def _interval(low: float | None, high: float | None, factor: float = 100.0, digits: int = 1) -> str:
+def interval_text(low: float | None, high: float | None, factor: float = 100.0, digits: int = 1) -> str:
+    """Return an interval as text, "-" if there is none; shares are in points by default."""
     return "-" if low is None or high is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
 
 

@@ -431,14 +431,15 @@ def retrieval_section(
             shares = ["-" if cell is None else _shares(cell.top1, cell.low, cell.high) for cell in cells]
             fifth = "-" if cells[0] is None else _shares(cells[0].top5)
             rows.append((grade, name, shares[0], fifth, *shares[1:], result.gallery, result.queries))
-    head = ("data", "features", "top-1 matched", "top-5 matched", "top-1 matched, centred", "top-1 by chance",
-            "top-1 by chance, centred", "gallery", "queries")  # fmt: skip
+    ways = ("recall@1 matched", "recall@5 matched", "recall@1 matched, centred", "recall@1 by chance",
+            "recall@1 by chance, centred")  # fmt: skip
+    head = ("data", "features", *ways, "gallery", "queries")
     table = statistics.markdown_table(head, rows)
-    table += f"\n\n{best}, top-1 ahead of the others (points, paired by query):\n\n"
+    table += f"\n\n{best}, recall@1 ahead of the others (points, paired by query):\n\n"
     table += statistics.markdown_table(("data", "features", f"{best} minus these"), ahead)
     path = folder / "figures" / "retrieval.png"
     if panels:
-        plots.bars(path, panels, label="top-1")
+        plots.bars(path, panels, label="recall@1")
     matched = [result for kinds in results.values() for result in kinds.get("matched", ())]
     near = [result.nearness for result in matched if result.nearness is not None]
     covariates = ", ".join(name.removeprefix("label.") for name in matched[0].matched) if matched else "nothing"

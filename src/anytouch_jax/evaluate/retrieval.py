@@ -410,9 +410,7 @@ def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
 
 def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
     """Return numeric columns as f64 (rows, columns), NaN for an empty cell. Raises UserError for text."""
-    return np.array([number_column(manifest, name)[rows] for name in names], np.float64).T.reshape(
-        len(rows), len(names)
-    )
+    return np.stack([number_column(manifest, name)[rows] for name in names], 1)
 
 
 def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1) -> Array:

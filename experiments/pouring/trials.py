@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from anytouch_jax.evaluate.statistics import mean_interval
 from anytouch_jax.files import atomic_write
-from anytouch_jax.sim.sensing.sensors import stack_trees
+from anytouch_jax.sim.recorder import stack_trees
 from experiments.pouring import physics, render
 from experiments.pouring.physics import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
 

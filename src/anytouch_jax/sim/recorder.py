@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +19,11 @@ from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
-from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, gel_to_object, look, rotated, stack_trees, unit_gel
+from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, gel_to_object, look, rotated, unit_gel
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object
 
+Tree = TypeVar("Tree")
 SPACING = 0.1  # mm between pixels of a height map
 RELIEF = 400  # pixels of a height map: 40 mm hold any rotated field and its motion
 GRID = 96  # pixels of the solve grid on the field's short side, at most
@@ -242,3 +243,8 @@ class Recorder:
             drift=recording.drift,
             seed=np.uint32(recording.seed),
         )
+
+
+def stack_trees(trees: Sequence[Tree]) -> Tree:
+    """Stack units, or records with units, along a new leading axis for vmap."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.sim.recorder import stack_trees
 from anytouch_jax.sim.sensing import optics, sensors
 from anytouch_jax.sim.sensing.sensors import SENSORS, Markers
 
@@ -170,7 +171,7 @@ def test_a_batch_is_its_frames():
     rng = np.random.default_rng(3)
     several = [sensors.draw_unit(SLIM, rng) for _ in range(2)]
     dents, keys = jnp.stack([bump(2.0), bump(0, -2.0)]), jax.random.split(KEY, 2)
-    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), sensors.stack_trees(several), keys)
+    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), stack_trees(several), keys)
     for i in range(2):
         np.testing.assert_allclose(levels(together[i]), levels(draw(dents[i], STILL, several[i], keys[i])), atol=1)
 

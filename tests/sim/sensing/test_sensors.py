@@ -11,6 +11,7 @@ import pytest
 
 from anytouch_jax import config
 from anytouch_jax.errors import UserError
+from anytouch_jax.sim.recorder import stack_trees
 from anytouch_jax.sim.sensing import calibration, sensors, shading
 from anytouch_jax.sim.sensing.sensors import SENSORS, Light, Lights
 
@@ -182,7 +183,7 @@ def test_the_mounting_and_its_inverse():
 def test_stacked_units_vmap():
     rng = np.random.default_rng(8)
     several = [sensors.draw_unit(DIGIT, rng) for _ in range(3)]
-    stacked = sensors.stack_trees(several)
+    stacked = stack_trees(several)
     assert stacked.uneven.shape == (3, 5, 3)
     moved = jax.vmap(lambda u: jnp.stack(sensors.gel_to_object(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
     np.testing.assert_allclose(moved[2], sensors.gel_to_object(several[2], 1.0, 2.0), rtol=1e-6)

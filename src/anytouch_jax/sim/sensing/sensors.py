@@ -9,11 +9,10 @@ ones. Tac3D measures a field and has no image.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib.resources import files
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -196,7 +195,6 @@ def shade(lights: Lights, nx: Array, ny: Array, u: Array, v: Array, *, flat_only
     return total
 
 
-Tree = TypeVar("Tree")
 Leaf = Any  # numpy, or jax under vmap and jit
 
 
@@ -326,8 +324,3 @@ def unit_gel(sensor: Sensor, unit: Unit) -> Gel:
     """Return the gel of a sensor unit."""
     gel = sensor.gel
     return replace(gel, modulus=gel.modulus * unit.modulus, thickness=gel.thickness * unit.thickness)
-
-
-def stack_trees(trees: Sequence[Tree]) -> Tree:
-    """Stack units, or records with units, along a new leading axis for vmap."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

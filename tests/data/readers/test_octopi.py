@@ -11,8 +11,11 @@ def test_octopi_follows_its_sample_files(tmp_path, read):
     samples = ("physiclear_apple_0", "physiclear_apple_1", "physiclear_tea_towel_0", "physiclear_rest_0")
     fill(tmp_path, [f"processed/{name}/{i:010d}.jpg" for name in samples for i in frames])
     for split, name in zip(("train", "val", "test"), samples, strict=False):
-        (tmp_path / f"processed/{split}_samples.json").write_text(json.dumps({"x": [f"C:\\out/{name}"]}))
+        (tmp_path / f"processed/{split}_samples.json").write_text(
+            json.dumps({"x": [f"C:\\out/{name}"], "y": [f"no_{split}"]})
+        )
     table = read("octopi")
+    assert table.reasons["sample of *_samples.json that is not on disk"] == 3
     assert table.report.splits == {"train": 5, "val": 5, "test": 5, "unused": 5}
     row = table.rows[f"processed/{samples[2]}/{7:010d}.jpg"]
     assert (row["split"], row["object"], row["sensor"]) == ("test", "tea_towel", "gelsight_mini")

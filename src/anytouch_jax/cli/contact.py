@@ -38,9 +38,8 @@ class ContactOptions:
     """PNG of kept and dropped frames by rising score. Look at it before you trust a threshold."""
     check: bool = False  # Print precision and recall against a reference column. Writes a manifest only with --out.
     reference: str | None = None  # Column for --check (default: label.force, label.contact or label.contact_score).
-    above: Annotated[float | None, Range(-math.inf, math.inf, "a number")] = (
-        None  # Value of the reference column above which a frame is in contact.
-    )
+    above: Annotated[float | None, Range(-math.inf, math.inf, "a number")] = None
+    """Value of the reference column above which a frame is in contact."""
     threads: int = 2  # Threads that read pictures.
 
 

@@ -35,9 +35,8 @@ class InfoOptions:
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
     health: bool = False  # Check every sensor unit of a manifest, and print a verdict and what to do.
     picture: Path | None = None  # PNG with a picture and the verdict of each unit, with --health.
-    model: Path | None = (
-        None  # Does this encoder see contact? With --health, on rows with a contact label or background.
-    )
+    model: Path | None = None
+    """Does this encoder see contact? With --health, on rows with a contact label or background."""
 
 
 def run(options: InfoOptions) -> int:

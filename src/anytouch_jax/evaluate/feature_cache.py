@@ -107,7 +107,7 @@ def encoder_features(
 
 def pixel_features(table: Manifest, *, order: Order = "right", folder: Path | None = None) -> FeatureStore:
     """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in 0..1."""
-    read = _pair_reader(table, _same_size)
+    read = _pair_reader(table, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
 
     def compute(rows: Array, frames: int) -> Array:
         clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
@@ -260,12 +260,6 @@ def principal_components(
         raise UserError("No row is marked as train. The principal components need some.")
     pca = PCA(min(components, *fitted.shape), svd_solver=solver, random_state=0)
     return np.asarray(pca.fit(fitted).transform(features), np.float32)
-
-
-def _same_size(image: Array) -> Array:
-    if image.shape[:2] == RAW_SIZE:
-        return image
-    return np.asarray(cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
 
 
 def _small(image: Array) -> Array:

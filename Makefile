@@ -25,6 +25,7 @@ GOLDEN     ?= tests/parity/golden
 WORKERS    ?= 2
 CORPUS     ?= data/corpus
 REAL       ?=
+TOUCH      ?=
 WEIGHTS    ?= runs/anytouch-tiny
 ENCODERS   ?=
 
@@ -55,7 +56,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu compare pouring translation long-clips export-onnx experiments results notebooks corpus weights release-check docs clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu compare pouring translation long-clips export-onnx experiments results notebooks corpus weights figures release-check docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -153,6 +154,14 @@ corpus: $(STAMP) ## the simulated touches that the shipped encoders are trained 
 
 weights: $(STAMP) ## train the shipped encoder again: [CORPUS= REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
 	$(PY) -m experiments.encoders.train --corpus $(CORPUS) --real $(REAL) --out $(WEIGHTS)
+
+figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
+	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
+	$(PY) -m experiments.real.run anytouch-tiny --backgrounds$(if $(TOUCH), --data $(TOUCH))
+	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png
+	$(PY) -m experiments.pages
+	$(PY) -m experiments.notebooks.execute 01 02 03 04
+	WRITE_PAGES=1 $(PY) -m pytest tests/laws/test_pages_run.py
 
 release-check: $(STAMP) ## build a release, install it into an empty environment, run the README there (network)
 	$(PY) -m tests.release

@@ -1,10 +1,12 @@
 """Make the pages of results again from their data: `python -m experiments.pages [FOLDER]`.
 
-FOLDER has the data, and gets the pages and figures. The default is experiments/results.
+FOLDER has the data, and gets the pages and figures. The default is experiments/results, whose
+values the README gets too.
 """
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,6 +18,9 @@ from experiments.compare.page import compare_encoders
 from experiments.pages import matrix, page, speed, studies
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
+README = RESULTS.parents[1] / "README.md"
+# The rows of a page that the README shows: what their first two cells are.
+SHOWN = {"real": ("object, other finger", "linear"), "teaching": ("convolutional patches", "fine texture")}
 STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "real": ("real.jsonl", studies.real),
     "backgrounds": ("backgrounds.jsonl", studies.backgrounds),
@@ -52,6 +57,17 @@ def index(several: list[page.Page]) -> str:
     )
 
 
+def readme(text: str, several: list[page.Page]) -> str:
+    """Return the README with the values of the pages that its table links to, written as `name` 1.2 %."""
+    lines = text.splitlines(keepends=True)
+    for one in several:
+        values = {row[2].partition(":")[0]: row[3] for row in one.rows if row[:2] == SHOWN.get(one.name)}
+        for name, value in values.items():
+            pattern = re.compile(rf"(?<={re.escape(name)}`) [\d.]+ %")
+            lines = [pattern.sub(f" {value.mean:.1f} %", line) if f"/{one.name}.md" in line else line for line in lines]
+    return "".join(lines)
+
+
 def write(folder: Path) -> list[Path]:
     """Write the pages, their figures and the index of a folder, and return the pages. Raises UserError."""
     several = pages(folder)
@@ -59,6 +75,8 @@ def write(folder: Path) -> list[Path]:
         page.draw(one, folder / "figures" / f"{one.name}.png")
         atomic_write(folder / f"{one.name}.md", page.text(one))
     atomic_write(folder / "README.md", index(several))
+    if folder == RESULTS:
+        atomic_write(README, readme(README.read_text(encoding="utf-8"), several))
     return [folder / f"{one.name}.md" for one in several]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +34,13 @@ def committed() -> list[Page]:
 def test_every_committed_page_is_what_its_data_give(committed):
     made = {f"{one.name}.md": page.text(one) for one in committed} | {"README.md": results.index(committed)}
     assert {file.name: file.read_text() for file in RESULTS.glob("*.md")} == made, "make results"
+
+
+def test_the_readme_has_the_values_of_the_pages(committed):
+    text = results.README.read_text()
+    assert results.readme(text, committed) == text, "make results"
+    changed, counts = re.subn(r"` [\d.]+ %", "` 0.5 %", text)
+    assert counts == 5 and results.readme(changed, committed) == text
 
 
 def test_every_page_has_one_figure_and_every_file_of_data_a_page(committed):

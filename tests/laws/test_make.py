@@ -7,13 +7,16 @@ import re
 import shlex
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from places import ROOT
+from runs import SIZES
 
 from anytouch_jax.cli.app import COMMANDS, GROUPS
+from tests.laws.test_readme import TEXT
 
 NAMES = (
     "DATA",
@@ -160,3 +163,33 @@ def test_pins_cover_the_declared_dependencies() -> None:
     for requirement in map(Requirement, declared):
         assert "<" in str(requirement.specifier), f"{requirement} has no upper bound"
         assert pins[re.sub(r"[-_.]+", "-", requirement.name).lower()] in requirement.specifier
+
+
+# Targets that pages name and that are not run here, with the reason.
+NOT_RUN = {
+    "setup": "CI begins with it, in a fresh clone", "test": "it is running", "test-all": "it is running",
+    "demo": "it trains for minutes, and the tests above read its commands",
+    "bench": "it measures for minutes, and tests/experiments/benchmarks runs its parts",
+    "compare": "it measures encoders of full size, and test_compare.py runs a small one",
+    "docs": "it installs packages from the network", "export-onnx": "it installs packages from the network",
+}  # fmt: skip
+SMALL = " ".join(f"--{name} {value}" for name, value in SIZES.items())
+RUN = {
+    "parity": [],
+    "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"],
+    "probe": ["RUN=anytouch-tiny", "LABEL=object", "DATA={world}"],
+}  # fmt: skip
+
+
+def test_every_target_of_the_pages_is_run_or_has_a_reason() -> None:
+    named = set(re.findall(r"(?:^ {4}|`)make ([a-z][a-z0-9-]*)", TEXT, re.MULTILINE))
+    assert named & set(TARGETS) <= NOT_RUN.keys() | RUN.keys()
+    assert not NOT_RUN.keys() & RUN.keys() and NOT_RUN.keys() <= named
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", RUN)
+def test_a_target_of_the_pages_runs(target: str, world: Path, tmp_path: Path) -> None:
+    words = [word.format(folder=tmp_path, world=world) for word in RUN[target]]
+    done = make("-o", ".venv/.made", f"PY={sys.executable}", target, *words)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -56,13 +56,16 @@ def test_a_case_is_within_tolerance(name):
     assert len(rows) >= COMPARISONS[name]
 
 
-def test_the_program_that_users_run_is_within_tolerance():
-    """On one device and with all of XLA's optimisations, unlike this process: attention takes its other form there."""
+def test_the_program_that_users_run_is_within_tolerance(tmp_path):
+    """On one device and with all of XLA's optimisations, unlike this process: attention takes its other form there.
+
+    Here it is one case. test_make.py runs all of them in the same way.
+    """
     settings = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
-    command = [sys.executable, "-m", "tests.parity.run", str(HERE)]
+    command = [sys.executable, "-m", "tests.parity.run", str(copied(tmp_path, "A_stage1_image_small_scale"))]
     done = subprocess.run(command, capture_output=True, text=True, env=settings, cwd=ROOT, timeout=900)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-    assert ", 0 out of tolerance" in done.stdout
+    assert "small_scale" in done.stdout and ", 0 out of tolerance" in done.stdout
 
 
 def test_every_case_of_the_folder_is_run():

@@ -71,7 +71,7 @@ def run(options: SimulateOptions) -> int:
         nonlocal last
         if last < 0 and done < of:
             sensors = ", ".join(scenes.sensors)
-            bar.console.print(f"compiling the contact solver for {sensors}: about a minute the first time")
+            bar.console.print(f"compiling the contact solver for {sensors}: about a minute at first", soft_wrap=True)
         elif bar.disable and 10 * done // of > 10 * last // of:
             log(f"{done} of {of} touches")
         last = done

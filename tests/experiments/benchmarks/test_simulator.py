@@ -27,6 +27,7 @@ def rows():
     return speed_against_error(VARIANTS, scenes, setting=SETTING, reference=32, rounds=2)
 
 
+@pytest.mark.slow
 def test_a_row_a_variant_with_times_and_errors(rows):
     assert [(row.fidelity, row.grid, row.iterations) for row in rows] == [dataclasses.astuple(one) for one in VARIANTS]
     for row in rows:
@@ -36,12 +37,14 @@ def test_a_row_a_variant_with_times_and_errors(rows):
         assert np.isfinite([row.shear, row.force, *row.image.values()]).all()
 
 
+@pytest.mark.slow
 def test_the_reference_itself_has_no_error(rows):
     same = rows[0]
     assert max(same.largest.values()) < 1e-3 and same.force < 1e-3 and same.shear < 5e-3 and same.converged == 2
     assert max(same.image.values()) < 0.05  # a rounded grey level here and there
 
 
+@pytest.mark.slow
 def test_errors_are_reported(rows):
     same, coarse, hasty, quick = rows
     assert coarse.converged == 2 and hasty.converged < 2

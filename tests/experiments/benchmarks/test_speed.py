@@ -63,9 +63,9 @@ def noise_of(work):
 
 @pytest.mark.parametrize("work", [
     Workload("stage1 clips", shallow(preset("small")), 2, 4),
-    Workload("stage1 stills", shallow(preset("small")), 2, 1),
+    pytest.param(Workload("stage1 stills", shallow(preset("small")), 2, 1), marks=pytest.mark.slow),
     Workload("stage2 align", shallow(preset("small", stage=2)), 4, 3),
-    Workload("stage2 match", shallow(preset("small", stage=2)), 4, 3),
+    pytest.param(Workload("stage2 match", shallow(preset("small", stage=2)), 4, 3), marks=pytest.mark.slow),
     Workload("embed", shallow(preset("small")), 2, 3),
 ], ids=lambda work: work.name)  # fmt: skip
 def test_useful_operations_are_nearly_all_that_xla_counts(work):
@@ -235,6 +235,7 @@ def test_a_variant_that_fails_when_it_is_run_is_a_row_with_a_note(monkeypatch):
     assert base.calls == 1 and base.ratio == 1 and large.note == "RuntimeError: RESOURCE_EXHAUSTED: out of memory"
 
 
+@pytest.mark.slow
 def test_a_step_is_measured_and_what_does_not_run_here_is_a_row_with_a_note():
     tried = (*FAST[:1], variants.Variant("donated", donate=True), variants.Variant("seven bits", NOWHERE))
     rows = speed.measure(STAGE1, tried, rounds=2, with_errors=False, peak_size=64)

@@ -1,10 +1,14 @@
-"""Search by touch: recall and latency of the graph of neighbours next to exact search.
+"""Search by touch: recall and latency of the graph of neighbours (usearch) and of exact search (numpy).
 
-python -m experiments.benchmarks.search --count 1000000
+    python -m experiments.benchmarks.search --count 1000000
+
+A line a way and size goes to `experiments/results/search.jsonl`. `make results` makes the page from that file alone.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import os
 import sys
 import tempfile
 import time
@@ -17,7 +21,11 @@ import numpy as np
 
 from anytouch_jax.encoder.search import load_index
 from anytouch_jax.evaluate.statistics import markdown_table
+from experiments.benchmarks import machine
 from experiments.command import run_script
+from experiments.records import write_record
+
+WAYS = {"exact (numpy)": False, "graph (usearch)": True}
 
 
 @dataclass(frozen=True)
@@ -26,44 +34,63 @@ class SearchOptions:
 
     count: int = 1_000_000  # Features.
     width: int = 128  # Values of a feature.
-    queries: int = 100
+    queries: int = 200
     nearest: int = 10
+    out: Path = Path("experiments/results/search.jsonl")  # JSON lines.
 
 
-def seconds(function: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the time of a call, and its result."""
-    begin = time.perf_counter()
+def timed(function: Callable[[], Any]) -> tuple[float, float, Any]:
+    """Return the seconds of a call, the processor seconds of all its threads, and its result."""
+    begin, work = time.perf_counter(), time.process_time()
     result = function()
-    return time.perf_counter() - begin, result
+    return time.perf_counter() - begin, time.process_time() - work, result
 
 
-def run(options: SearchOptions) -> int:
-    """Print a table with both ways."""
+def made_features(options: SearchOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Return features (count, width), some 50 around a middle, and queries near some of them, all f32."""
     rng = np.random.default_rng(0)
     middles = rng.standard_normal((max(1, options.count // 50), options.width), np.float32)
     values = middles[rng.integers(len(middles), size=options.count)]
     values += 0.5 * rng.standard_normal(values.shape, np.float32)
     queries = values[rng.integers(options.count, size=options.queries)]
-    queries = queries + 0.3 * rng.standard_normal(queries.shape, np.float32)
-    rows, truth = [], np.zeros(0)
+    return values, queries + 0.3 * rng.standard_normal(queries.shape, np.float32)
+
+
+def measured(path: Path, queries: np.ndarray, options: SearchOptions) -> dict[str, dict[str, Any]]:
+    """Return the record of each way: times of one query alone in ms, recall of the exact result, seconds to open."""
+    records, truth = {}, np.zeros(0)
+    for way, approximate in WAYS.items():
+        opened, work, index = timed(lambda approximate=approximate: load_index(path, approximate=approximate))
+        load, found = (
+            os.getloadavg()[0],
+            [timed(lambda q=q, index=index: index.search(q, options.nearest)) for q in queries],
+        )
+        ids = np.stack([result[0][0] for *_, result in found])
+        truth = truth if approximate else ids
+        wall, processor = (1e3 * np.array([each[i] for each in found]) for i in (0, 1))
+        records[way] = {
+            "count": options.count, "width": options.width, "nearest": options.nearest, "queries": options.queries,
+            "recall": float(np.mean([len(set(a) & set(b)) / len(a) for a, b in zip(ids, truth, strict=True)])),
+            "p50_ms": float(np.median(wall)), "p99_ms": float(np.percentile(wall, 99)),
+            "processor_ms": float(processor.mean()), "opened_s": opened, "opened_processor_s": work, "load": load,
+            "machine": dataclasses.asdict(machine.describe()),
+        }  # fmt: skip
+    return records
+
+
+def run(options: SearchOptions) -> int:
+    """Measure both ways, store them and print a table."""
+    values, queries = made_features(options)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "features.npz"
         np.savez(path, features=values, rows=np.arange(len(values)))
-        for name, approximate in (("exact", False), ("graph (usearch)", True)):
-            built, index = seconds(lambda approximate=approximate: load_index(path, approximate=approximate))
-            found = [seconds(lambda q=q, index=index: index.search(q, options.nearest)) for q in queries]
-            times, ids = 1e3 * np.array([each[0] for each in found]), np.stack([each[1][0][0] for each in found])
-            truth = truth if approximate else ids
-            recall = np.mean([len(set(a) & set(b)) / len(a) for a, b in zip(ids, truth, strict=True)])
-            rows.append((name, f"{recall:.3f}", *(f"{np.percentile(times, q):.2f}" for q in (50, 99)), f"{built:.0f}"))
-    head = (
-        f"{options.count:,} features of {options.width}",
-        f"recall@{options.nearest}",
-        "p50 ms",
-        "p99 ms",
-        "ready in s",
-    )
-    print(markdown_table(head, rows))
+        del values
+        records = measured(path, queries, options)
+    for way, record in records.items():
+        write_record(options.out, f"{options.count:09d}/{way}", record | {"way": way})
+    shown = ("recall", "p50_ms", "p99_ms", "processor_ms", "opened_s", "opened_processor_s", "load")
+    rows = [(way, *(f"{record[name]:.3f}" for name in shown)) for way, record in records.items()]
+    print(markdown_table((f"{options.count:,} features", *shown), rows))
     return 0
 
 

@@ -15,7 +15,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 from experiments.compare.page import NAME as COMPARED
 from experiments.compare.page import compare_encoders
-from experiments.pages import matrix, page, speed, studies
+from experiments.pages import matrix, page, speed, studies, trust
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 README = RESULTS.parents[1] / "README.md"
@@ -23,6 +23,8 @@ README = RESULTS.parents[1] / "README.md"
 SHOWN = {"real": ("object, other finger", "linear"), "teaching": ("convolutional patches", "fine texture")}
 STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "real": ("real.jsonl", studies.real),
+    "trust": (trust.NAME, trust.trust),
+    "health": (trust.NAME, trust.health),
     "backgrounds": ("backgrounds.jsonl", studies.backgrounds),
     "motion": ("motion.jsonl", studies.motion),
     "lookalikes": ("lookalikes.jsonl", studies.lookalikes),
@@ -35,6 +37,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "variants": (speed.VARIANTS, speed.variants),
     "torch": (speed.TORCH[0], speed.torch),
     "memory": (speed.MEMORY, speed.memory),
+    "search": (speed.SEARCH, speed.search),
     "photometry": (speed.SIMULATOR, speed.photometry),
     "contact": (speed.SIMULATOR, speed.contact),
     "compare": (COMPARED, compare_encoders),

@@ -14,6 +14,7 @@ from experiments.records import read_records
 VARIANTS = "speed_stage1_stage2_embed_small.json"
 TORCH = ("torch_small.json", "torch_small_epyc_stage1.json", "torch_small_epyc.json", "torch_large.json")
 MEMORY, SIMULATOR = "memory_large.json", "simulator.jsonl"
+SEARCH = "search.jsonl"
 BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
 GIB = 2**30
 
@@ -78,6 +79,35 @@ def torch(folder: Path) -> Page:
         f"ours in float32. {BATCHES} From and to are quartiles.",
         ("machine", "preset", "work", *(Measure(name, ".2f") for name in names)),
         rows, findings, TORCH, "make bench-torch",
+    )  # fmt: skip
+
+
+def search(folder: Path) -> Page:
+    """Exact search and the graph of neighbours."""
+    records = [*read_records(folder / SEARCH).values()]
+    rows = [
+        (f"{one['count']:,}", one["way"], Value(100 * one["recall"]), one["p50_ms"], one["p99_ms"],
+         one["processor_ms"], one["opened_s"], one["opened_processor_s"]) for one in records
+    ]  # fmt: skip
+    largest = {one["way"].split()[0]: one for one in records if one["count"] == max(one["count"] for one in records)}
+    exact, graph = largest["exact"], largest["graph"]
+    loads = sorted(one["load"] for one in records)
+    return Page(
+        "search",
+        "How fast is search by touch?",
+        f"The {exact['nearest']} nearest of made features of {exact['width']} values are searched, in clusters of "
+        "about 50. A query is one touch. Recall is the share of the exact result that is found. The exact way is "
+        f"numpy, the graph is usearch. The machine is {_machine(exact['machine'])}. Other work ran on it, and its load "
+        f"was {loads[0]:.0f} to {loads[-1]:.0f}. So compare processor times, which are sums over the threads.",
+        ("features", "way", Measure("recall, %"),
+         *(Measure(name, ".1f", False) for name in ("p50, ms", "p99, ms", "processor ms", "s to open",
+                                                     "processor s to open"))),
+        rows,
+        [f"Of {exact['count']:,} features, exact search takes {exact['processor_ms']:.0f} ms of processor time a "
+         f"query, and the graph {graph['processor_ms']:.1f} ms with a recall of {100 * graph['recall']:.1f} %.",
+         f"The graph is built when the index opens, which takes {graph['opened_processor_s']:.0f} s of processor "
+         "time. For a few queries exact search is done earlier."],
+        (SEARCH,), "python -m experiments.benchmarks.search --count 1000000",
     )  # fmt: skip
 
 

@@ -1,17 +1,21 @@
 """Does a head know when it does not know, and does the health check find faults? Figures on recordings of your own.
 
-    anytouch embed --data ../shared/real_touch2/manifest.csv --out known.npz
-    anytouch embed --data ../shared/real_touch/manifest.csv --out others.npz
-    python -m experiments.real.trust ../shared/real_touch2/manifest.csv --features known.npz --strange others.npz
-    python -m experiments.real.trust ../shared/real_touch2/manifest.csv --health
+    anytouch embed --data ../shared/real_touch2/manifest.csv --out known.npz --on-bad-sample skip
+    anytouch embed --data ../shared/real_touch/manifest.csv --out others.npz --on-bad-sample skip
+    python -m experiments.real.trust "real, object" ../shared/real_touch2/manifest.csv --features known.npz \\
+        --strange others.npz
+    python -m experiments.real.trust "real" ../shared/real_touch2/manifest.csv --health
 
-Heads are fitted on split train, calibrated on train and val, and measured on test. Intervals are 95 %, over groups.
+Recordings are split at random, again and again: 60 % to fit a head, 20 % to calibrate it with parts of the 60, and 20 %
+to test it. Intervals are 95 %, over groups of recordings. A line of each name goes to
+`experiments/results/trust.jsonl`. `make results` makes the pages from that file alone.
 """
 
 from __future__ import annotations
 
 import sys
 from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,19 +26,22 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder import health, novelty
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import heads, probing, splits, tasks
-from anytouch_jax.evaluate.statistics import Array, markdown_table
-from anytouch_jax.files import atomic_write, read_arrays
+from anytouch_jax.evaluate import heads, probing, splits
+from anytouch_jax.evaluate.statistics import Array
+from anytouch_jax.files import read_arrays
+from anytouch_jax.sim.sensing.sensors import SENSORS, bases
 from experiments.command import run_script
 from experiments.real.faults import FAULTS, most_different
+from experiments.records import write_record
 
-DRAWS = 2000
+DRAWS = 200  # of a bootstrap over groups
 
 
 @dataclass(frozen=True)
 class TrustOptions:
-    """Measure calibration, coverage, novelty and health."""
+    """Measure calibration, coverage and novelty, or with --health the faults of sensor units."""
 
+    name: str  # Of the record.
     data: Path  # Manifest.
     features: Path | None = None  # Its features, by anytouch embed.
     strange: Path | None = None  # Features of another manifest by the same encoder, for sensors never met.
@@ -43,20 +50,32 @@ class TrustOptions:
     penalty: float = 0.1  # Of the heads.
     coverage: float = 0.9
     false_alarms: float = 0.05
-    held_out: int = 5  # Folds of classes that are left out in turn, for objects never met.
+    repeats: int = 20  # Random splits.
+    held_out: int = 5  # Folds of classes that are left out in turn, for classes never met.
     health: bool = False  # Check the units, and made faults of them.
+    package: bool = False  # With --health, compare with the real gels in the package too, for sensors of one unit.
     skip_units: tuple[str, ...] = ("unknown",)  # Units whose name contains one of these are not in good order.
-    out: Path | None = None  # Markdown page.
+    out: Path = Path("experiments/results/trust.jsonl")  # JSON lines.
 
 
-def interval(value: Any, groups: Array) -> str:
-    """Return a figure of row numbers, and its interval under a bootstrap over groups."""
-    rng, names = np.random.default_rng(0), np.unique(groups)
-    members = [np.flatnonzero(groups == name) for name in names]
-    draws = [value(np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))]))
-             for _ in range(DRAWS // 10)]  # fmt: skip
-    low, high = np.nanpercentile(draws, [2.5, 97.5])
-    return f"{value(np.arange(len(groups))):.3f} ({low:.3f} to {high:.3f})"
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """Features (n, d) with class names, groups and sensors (n,)."""
+
+    x: Array
+    y: Array
+    groups: Array
+    sensors: Array
+
+
+def read_touches(options: TrustOptions) -> Touches:
+    """Return the labelled rows of the manifest that have features. Raises UserError."""
+    table, arrays = manifests.read(options.data), read_arrays(options.features or "")
+    rows, _ = probing.label_rows(table, options.label, group=options.group)
+    rows = rows.take(np.flatnonzero(np.isin(rows.rows[:, 0], arrays["rows"])))
+    place = np.argsort(arrays["rows"])
+    x = arrays["features"][place[np.searchsorted(arrays["rows"][place], rows.rows[:, 0])]]
+    return Touches(x, rows.labels, rows.groups, rows.sensors)
 
 
 def auroc(known: Array, strange: Array) -> float:
@@ -77,67 +96,110 @@ def calibration_error(p: Array, correct: Array, bins: int = 15) -> float:
     return float(np.abs(gaps).sum() / max(sizes.sum(), 1))
 
 
-def fitted(x: Array, y: Array, rows: tasks.TaskRows, keep: Array, options: TrustOptions) -> LinearHead:
-    """Return a calibrated head of the train rows in `keep`, bool (n,)."""
-    fit, val = (np.flatnonzero((rows.split == name) & keep) for name in ("train", "val"))
-    names, numbers = np.unique(y, return_inverse=True)
-    (model,) = heads.linear_path(x[fit], numbers[fit], (options.penalty,))
-    head = heads.linear_head(model, names, label="", pooling="class", frames=1, fingerprint="")
-    folds = splits.group_folds(fit, rows.groups, numbers, splits.FOLDS)
-    return heads.calibrate(head, x, y, rows.groups, rows.sensors, fit, val, folds, options.penalty,
-                           coverage=options.coverage, false_alarms=options.false_alarms)  # fmt: skip
-
-
-def trust_table(options: TrustOptions) -> str:
-    """Return the figures of calibration and novelty."""
-    table, arrays = manifests.read(options.data), read_arrays(options.features or "")
-    rows, _ = probing.label_rows(table, options.label, group=options.group)
-    kept = np.isin(rows.rows[:, 0], arrays["rows"])
-    rows = rows.take(np.flatnonzero(kept))
-    place = np.argsort(arrays["rows"])
-    x = arrays["features"][place[np.searchsorted(arrays["rows"][place], rows.rows[:, 0])]]
-    y, everything = rows.labels, np.ones(len(rows.labels), bool)
-    head = fitted(x, y, rows, everything, options)
-    known = head.calibration
-    assert known is not None
-    test = np.flatnonzero((rows.split == "test") & np.isin(y, head.classes))
-    seen, groups = head.assess(x[test]), rows.groups[test]
-    right, p = seen.label == y[test], seen.p.max(1)
-    plain = novelty.probabilities(head.scaled(x[test]) @ head.weights + head.bias)
-    covered = seen.in_set[np.arange(len(test)), np.searchsorted(head.classes, y[test])]
-    error = calibration_error
-    lines = [
-        ("accuracy", interval(lambda i: right[i].mean(), groups)),
-        ("ECE before calibration", interval(lambda i: error(plain[i].max(1), right[i]), groups)),
-        ("ECE", interval(lambda i: error(p[i], right[i]), groups)),
-        (f"coverage of sets at {options.coverage:g}", interval(lambda i: covered[i].mean(), groups)),
-        ("classes in a set, of " + str(len(head.classes)), f"{seen.in_set.sum(1).mean():.1f}"),
-        (f"novel at {options.false_alarms:g}", interval(lambda i: seen.novel[i].mean(), groups)),
-        ("groups in calibration, in test", f"{known.recordings}, {len(np.unique(groups))}"),
+def over_groups(value: Callable[[Array], float], groups: Array) -> list[float]:
+    """Return a figure of row numbers, and the ends of its interval under a bootstrap over groups."""
+    rng, names = np.random.default_rng(0), np.unique(groups)
+    members = [np.flatnonzero(groups == name) for name in names]
+    draws = [
+        value(np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])) for _ in range(DRAWS)
     ]
-    classes, scores = np.random.default_rng(0).permutation(np.unique(y)), []
+    return [value(np.arange(len(groups))), *map(float, np.nanpercentile(draws, [2.5, 97.5]))]
+
+
+def random_split(groups: Array, seed: int) -> tuple[Array, Array, Array]:
+    """Return masks (n,) of the rows to fit on, to calibrate on and to test, 60, 20 and 20 % of the groups."""
+    names, ids = np.unique(groups, return_inverse=True)
+    place = np.random.default_rng(seed).permutation(len(names))[ids] / len(names)
+    return place < 0.6, (place >= 0.6) & (place < 0.8), place >= 0.8
+
+
+def fitted(data: Touches, fit: Array, val: Array, options: TrustOptions) -> LinearHead:
+    """Return a head of the rows of `fit`, calibrated on parts of them and on `val`, bool (n,)."""
+    rows = np.flatnonzero(fit)
+    names, numbers = np.unique(data.y, return_inverse=True)
+    (model,) = heads.linear_path(data.x[rows], numbers[rows], (options.penalty,))
+    head = heads.linear_head(model, names, label="", pooling="class", frames=1, fingerprint="")
+    folds = splits.group_folds(rows, data.groups, numbers, splits.FOLDS)
+    return heads.calibrate(head, data.x, data.y, data.groups, data.sensors, rows, np.flatnonzero(val), folds,
+                           options.penalty, coverage=options.coverage, false_alarms=options.false_alarms)  # fmt: skip
+
+
+def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
+    """Return accuracy, calibration error, coverage and false alarms on recordings that a head never met."""
+    columns: dict[str, list[Array]] = defaultdict(list)
+    counts = []
+    for seed in range(options.repeats):
+        fit, val, test = random_split(data.groups, seed)
+        head = fitted(data, fit, val, options)
+        assert head.calibration is not None
+        counts.append(head.calibration.recordings)
+        rows = np.flatnonzero(test & np.isin(data.y, head.classes))
+        seen, y = head.assess(data.x[rows]), data.y[rows]
+        plain = novelty.probabilities(head.scaled(data.x[rows]) @ head.weights + head.bias)
+        several = {
+            "groups": data.groups[rows], "right": seen.label == y, "p": seen.p.max(1), "plain": plain.max(1),
+            "novel": seen.novel, "size": seen.in_set.sum(1), "sure": ~seen.abstains,
+            "covered": seen.in_set[np.arange(len(rows)), np.searchsorted(head.classes, y)],
+        }  # fmt: skip
+        for name, values in several.items():
+            columns[name].append(values)
+    whole = {name: np.concatenate(values) for name, values in columns.items()}
+    groups, right, error = whole["groups"], whole["right"], calibration_error
+    weights = 1 / np.unique(groups, return_counts=True)[1][np.unique(groups, return_inverse=True)[1]]
+
+    def share(name: str) -> list[float]:  # a recording has the same weight, however many frames it has
+        return over_groups(lambda i: float(np.average(whole[name][i], weights=weights[i])), groups)
+
+    return {
+        "accuracy": share("right"), "coverage": share("covered"), "novel": share("novel"), "decided": share("sure"),
+        "ece_before": over_groups(lambda i: error(whole["plain"][i], right[i]), groups),
+        "ece": over_groups(lambda i: error(whole["p"][i], right[i]), groups),
+        "size": float(whole["size"].mean()), "classes": len(np.unique(data.y)), "groups": len(np.unique(data.groups)),
+        "calibration_groups": float(np.mean(counts)),
+    }  # fmt: skip
+
+
+def classes_never_met(data: Touches, options: TrustOptions) -> dict[str, list[float]]:
+    """Return the AUROC of the novelty, and of a low probability, for classes that are left out of the fit in turn."""
+    classes, parts = np.random.default_rng(0).permutation(np.unique(data.y)), []
     for fold in range(options.held_out):
-        out = np.isin(y, classes[fold :: options.held_out])
-        part = fitted(x, y, rows, ~out, options)
-        assert part.calibration is not None
-        score = part.calibration.novelty(part.scaled(x[test]))
-        scores.append(auroc(score[~out[test]], score[out[test]]))
-    if scores:
-        lines.append((f"AUROC, {options.label} never met (folds)", f"{np.mean(scores):.3f} ± {np.std(scores):.3f}"))
-    if options.strange is not None:
-        other = read_arrays(options.strange)
-        sensors = other["key/sensor"]
-        for name in np.setdiff1d(sensors, rows.sensors[rows.split == "train"]):
-            score = known.novelty(head.scaled(other["features"][sensors == name]))
-            both = np.concatenate([groups, [f"strange {i}" for i in range(len(score))]])
-            every = np.concatenate([seen.novelty, score])
+        out, (fit, val, test) = np.isin(data.y, classes[fold :: options.held_out]), random_split(data.groups, fold)
+        head = fitted(data, fit & ~out, val & ~out, options)
+        seen, rows = head.assess(data.x), np.flatnonzero(test | out)
+        parts.append((rows, out[rows], seen.novelty[rows], 1 - seen.p.max(1)[rows]))
 
-            def area(i: Array, every: Array = every, cut: int = len(groups)) -> float:
-                return auroc(every[i[i < cut]], every[i[i >= cut]]) if (i >= cut).any() and (i < cut).any() else np.nan
+    def area(column: int) -> Callable[[Array], float]:
+        def mean(chosen: Array) -> float:
+            counts, areas = np.bincount(chosen, minlength=len(data.y)), []
+            for rows, new, *scores in parts:
+                times, score = counts[rows], scores[column]
+                if times[new].any() and times[~new].any():
+                    areas.append(auroc(np.repeat(score[~new], times[~new]), np.repeat(score[new], times[new])))
+            return float(np.mean(areas))
 
-            lines.append((f"AUROC, sensor {name} ({len(score)} frames)", interval(area, both)))
-            lines.append((f"novel, sensor {name}", f"{(score > known.novelty_limit).mean():.3f}"))
-    return markdown_table(("figure", "value"), lines)
+        return mean
+
+    return {name: over_groups(area(i), data.groups) for i, name in enumerate(("novelty", "low probability"))}
+
+
+def sensors_never_met(data: Touches, options: TrustOptions) -> dict[str, dict[str, Any]]:
+    """Return the AUROC and the share called novel of each sensor that the head never met."""
+    fit, val, test = random_split(data.groups, 0)
+    head, other, result = fitted(data, fit, val, options), read_arrays(options.strange or ""), {}
+    assert head.calibration is not None
+    known = head.assess(data.x[test]).novelty
+    for name in np.setdiff1d(other["key/sensor"], data.sensors):
+        of_sensor = other["key/sensor"] == name
+        score = head.calibration.novelty(head.scaled(other["features"][of_sensor]))
+        both, groups = np.concatenate([known, score]), [*data.groups[test], *other["key/sequence"][of_sensor]]
+
+        def area(i: Array, both: Array = both) -> float:
+            old, new = (both[i[(i < len(known)) == is_known]] for is_known in (True, False))
+            return auroc(old, new) if len(old) and len(new) else np.nan
+
+        novel = float((score > head.calibration.novelty_limit).mean())
+        result[str(name)] = {"auroc": over_groups(area, np.array(groups)), "novel": novel, "frames": len(score)}
+    return result
 
 
 def thinned(unit: health.UnitFrames) -> health.UnitFrames:
@@ -146,43 +208,53 @@ def thinned(unit: health.UnitFrames) -> health.UnitFrames:
     return replace(unit, recordings=[recording[:3:2] for recording in unit.recordings[::step]])
 
 
-def health_table(options: TrustOptions) -> str:
-    """Return false alarms on the units, and the share of made faults that the right check reports."""
-    units = [unit for unit in health.read_units(manifests.read(options.data))
-             if not any(word in unit.unit for word in options.skip_units)]  # fmt: skip
-    results = health.check_units(units, {})
+def health_record(units: Sequence[health.UnitFrames], gels: Mapping[str, list[Array]]) -> dict[str, Any]:
+    """Return false alarms on the units, and {fault: [reported, made, undecided]} of faults made from each.
+
+    `gels` are pictures of more untouched gels by sensor.
+    """
+    alarms = [
+        f"{result.sensor} {result.unit}: {check.name} ({check.value})"
+        for result in health.check_units(units, gels) for check in result.faults
+    ]  # fmt: skip
     units = [thinned(unit) for unit in units]
-    found, alarms, undecided = defaultdict[str, list[bool]](list), list[str](), defaultdict[str, int](int)
-    for unit, result in zip(units, results, strict=True):
+    counts = {fault: [0, 0, 0] for fault in FAULTS}
+    for unit in units:
         others = [other for other in units if other.sensor == unit.sensor and other is not unit]
-        references = [other.untouched() for other in others]
-        alarms += [f"{unit.sensor} {unit.unit}: {check.name} ({check.value})" for check in result.faults]
-        good = {check.name for check in result.checks if check.ok}
+        references = [*gels.get(unit.sensor, ()), *(other.untouched() for other in others)]
+        good = {check.name for check in health.examine(unit, references, others).checks if check.ok}
         for fault, (name, make) in FAULTS.items():
             other = most_different(unit, units)
             if name not in good or (other is None and fault == "two units mixed"):
-                undecided[fault] += 1
+                counts[fault][2] += 1
                 continue
             bad = make(unit, other, np.random.default_rng(0))
             (check,) = health.examine(bad, references, others, only=name).checks
-            found[fault].append(check.ok is False)
-    lines = [(fault, f"{sum(found[fault])} of {len(found[fault])}", undecided[fault]) for fault in FAULTS]
-    every = [one for several in found.values() for one in several]
-    lines.append(("all", f"{sum(every)} of {len(every)} ({np.mean(every):.1%})", ""))
-    count = len({alarm.partition(":")[0] for alarm in alarms})
-    text = f"False alarms: {count} of {len(units)} units. " + " ".join(alarms)
-    return f"{text}\n\n{markdown_table(('made fault', 'reported', 'units where it cannot be decided'), lines)}"
+            counts[fault][0] += check.ok is False
+            counts[fault][1] += 1
+    return {"units": len(units), "alarms": alarms, "faults": counts}
 
 
 def run(options: TrustOptions) -> int:
-    """Print the tables, and write them with --out."""
-    if options.features is None and not options.health:
+    """Measure, store and print a record."""
+    if options.health:
+        units = [unit for unit in health.read_units(manifests.read(options.data))
+                 if not any(word in unit.unit for word in options.skip_units)]  # fmt: skip
+        real = [sensor for sensor in SENSORS.values() if options.package and isinstance(sensor.look, str)]
+        gels = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
+        kind, record = "health", health_record(units, gels)
+    elif options.features is not None:
+        data = read_touches(options)
+        kind, record = "trust", calibration_record(data, options) | {
+            "asked": options.coverage, "false_alarms": options.false_alarms, "repeats": options.repeats,
+            "label": options.label, "never_met": classes_never_met(data, options) if options.held_out else {},
+            "sensors": {} if options.strange is None else sensors_never_met(data, options),
+        }  # fmt: skip
+    else:
         raise UserError("Give --features, by anytouch embed, or --health.")
-    parts = [trust_table(options)] if options.features is not None else []
-    parts += [health_table(options)] if options.health else []
-    print("\n\n".join(parts))
-    if options.out is not None:
-        atomic_write(options.out, "\n\n".join(parts) + "\n")
+    write_record(options.out, f"{kind}/{options.name}", record)
+    for name, value in record.items():
+        print(f"{name}: {value}")
     return 0
 
 

@@ -7,6 +7,7 @@ recordings of units in good order (`experiments/real/trust.py`). Pictures are co
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise, product
@@ -150,10 +151,8 @@ def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
 def _pictures(manifest: Manifest, rows: Array) -> list[Array]:
     pictures = []
     for row in rows.tolist():
-        try:
+        with suppress(UserError):
             pictures.append(decode(manifest.file(row)))
-        except UserError:
-            continue
     return [picture for picture in pictures if picture.shape == pictures[0].shape]
 
 
@@ -162,10 +161,8 @@ def _background(manifest: Manifest, rows: Array, free: Array) -> Array | None:
     paths = [manifest.file(int(row), "background_path") for row in rows[manifest.present("background_path")[rows]]]
     paths = [max(set(paths), key=paths.count)] if paths else [manifest.file(int(row)) for row in free]
     for path in paths:
-        try:
+        with suppress(UserError):
             return decode(path)
-        except UserError:
-            continue
     return None
 
 
@@ -238,10 +235,8 @@ def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
 
 def _layout(picture: Array) -> Array:
     """Return where a picture has which colour, f32 (SIDE, SIDE, 3) of norm 1, without brightness and contrast."""
-    small = scale_picture(np.ascontiguousarray(picture))
-    small = close_dots(small) if has_dots(small) else small
-    small = cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
-    small -= small.mean()
+    small = _look(np.ascontiguousarray(picture)).reshape(SIDE, SIDE, 3)
+    small = small - small.mean()
     return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6))
 
 
@@ -263,7 +258,7 @@ def _focus(unit: UnitFrames) -> Check:
     """Compare details of one pixel with those of two: blur removes the first."""
     shares, details = [], []
     for frame in (recording[len(recording) // 2] for recording in unit.recordings):
-        grey = scale_picture(frame, 320).mean(2).astype(np.float32)
+        grey = scale_picture(frame, min(320, max(frame.shape))).mean(2).astype(np.float32)  # enlarged is blurred
         one, two = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1, 2))
         details.append(float(np.std(one - two)))
         shares.append(float(np.std(grey - one)) / (details[-1] + 1e-6))

@@ -84,14 +84,15 @@ class LinearHead:
         temperature = novelty.fit_temperature(z, truth, held_out)
         p = novelty.probabilities(z, temperature)
         limit = novelty.conformal_limit(1 - p[np.arange(len(truth)), truth], held_out, coverage)
-        chosen = fit[novelty.choose_references(groups[fit])]
-        both = np.concatenate([fit, val])
-        whitening = novelty.fit_whitening(self.scaled(features[fit]))
-        references, x = (self.scaled(features[some]) @ whitening for some in (chosen, both))
-        scores = novelty.novelty_scores(x, references, groups[both], groups[chosen])
-        novel = novelty.conformal_limit(scores, groups[both], 1 - false_alarms)
+        x, owners = self.scaled(features), groups[val]
+        whitening, chosen, references = novelty.reference_space(x[fit], groups[fit])
+        scores = novelty.novelty_scores(x[val] @ whitening, references, owners, groups[fit[chosen]])
+        if len(np.unique(owners)) * false_alarms < 5:  # few for a limit: rows of `fit` help
+            scores = np.concatenate([scores, novelty.left_out_scores(x[fit], groups[fit])])
+            owners = np.concatenate([owners, groups[fit]])
+        novel = novelty.conformal_limit(scores, owners, 1 - false_alarms)
         limits = (coverage, limit, false_alarms, novel, len(np.unique(held_out)))
-        return replace(self, calibration=Calibration(temperature, *limits, whitening, references, sensors[chosen]))
+        return replace(self, calibration=Calibration(temperature, *limits, whitening, references, sensors[fit[chosen]]))
 
     def promises(self) -> list[str]:
         """Return sentences on what the limits of the calibration promise, and on those that need more groups."""

@@ -235,12 +235,9 @@ def _control(live: Live, order: Any) -> None:
     """Do what the page asks of a live source. Raises UserError for anything else."""
     order = order if isinstance(order, dict) else {}
     action, recorder = order.get("do"), live.recorder
-    if (
-        action == "orient"
-        and order.get("rotate") in (0, 90, 180, 270)
-        and order.get("flip") in ("none", "across", "down")
-    ):
-        live.orient(order["rotate"], order["flip"])
+    rotate, flip = order.get("rotate"), order.get("flip")
+    if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
+        live.orient(rotate, flip)
     elif action == "background":
         live.capture_background()
     elif action == "no background":

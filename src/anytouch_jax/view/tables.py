@@ -68,7 +68,7 @@ class Table:
 
     def place_of(self, row: int) -> int:
         """Return the place of the touch of a row, without filters."""
-        at = int(np.searchsorted(self._starts, self._position(row), "right")) - 1
+        at = int(np.searchsorted(self._order[1], self._position(row), "right")) - 1
         return int(np.searchsorted(self._touches(()), self._touch_of[at]))
 
     def frame(self, row: int) -> Array:
@@ -86,7 +86,7 @@ class Table:
     def panels(self, row: int) -> tuple[Array, float]:
         """Return the panels of a row (see `touch_panels`) and its contact score, NaN without a background."""
         frame, gel = self.frame(row), None
-        first = self._rows(int(np.searchsorted(self._starts, self._position(row), "right")) - 1)[0]
+        first = self._rows(int(np.searchsorted(self._order[1], self._position(row), "right")) - 1)[0]
         path = self.manifest.value(row, "background_path")
         if path is not None or first != row:
             gel = self._background(row if path is not None else int(first), path)
@@ -114,10 +114,6 @@ class Table:
         else:
             order = np.lexsort((frame, sequence))
         return order, np.flatnonzero(np.diff(sequence[order], prepend=-1))
-
-    @property
-    def _starts(self) -> Array:
-        return self._order[1]
 
     @cached_property
     def _touch_of(self) -> Array:

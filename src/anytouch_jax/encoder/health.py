@@ -258,7 +258,7 @@ def _focus(unit: UnitFrames) -> Check:
     """Compare details of one pixel with those of two: blur removes the first."""
     shares, details = [], []
     for frame in (recording[len(recording) // 2] for recording in unit.recordings):
-        grey = scale_picture(frame, min(320, max(frame.shape))).mean(2).astype(np.float32)  # enlarged is blurred
+        grey = scale_picture(frame, 320).mean(2).astype(np.float32)
         one, two = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1, 2))
         details.append(float(np.std(one - two)))
         shares.append(float(np.std(grey - one)) / (details[-1] + 1e-6))

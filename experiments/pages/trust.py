@@ -22,7 +22,7 @@ def _of_kind(folder: Path, kind: str) -> dict[str, Record]:
 
 
 def _percent(values: list[float]) -> Value:
-    return Value(*values).times(100)
+    return Value(values[0], values[1], values[2]).times(100)
 
 
 def trust(folder: Path) -> Page:
@@ -47,11 +47,11 @@ def trust(folder: Path) -> Page:
             f"The calibration error is {one['ece'][0]:.3f}. A set has {one['size']:.1f} of {one['classes']} classes."
         )
         if value := one["never_met"].get("novelty"):
-            words = "tells classes never met apart" if value[1] > 0.5 else "does not tell classes never met apart"
-            findings.append(f"{name}: the novelty {words}, with an AUROC of {value[0]:.2f}.")
+            words = "is higher" if value[1] > 0.5 else "is not shown to be higher"
+            findings.append(f"{name}: the novelty of classes never met {words}, with an AUROC of {value[0]:.2f}.")
         if one["sensors"]:
             least = min(found["auroc"][0] for found in one["sensors"].values())
-            findings.append(f"{name}: a sensor never met is told apart with an AUROC of {least:.2f} or more.")
+            findings.append(f"{name}: of sensors never met, the novelty of the hardest has an AUROC of {least:.2f}.")
     return Page(
         "trust", "Does a head know when it does not know?",
         "A linear head on features of `anytouch-tiny` is calibrated, and then tested on recordings that it never met. "

@@ -223,19 +223,14 @@ def novelty_scores(x: Array, references: Array, groups: Array | None = None, ref
 
 
 def reference_space(x: Array, groups: Array) -> tuple[Array, Array, Array]:
-    """Return a whitening f32 (d, d) by scaled features (n, d), numbers (m,) of reference rows, and these, whitened.
-
-    Its own rows look too familiar in it: a direction that only they have is stretched less. Score other rows.
-    """
+    """Return a whitening f32 (d, d) by scaled features (n, d), numbers (m,) of reference rows, and these, whitened."""
     whitening, chosen = fit_whitening(x), choose_references(groups)
     return whitening, chosen, x[chosen] @ whitening
 
 
 def left_out_scores(x: Array, groups: Array) -> Array:
-    """Return the novelty (n,) of scaled features (n, d), in the space of others: a fifth of groups is left out in turn.
-
-    It is infinite where no two rows are left.
-    """
+    """Return the novelty (n,) of scaled features (n, d) by other groups alone: a fifth is left out in turn."""
+    # A whitening that has seen a row stretches its direction less, and the row looks too familiar.
     part, scores = np.unique(groups, return_inverse=True)[1] % 5, np.full(len(x), np.inf)
     for out in (part == number for number in range(5)):
         if (~out).sum() > 1 and out.any():

@@ -173,20 +173,12 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
 
     each = "/api/{source:int}"
     routes = [
-        Route("/", page),
-        Route("/{name:str}", page),
-        Route("/api/sources", listed),
-        Route(f"{each}/touch", touch),
-        Route(f"{each}/frame/{{row:int}}", frame),
-        Route(f"{each}/photo/{{row:int}}", photo),
-        Route(f"{each}/map", points),
-        Route(f"{each}/colours", colours),
-        Route(f"{each}/neighbours", neighbours),
-        Route(f"{each}/losses", losses),
-        Route(f"{each}/figure/{{name:str}}", figure),
-        Route(f"{each}/stream", stream),
-        Route(f"{each}/control", control, methods=["POST"]),
-    ]
+        Route("/", page), Route("/{name:str}", page), Route("/api/sources", listed), Route(f"{each}/touch", touch),
+        Route(f"{each}/frame/{{row:int}}", frame), Route(f"{each}/photo/{{row:int}}", photo),
+        Route(f"{each}/map", points), Route(f"{each}/colours", colours), Route(f"{each}/neighbours", neighbours),
+        Route(f"{each}/losses", losses), Route(f"{each}/figure/{{name:str}}", figure),
+        Route(f"{each}/stream", stream), Route(f"{each}/control", control, methods=["POST"]),
+    ]  # fmt: skip
     guards = [Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)), Middleware(_Token, token=token)]
     return Starlette(routes=routes, middleware=guards, exception_handlers={UserError: _refuse, ValueError: _refuse})
 

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,12 +59,13 @@ def made_features(options: SearchOptions) -> tuple[np.ndarray, np.ndarray]:
 
 def measured(path: Path, queries: np.ndarray, options: SearchOptions) -> dict[str, dict[str, Any]]:
     """Return the record of each way: times of one query alone in ms, recall of the exact result, seconds to open."""
-    records, truth = {}, np.zeros(0)
+    records: dict[str, dict[str, Any]] = {}
+    truth: Any = None
     for way, approximate in WAYS.items():
-        opened, work, index = timed(lambda approximate=approximate: load_index(path, approximate=approximate))
+        opened, work, index = timed(partial(load_index, path, approximate=approximate))
         load, found = (
             os.getloadavg()[0],
-            [timed(lambda q=q, index=index: index.search(q, options.nearest)) for q in queries],
+            [timed(partial(index.search, q, options.nearest)) for q in queries],
         )
         ids = np.stack([result[0][0] for *_, result in found])
         truth = truth if approximate else ids

@@ -107,7 +107,7 @@ def search(folder: Path) -> Page:
          f"query, and the graph {graph['processor_ms']:.1f} ms with a recall of {100 * graph['recall']:.1f} %.",
          f"The graph is built when the index opens, which takes {graph['opened_processor_s']:.0f} s of processor "
          "time. For a few queries exact search is done earlier."],
-        (SEARCH,), "python -m experiments.benchmarks.search --count 1000000",
+        (SEARCH,), "python -m experiments.benchmarks.search --count 100000",
     )  # fmt: skip
 
 

@@ -103,7 +103,8 @@ def search(folder: Path) -> Page:
          *(Measure(name, ".1f", False) for name in ("p50, ms", "p99, ms", "processor ms", "s to open",
                                                      "processor s to open"))),
         rows,
-        [f"Exact search among {exact['count']:,} features takes {exact['processor_ms']:.0f} ms of processor time a query.",
+        [f"Exact search among {exact['count']:,} features takes {exact['processor_ms']:.0f} ms of processor "
+         "time a query.",
          f"The graph takes {graph['processor_ms']:.1f} ms, with a recall of {100 * graph['recall']:.1f} %.",
          f"The graph is built when the index opens, which takes {graph['opened_processor_s']:.0f} s of processor "
          "time. For a few queries exact search is done earlier."],

@@ -3,7 +3,8 @@
     python -m experiments.encoders.real ../shared/real_touch2 ../shared/real_touch --out data/real
 
 Taken are train rows of a GelSight Mini or a 9DTact, with a background and a licence for commercial use. The slip clips
-of the first pack are left out, since the second pack has them with other splits.
+of the first pack are left out, since the second pack has them with other splits. A touch of the second pack is a group
+of grasps: recordings of one object, by either finger, whose contact pictures agree.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ def copy(pack: Path, out: Path, keep: Callable[[Row], bool], contact: Callable[[
         rows = [row for row in csv.DictReader(file) if row["split"] == "train" and row["background_path"] and keep(row)]
     for row in rows:
         row["label.contact"] = str(int(contact(row)))
+        if contact(row) and row.get("grasp_group"):
+            row["touch"] = row["grasp_group"]
         for name in ("path", "background_path", "image_path"):
             if row[name] and not (out / row[name]).exists():
                 (out / row[name]).parent.mkdir(parents=True, exist_ok=True)

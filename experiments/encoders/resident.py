@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from contextlib import ExitStack
+from functools import lru_cache, partial
 from multiprocessing import get_context
 from typing import Any
 
@@ -183,25 +184,24 @@ def read_all(config: Config, rows: np.ndarray, view: int | None, processes: int)
     size = config.model.image_size
     out = np.empty((len(rows), size, size, 3), np.uint8)
     chunks = [slice(at, at + CHUNK) for at in range(0, len(rows), CHUNK)]
-    if not chunks:
-        return out
-    with ProcessPoolExecutor(processes, get_context("spawn"), _open, (config,)) as pool:
-        for chunk, pictures in zip(
-            chunks, pool.map(_read, [rows[c] for c in chunks], [view] * len(chunks)), strict=True
-        ):
+    with ExitStack() as stack:
+        read = map
+        if processes > 1 and chunks:
+            read = stack.enter_context(ProcessPoolExecutor(processes, get_context("spawn"))).map
+        for chunk, pictures in zip(chunks, read(partial(_read, config, view), [rows[c] for c in chunks]), strict=True):
             out[chunk] = pictures
     return out
 
 
-_readers: list[SampleReader] = []
-
-
-def _open(config: Config) -> None:
-    _readers.append(SampleReader(manifests.read(config.data.manifests), config))
-
-
-def _read(rows: np.ndarray, view: int | None) -> np.ndarray:
-    reader = _readers[0]
+def _read(config: Config, view: int | None, rows: np.ndarray) -> np.ndarray:
+    """Return the pictures of a chunk of rows."""
+    reader = _reader(config)
     if view is None:
         return np.concatenate([reader.touch(row[None], None) for row in rows])
     return np.stack([reader.vision(int(row), view) for row in rows])
+
+
+@lru_cache(1)
+def _reader(config: Config) -> SampleReader:
+    """Return the reader of this process."""
+    return SampleReader(manifests.read(config.data.manifests), config)

@@ -2,8 +2,8 @@
 
     python -m experiments.encoders.train --corpus data/corpus --real a.csv b.csv --out runs/anytouch-tiny
 
-The same command again continues. The recipe is the paper's two losses, with what a CPU needs: see README.md. The second
-part of stage 2 has stills only, and draws the pairs of two real fingers more often.
+The same command again continues. The recipe is the paper's two losses. The pictures lie in the memory of the device
+(`resident.py`). The first two parts are for a GPU, the last one fits a CPU: stills only, small batches.
 """
 
 from __future__ import annotations
@@ -11,18 +11,20 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from anytouch_jax.cli import train
 from anytouch_jax.cli.app import main as anytouch
+from anytouch_jax.cli.output import log
+from anytouch_jax.pretrain import pretrain
+from experiments.encoders.resident import ResidentLoader
 
 NOTES = Path(__file__).with_name("anytouch-tiny.md")
 DATA = [
-    "--preset", "tiny", "--batch", "64", "--data.background", "subtract", "--data.contact-only",
-    "--data.jitter", "0", "0", "0", "0", "--data.cache", "5000",
+    "--preset", "tiny", "--data.background", "subtract", "--data.contact-only", "--data.jitter", "0", "0", "0", "0",
+    "--data.affine", "8", "0.04", "0.1", "--run.figure-every", "0",
 ]  # fmt: skip
-STAGE1 = [*DATA, "--optim.learning-rate", "1e-3", "--objective.norm-pix-loss"]
 SMALL = ("width=128", "depth=2", "heads=4", "mlp=512")  # the image tower: photographs are few and simple
 STAGE2 = [
-    *DATA, "--optim.learning-rate", "7e-4", "--optim.layer-decay", "0.75", "--model.dtype", "bfloat16",
-    "--model.match-head", "cosine", "--objective.match-weight", "8", "--objective.match-keep", "0.5",
+    *DATA, "--optim.layer-decay", "0.75", "--model.match-head", "cosine", "--objective.match-weight", "8",
     "--data.negatives", "same_sensor", "--model.text.stack.depth", "2",
     *(word for part in SMALL for word in (f"--model.image.{part.partition('=')[0]}", part.partition("=")[2])),
 ]  # fmt: skip
@@ -33,12 +35,17 @@ def real_share(slip: int, press: int) -> list[str]:
     return ["--data.weights", "incipient_slip-gelsight_mini_markers", str(slip), "gelslam-gelsight_mini", str(press)]
 
 
-# Folder, stage, steps, options, and draws of real recordings. Each starts from the one before.
+# Folder, stage, steps, steps after which it stops, options, draws of real recordings. Each starts from the one before.
 PARTS = (
-    ("stage1", 1, 1651, STAGE1, real_share(5, 10)),
-    ("stage2-clips", 2, 2000, STAGE2, real_share(5, 10)),
-    ("stage2", 2, 1070, [*STAGE2, "--data.clip-share", "0"], real_share(10, 20)),
-)
+    ("stage1", 1, 12666, None,
+     [*DATA, "--batch", "256", "--optim.learning-rate", "1.5e-3", "--objective.norm-pix-loss"], real_share(10, 20)),
+    ("stage2-wide", 2, 2109, 175,
+     [*STAGE2, "--batch", "256", "--optim.learning-rate", "1e-3", "--objective.match-keep", "0.75",
+      "--data.clip-share", "0.2"], real_share(8, 20)),
+    ("stage2", 2, 850, None,
+     [*STAGE2, "--batch", "64", "--optim.learning-rate", "5e-4", "--optim.warmup", "30",
+      "--objective.match-keep", "0.5", "--data.clip-share", "0"], real_share(8, 20)),
+)  # fmt: skip
 
 
 def main() -> None:
@@ -46,14 +53,20 @@ def main() -> None:
     parser.add_argument("--corpus", type=Path, required=True)
     parser.add_argument("--real", type=Path, nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--processes", type=int, default=2, help="processes that read the pictures")
     options = parser.parse_args()
     data = [str(path) for path in (*sorted(options.corpus.glob("*/manifest.parquet")), *options.real)]
     init: list[str] = []
-    for folder, stage, steps, recipe, share in PARTS:
+    ResidentLoader.processes = options.processes
+    for folder, stage, steps, stop, recipe, share in PARTS:
         run, more = str(options.out / folder), [*recipe, *(share if options.real else []), *init]
-        status = anytouch(["train", "--stage", str(stage), "--data", *data, "--run", run, "--steps", str(steps), *more])
-        if status:
-            raise SystemExit(status)
+        words = ["--stage", str(stage), "--data", *data, "--run", run, "--steps", str(steps), *more]
+        request = train.parse(train.TrainOptions, "train", words)
+        result = pretrain(
+            request.config, run, init=request.options.init, stop_after=stop, make_loader=ResidentLoader, log=log
+        )
+        if result.interrupted:
+            raise SystemExit(130)
         init = ["--init", run]
     anytouch(["export", "--card", str(options.out / "anytouch-tiny"), "--model", run, "--notes", str(NOTES)])
 

@@ -279,9 +279,9 @@ def real(folder: Path) -> Page:
                 fresh = next((other for other in scores if other.startswith("untrained:")), "")
                 changes = [_minus(score, scores.get(other)) if other != name else None for other in ("pixels", fresh)]
                 rows.append((task, head, name, Value(score.share, *score.interval()).times(100), *changes))
-                if name in encoders and head == "linear":
+                if name in encoders and head in HEADS:
                     findings += [
-                        compare(f"`{name}`", words, change, task)
+                        compare(f"`{name}`", words, change, f"{task}, {head} head")
                         for words, change in zip(("pixels", "an untrained encoder"), changes, strict=True)
                     ]
     for count in ("1", "2", "5"):

@@ -334,5 +334,5 @@ def test_scripts_and_modules_of_the_pages_are_there() -> None:
     """They have tests of their own."""
     text = "\n".join(PAGES.values())
     scripts = re.findall(r"python (integrations/\S+\.py)", text)
-    modules = [f"{one.replace('.', '/')}.py" for one in re.findall(r"python -m ((?:experiments|tests)\.\S+)", text)]
+    modules = [f"{one.replace('.', '/')}.py" for one in re.findall(r"python -m ((?:experiments|tests)\.[\w.]+)", text)]
     assert len(scripts) > 1 and len(modules) > 2 and all((ROOT / file).is_file() for file in (*scripts, *modules))

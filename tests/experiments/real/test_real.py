@@ -92,7 +92,7 @@ def test_the_page_has_every_row_and_refuses_mixed_data(data, tmp_path):
     made = real(tmp_path)
     assert [row[2] for row in made.rows].count("a") == 6 + 3 and "`a` takes 3 ms a frame on a CPU." in made.findings
     best = next(row for row in made.rows if row[:3] == ("object", "linear", "a"))
-    assert best[4].low > 0 and any(one.startswith("object: `a` is") for one in made.findings)
+    assert best[4].low > 0 and any(one.startswith("object, linear head: `a` is") for one in made.findings)
     task = run.task_record(scores.object_score(planted(data, 0.1), data))
     write_record(
         file, "a CNN", {"data": data.content_hash, "kind": "baseline", "tasks": {"object, trained with labels": task}}

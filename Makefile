@@ -101,7 +101,7 @@ test: $(STAMP) ## the quick tests, some minutes on two cores
 	$(PYTEST) -m "not slow"
 
 test-all: $(STAMP) ## every test
-	-$(PY) -m pip install -q playwright
+	-$(PY) -m pip install -q playwright "moto[server]" s3fs
 	$(PYTEST)
 
 lint: $(STAMP) ## ruff (rules and format), mypy and the rules of prose

@@ -33,7 +33,7 @@ CHUNK = 256  # rows that a process reads at a time
 
 
 class ResidentLoader(Loader):
-    """Batches on the device, from pictures that are read once, by `processes` processes."""
+    """`Loader` with its pictures on the device. `processes` processes read them, once."""
 
     processes = 2
 
@@ -43,7 +43,9 @@ class ResidentLoader(Loader):
         rows = np.unique(np.concatenate(windows))
         self._place = np.full(len(manifest), -1, np.int32)
         self._place[rows] = np.arange(len(rows))
-        with_image = [pool.windows[ids, -1] for pool in self._pools for ids in _members(pool, VISION, BOTH)]
+        with_image = [
+            pool.windows[ids, -1] for pool in self._pools for ids in (pool.members[VISION], pool.members[BOTH])
+        ]
         photo_rows = np.concatenate([*with_image, np.empty(0, np.int64)])
         codes = manifest.codes("image_path")
         _, first, which = np.unique(codes[photo_rows], return_index=True, return_inverse=True)
@@ -113,7 +115,9 @@ class ResidentLoader(Loader):
         rows = self._match_size
         anchors = pool.matches.anchors[[item for item, _ in pool.anchors.take(rank * rows, rows)]]
         gallery = self._gallery_sensor(step, pool)
-        positives = partners(pool, anchors, -1 if gallery is None else gallery, np.random.default_rng([step, rows]))
+        positives = partners(
+            pool, anchors, -1 if gallery is None else gallery, np.random.default_rng([self._seed, step, 1])
+        )
         last = pool.windows[:, -1]
         swap = self._sensor[last[anchors]] == gallery
         first, second = np.where(swap, positives, anchors), np.where(swap, anchors, positives)
@@ -122,10 +126,6 @@ class ResidentLoader(Loader):
             self._touches(pool.windows[first], step, 1), self._sensor[last[first]].astype(np.int32),
             self._touches(pool.windows[second], step, 2), self._sensor[last[second]].astype(np.int32), place=place,
         )  # fmt: skip
-
-
-def _members(pool: Pool, *strata: int) -> list[np.ndarray]:
-    return [pool.members[stratum] for stratum in strata]
 
 
 def partners(pool: MatchPool, anchors: np.ndarray, gallery: int, rng: np.random.Generator) -> np.ndarray:

@@ -51,7 +51,7 @@ def pretrain(
     folder.
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
-    report, log = log, log if jax.process_index() == 0 else silent  # each process reads samples of its own
+    report, log = log, log if jax.process_index() == 0 else silent  # every process reads other samples
     resumes = bool(steps(run / CHECKPOINTS))
     _check(config, run, init, clip, resumes)
     manifest = manifests.read(config.data.manifests)

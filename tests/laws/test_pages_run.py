@@ -69,7 +69,7 @@ STAGE2 = STAGE1 | {
 
 def small(words: list[str]) -> list[str]:
     """Return the words of a command, with sizes that compile fast if it trains."""
-    if words[0] != "train" or "runs/try" in words:  # that one is typed as it is shown
+    if words[0] != "train" or "runs/try" in words:  # that one is typed word for word
         return words
     stage = STAGE2 if words[words.index("--stage") + 1] == "2" else STAGE1
     sizes = {name: value for name, value in stage.items() if f"--{name}" not in words}

@@ -52,6 +52,8 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--batches", type=int, nargs="*", default=list(BATCHES), help="of the memory sweep")
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--variants", nargs="*", default=[], help="names of rows to measure; all if none is named")
+    parser.add_argument("--no-errors", action="store_true", help="leave out the float64 reference, which compiles long")
     parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     options = parser.parse_args()
@@ -77,7 +79,12 @@ def main() -> None:
     works = [work for what in options.what for work in workloads(what, options.preset, options.batch)]
     for work in works:
         try:
-            result = speed.measure(work, rounds=options.rounds, peak_size=options.peak_size, log=log)
+            known = variants_of(work, jax.default_backend())
+            chosen = [one for one in known if one.name in options.variants] or known
+            result = speed.measure(
+                work, chosen, rounds=options.rounds, with_errors=not options.no_errors, peak_size=options.peak_size,
+                log=log,
+            )  # fmt: skip
         except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
             result = [speed.SpeedRow(work.name, "none", work.samples, note=str(error).splitlines()[0])]
         rows += result

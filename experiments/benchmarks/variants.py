@@ -111,10 +111,16 @@ def cold() -> Iterator[None]:
 def traced_as(variant: Variant) -> Iterator[None]:
     """Trace with a variant's activation and precision of products."""
     gelu = partial(jax.nn.gelu, approximate=False) if variant.activation == "jax" else layers.gelu
-    functional._cached_skeleton.cache_clear()  # it keeps modules, and they their activation
+
+    def forget() -> None:
+        functional._cached_skeleton.cache_clear()  # it keeps modules, and they their activation
+        if variant.activation == "jax":
+            jax.clear_caches()  # they keep what was traced with another activation
+
+    forget()
     with mock.patch.object(layers, "gelu", gelu), jax.default_matmul_precision(variant.precision):
         yield
-    functional._cached_skeleton.cache_clear()
+    forget()
 
 
 def compiled(variant: Variant, work: Workload, state: Tree) -> Program:

@@ -76,8 +76,9 @@ class ResidentLoader(Loader):
 
     def _touches(self, windows: np.ndarray, step: int, part: int) -> jax.Array:
         """Return augmented clips u8 (B, T, H, W, 3) of windows of rows (B, T)."""
-        data, key = self.config.data, jax.random.fold_in(jax.random.fold_in(self._key, step), part)
-        return gather(self._frames, self._place[windows], key, flip=data.flip, affine=data.affine)
+        data = self.config.data
+        rows = self._place[windows]
+        return gather(self._frames, rows, self._key, step, part, flip=data.flip, affine=data.affine)
 
     def _draw_align(self, step: int) -> tuple[AlignBatch, Info]:
         kind, rank = self._align.at(step)
@@ -146,10 +147,16 @@ def partners(pool: MatchPool, anchors: np.ndarray, gallery: int, rng: np.random.
 
 
 @partial(jax.jit, static_argnames=("flip", "affine"))
-def gather(frames: jax.Array, rows: jax.Array, key: jax.Array, *, flip: float, affine: tuple[float, ...]) -> jax.Array:
-    """Return frames u8 (B, T, H, W, 3) of `rows` (B, T), with one flip and one affine map for each clip."""
+def gather(
+    frames: jax.Array, rows: jax.Array, key: jax.Array, step: int, part: int, *,
+    flip: float, affine: tuple[float, ...],
+) -> jax.Array:  # fmt: skip
+    """Return frames u8 (B, T, H, W, 3) of `rows` (B, T), with one flip and one affine map for each clip.
+
+    The draws depend on `step` and on `part`, the number of the array in its batch.
+    """
     clip = frames[rows]
-    toss, turn = jax.random.split(key)
+    toss, turn = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, step), part))
     across, down = jax.random.bernoulli(toss, flip, (2, len(rows), 1, 1, 1, 1))
     clip = jnp.where(across, clip[:, :, :, ::-1], clip)
     clip = jnp.where(down, clip[:, :, ::-1], clip)

@@ -54,10 +54,10 @@ def test_partners_touch_the_same_place_with_another_sensor(loaders):
 def test_a_warp_moves_a_spot_as_the_map_says():
     frames = jnp.zeros((1, 41, 41, 3), jnp.uint8).at[0, 20, 30].set(255)
     rows, key = jnp.zeros((64, 1), jnp.int32), jax.random.key(0)
-    turned = np.asarray(gather(frames, rows, key, flip=0.0, affine=(90.0, 0.0, 0.0)), float)[:, 0, :, :, 0]
+    turned = np.asarray(gather(frames, rows, key, 0, 0, flip=0.0, affine=(90.0, 0.0, 0.0)), float)[:, 0, :, :, 0]
     y, x = np.mgrid[:41, :41] - 20
     total = turned.sum((1, 2))
     radius = np.hypot((turned * y).sum((1, 2)) / total, (turned * x).sum((1, 2)) / total)
     assert np.allclose(radius, 10, atol=0.5)  # it stays on its circle
     assert np.ptp((turned * y).sum((1, 2)) / total) > 10  # at many angles
-    assert np.array_equal(gather(frames, rows, key, flip=0.0, affine=(0.0, 0.0, 0.0))[5, 0], frames[0])
+    assert np.array_equal(gather(frames, rows, key, 0, 0, flip=0.0, affine=(0.0, 0.0, 0.0))[5, 0], frames[0])

@@ -26,6 +26,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "trust": (trust.NAME, trust.trust),
     "health": (trust.NAME, trust.health),
     "backgrounds": ("backgrounds.jsonl", studies.backgrounds),
+    "untouched_gel": (studies.GELS, studies.untouched_gel),
     "motion": ("motion.jsonl", studies.motion),
     "lookalikes": ("lookalikes.jsonl", studies.lookalikes),
     "teaching": ("teaching.jsonl", studies.teaching),

@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import mean_interval
+from experiments.benchmarks.untouched_gel import NAME as GELS
+from experiments.benchmarks.untouched_gel import WAYS
 from experiments.pages.page import Measure, Page, Value, compare, over_seeds
 from experiments.pouring import table as pours
 from experiments.real.scores import HEADS, TASKS, TRAINED, Score
@@ -332,6 +335,40 @@ def backgrounds(folder: Path) -> Page:
         "Scores are as on the page of real recordings.",
         ("task", "head", "subtracted", Measure("right, %"), Measure("minus own picture", "+.1f")),
         rows, findings, (path.name,), "python -m experiments.real.run anytouch-tiny --backgrounds",
+    )  # fmt: skip
+
+
+def untouched_gel(folder: Path) -> Page:
+    """Contact in recordings without a picture of the untouched gel."""
+    path = folder / GELS
+    rows: list[Any] = []
+    findings = []
+    for sensor, record in records_of(path).items():
+        shares = record["pressed"]
+        for share, ways in shares.items():
+            for way, one in ways.items():
+                right = 100 * one["right"] / one["frames"] if one["frames"] else None
+                low, high = binomtest(one["decided"], one["films"]).proportion_ci(method="wilson")
+                decided = Value(one["decided"] / one["films"], low, high).times(100)
+                rows.append((sensor, f"{share} % pressed", way, decided, right, one["inverted"]))
+        least = {way: min(ways[way]["decided"] / ways[way]["films"] for ways in shares.values()) for way in WAYS}
+        findings.append(
+            f"`{sensor}`: at least {least[WAYS[0]]:.0%} are decided alone, and {least[WAYS[1]]:.0%} {WAYS[1]}."
+        )
+    every = [
+        one for record in records_of(path).values() for ways in record["pressed"].values() for one in ways.values()
+    ]
+    inverted, decided = (sum(one[name] for one in every) for name in ("inverted", "decided"))
+    findings.append(f"{inverted} of {decided:,} decided recordings are inverted.")
+    return Page(
+        "untouched_gel", "Is contact found without a picture of the untouched gel?",
+        "`anytouch data contact` estimates the untouched gel from the frames of a recording, or leaves the label "
+        "empty. Recordings are films of simulated frames, pressed for some share of the time. Light and noise "
+        f"change from frame to frame. A recording is decided {WAYS[0]}, or {WAYS[1]}, which are pressed as long.",
+        ("sensor", "recordings", "decided", Measure("decided, %", ".0f"), Measure("frames right, %", ".1f", False),
+         Measure("inverted", ".0f", False)),
+        rows, findings, (GELS,), "python -m experiments.benchmarks.untouched_gel MANIFEST",
+        "The share of recordings that are decided, with its interval.",
     )  # fmt: skip
 
 

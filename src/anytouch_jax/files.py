@@ -1,8 +1,9 @@
-"""Atomic writes, file locks, and .npy and .npz files read with limits."""
+"""Atomic writes, file locks, .npy and .npz files read with limits, and lines of CSV files."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import io
 import math
@@ -64,15 +65,34 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def placeholder(path: str | Path) -> str | None:
-    """Return the kind of a text file that takes the place of data ("a web page"); None for any other file."""
-    with open(path, "rb") as file:
-        start = file.read(512).removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+def placeholder(file: str | Path | bytes) -> str | None:
+    """Return what takes the place of data in a file, or in its bytes, and what to do; None for any other content."""
+    if not isinstance(file, bytes):
+        with open(file, "rb") as opened:
+            file = opened.read(512)
+    start = file[:512].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if start.startswith((b"<!doctype html", b"<html", b"<?xml")):
-        return "a web page"
+        return "a web page, not the data that its name promises; download the file itself"
     if start.startswith(b"version https://git-lfs"):
-        return "a Git LFS pointer"
+        return "a Git LFS pointer, not the data that its name promises; run `git lfs pull`"
     return None
+
+
+def csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the first line, from 1, and the cells of the rows of a CSV file. Blank lines are left out.
+
+    Raises csv.Error, which names the line, for a quote that is not closed.
+    """
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        line, rows = 1, csv.reader(file, strict=True)
+        try:
+            for cells in rows:
+                if cells:
+                    yield line, cells
+                line = rows.line_num + 1
+        except csv.Error:
+            limit = csv.field_size_limit()
+            raise csv.Error(f"the quote in line {line} is not closed, or its cell is longer than {limit:,}") from None
 
 
 def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = lambda _: True) -> dict[str, np.ndarray]:
@@ -84,7 +104,7 @@ def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = l
     import numpy as np
 
     if isinstance(file, str | Path) and (kind := placeholder(file)):
-        raise ValueError(f"it is {kind}; download the file itself")
+        raise ValueError(f"it is {kind}")
     try:
         with zipfile.ZipFile(file) as archive:
             members = [(info, info.filename.removesuffix(".npy")) for info in archive.infolist()]

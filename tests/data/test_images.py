@@ -128,6 +128,15 @@ def test_a_jpeg_with_a_trailer_or_a_thumbnail_is_whole(tmp_path):
         images.decode(path)
 
 
+@pytest.mark.parametrize("name", ["0.png", "0.jpg", "film.mp4"])
+def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
+    texts = {"a web page": "\n<!DOCTYPE html>", "a Git LFS pointer": "version https://git-lfs.github.com/spec/v1\noid"}
+    for kind, text in texts.items():
+        (tmp_path / name).write_text(text)
+        with pytest.raises(images.ImageError, match=rf"{name}.* is {kind}"):
+            images.decode(tmp_path / name) if name != "film.mp4" else next(images.timed_frames(tmp_path / name))
+
+
 def test_files_that_are_no_pictures_are_named(tmp_path):
     (tmp_path / "text.jpg").write_text("not a picture at all")
     corrupt = bytearray(_encoded(".png"))

@@ -35,6 +35,12 @@ def test_tuples_are_stacked_one_by_one_and_the_last_item_fills_up():
     np.testing.assert_array_equal(run_in_batches(check, iter(items), 2), 13 * np.arange(5))
 
 
+def test_results_that_are_not_finite_are_refused():
+    huge = RNG.standard_normal((3, 2)).astype(np.float32) * np.float32(1e30)
+    with np.errstate(over="ignore"), pytest.raises(UserError, match="the features are not finite"):
+        run_in_batches(lambda batch: batch * batch, huge, 2)
+
+
 @pytest.fixture(scope="module")
 def encoder(tiny_run):
     return load_encoder(tiny_run)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.encoder import export
+from anytouch_jax.weights.convert import KEYMAPS
 from anytouch_jax.weights.safetensors import read_safetensors
 from experiments.pouring.recordings import POLICY, WEIGHTS, load_policy
 from tests.fuzz.harness import Case, cut, flipped, pick
@@ -231,7 +232,7 @@ def make(rng, folder: Path, things) -> Case:
     file = folder / "f.npz"
     if kind == "weights":
         arrays, _ = read_safetensors(things.release)
-        needed = sorted(arrays)
+        needed = sorted(arrays.keys() - KEYMAPS["stage1"].unused)
     elif kind == "policy":
         arrays, needed = policy_arrays(things, folder)
         file = folder / POLICY

@@ -373,4 +373,4 @@ def test_hostile_manifests(survives):
 
 @pytest.mark.slow
 def test_many_hostile_manifests(survives):
-    survives(make, 0.22)
+    survives(make, 0.2)

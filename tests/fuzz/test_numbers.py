@@ -106,4 +106,4 @@ def test_hostile_numbers(survives):
 
 @pytest.mark.slow
 def test_many_hostile_numbers(survives):
-    survives(make, 0.07)
+    survives(make, 0.05)

@@ -429,3 +429,19 @@ def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
         (tmp_path / name).write_text(text)
         with pytest.raises(UserError, match=f"is {kind}"):
             load_model(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda arrays: {"a": np.zeros(3)}, "these are not weights"),
+        (lambda arrays: {"touch/class_token": np.zeros((1, 1, 4))}, "its metadata lack the model"),
+        (lambda arrays: dict(list(arrays.items())[3:]), "missing"),
+        (lambda arrays: arrays, "number of attention heads"),
+        (lambda arrays: arrays | {"cls_token": np.full((1, 1, 16), 1e60)}, "number of attention heads"),
+    ],
+)
+def test_errors_name_the_file(tmp_path, change, words):
+    np.savez(tmp_path / "w.npz", **change(weights_of(STAGE1)))
+    with pytest.raises(WeightsError, match=rf"w\.npz: .*{words}"):
+        load_model(tmp_path / "w.npz")

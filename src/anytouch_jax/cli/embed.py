@@ -121,13 +121,9 @@ def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean"
 
 
 def save_features(
-    out: Path,
-    encoder: Encoder,
-    features: Features,
-    head: LinearHead | None,
-    options: FrameOptions,
+    out: Path, encoder: Encoder, features: Features, head: LinearHead | None, options: FrameOptions,
     about: dict[str, str],
-) -> None:
+) -> None:  # fmt: skip
     """Write features to `out`, with what a `head` predicts, and metadata; log a sensor that is not the one named."""
     from anytouch_jax.encoder.embed import save_npz
 

@@ -278,7 +278,7 @@ def _arrays(path: Path) -> list[str]:
     try:
         arrays = read_arrays(path, only=lambda name: name.startswith("about/") or (is_small and name == "features"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}. Write it again.") from None
+        raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}.") from None
     if {"format", "mark", "classes"} <= arrays.keys():
         from anytouch_jax.encoder.linear_head import load_head
 

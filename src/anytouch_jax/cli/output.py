@@ -70,7 +70,7 @@ def check_new(manifest: Manifest, path: Path) -> Path:
     target = path.expanduser().resolve()
     if target.is_file() and not is_manifest(target):
         raise UserError(f"{target} exists and is no manifest. Name another file with --out, or remove it.")
-    manifests.check_target(manifest, target)
+    manifests.placed(manifest, target)
     check_folder(target, read=manifest.files)
     return target
 

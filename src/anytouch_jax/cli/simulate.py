@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from anytouch_jax.bars import bar
 from anytouch_jax.cli.output import log
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from anytouch_jax.sim.scene import Scenes
 
 
@@ -51,9 +51,6 @@ class SimulateOptions:
 
 def run(options: SimulateOptions) -> int:
     """Simulate a data set, or finish one that was interrupted; 130 after Ctrl-C."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     from anytouch_jax.sim.dataset import simulate
     from anytouch_jax.sim.scene import Scenes
     from anytouch_jax.train.mesh import enable_compilation_cache
@@ -62,29 +59,25 @@ def run(options: SimulateOptions) -> int:
     scenes = Scenes(**{name: value for name, value in vars(options).items() if name not in ("out", "threads")})
     if missing := _missing_splits(scenes):
         log(f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or more.")
-    console, last = Console(stderr=True), -1
-    columns = TextColumn("touches"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=console, disable=not console.is_terminal)
-    task = bar.add_task("touches")
+    last = -1
+    with bar(options.touches, "touches") as advance, _exit_on_interrupt():
 
-    def report(done: int, of: int) -> None:
-        nonlocal last
-        if last < 0 and done < of:
-            sensors = ", ".join(scenes.sensors)
-            bar.console.print(f"compiling the contact solver for {sensors}: about a minute at first", soft_wrap=True)
-        elif bar.disable and 10 * done // of > 10 * last // of:
-            log(f"{done} of {of} touches")
-        last = done
-        bar.update(task, completed=done, total=of)
+        def report(done: int, of: int) -> None:
+            nonlocal last
+            if last < 0 and done < of:
+                log(f"compiling the contact solver for {', '.join(scenes.sensors)}: about a minute at first")
+            elif not sys.stderr.isatty() and 10 * done // of > 10 * last // of:
+                log(f"{done} of {of} touches")
+            last = done
+            advance(done)
 
-    with bar, _exit_on_interrupt(bar):
         path = simulate(scenes, options.out, threads=options.threads, progress=report)
     log(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
     return 0
 
 
 @contextmanager
-def _exit_on_interrupt(bar: Progress) -> Iterator[None]:
+def _exit_on_interrupt() -> Iterator[None]:
     """Exit at once on Ctrl-C: a thread that compiles would not react for a minute, and files are written atomically."""
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.default_int_handler:  # ignored, as in a script's background
@@ -92,7 +85,9 @@ def _exit_on_interrupt(bar: Progress) -> Iterator[None]:
         return
 
     def end(*_: Any) -> None:
-        bar.stop()
+        from rich.console import Console
+
+        Console(stderr=True).show_cursor()  # which the bar hides
         log("interrupted: finished touches are kept. Run the same command again to continue.")
         os._exit(130)
 

@@ -52,7 +52,7 @@ def run(options: VerifyOptions) -> int:
     if options.commercial_only is not None:
         commercial_only(manifest)  # raises for a manifest without such rows, before the work
     check_folder(options.out, read=manifest.files)
-    report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads, log=log)
+    report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads)
     print(report.to_markdown(), end="")
     if options.out is not None:
         atomic_write(options.out, report.to_json())

@@ -12,7 +12,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from PIL import BmpImagePlugin, ImageFile, JpegImagePlugin, PngImagePlugin, Tiff
 from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import placeholder
 
 MAX_PIXELS = 1 << 26  # a small file can declare an image that would fill the memory
 MAX_CODED = 16 * MAX_PIXELS  # pixels times scans of a JPEG: each scan goes over the whole picture
@@ -93,13 +94,6 @@ class _Quiet:
 
 
 QUIET = _Quiet()
-
-
-class Video(Protocol):
-    """An opened video: the part of cv2.VideoCapture that knows its times."""
-
-    def get(self, propId: int, /) -> float:
-        """Return a property."""
 
 
 class ImageError(UserError):
@@ -196,6 +190,8 @@ def _check_header(data: bytes) -> int:
     """
     header = next((header for start, header in _HEADERS.items() if data.startswith(start)), None)
     if header is None and not data.startswith(_TIFF):
+        if kind := placeholder(data):
+            raise ValueError(f"it is {kind}")
         raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
     if data.startswith(_JPEG):
         _check_segments(data)
@@ -332,8 +328,8 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
         raise ImageError(f"{path} is not a video that can be read, or has no frame")
 
 
-def frame_time(video: Video, number: int, last: float) -> float:
-    """Return the time stamp in seconds of frame `number`, which was just read, later than `last`.
+def frame_time(video: Any, number: int, last: float) -> float:
+    """Return the time stamp in seconds of frame `number` of a cv2.VideoCapture, just read, later than `last`.
 
     Without a stamp, the number is divided by the frame rate.
     """
@@ -354,8 +350,10 @@ def count_frames(path: str | Path) -> int:
 
 
 def open_video(path: str | Path) -> cv2.VideoCapture:
-    """Open a video. FFmpeg takes the part of a relative name before a colon for a protocol."""
-    with QUIET:
+    """Open a video. Raises ImageError for a web page or a Git LFS pointer in its place."""
+    if Path(path).is_file() and (kind := placeholder(path)):
+        raise ImageError(f"{path} is {kind}")
+    with QUIET:  # FFmpeg takes the part of a relative name before a colon for a protocol
         return cv2.VideoCapture(os.path.abspath(path))
 
 

@@ -32,18 +32,29 @@ def warn(sentence: str) -> None:
     warnings.warn(sentence, stacklevel=4)
 
 
+def check_features(values: np.ndarray) -> np.ndarray:
+    """Return what an encoder computed. Raises UserError if it is not finite, since finite weights may overflow."""
+    if not np.isfinite(values).all():
+        raise UserError(
+            "the features are not finite (NaN or infinite): the weights are damaged or much too large. Load them again "
+            "from their source, or take an earlier checkpoint."
+        )
+    return values
+
+
 def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: int = BATCH) -> np.ndarray:
     """Return the results (n, ...) of `function` over n items, in batches of `size`.
 
     Items are arrays, which are stacked, or tuples of arrays, which are stacked one by one. The last batch is filled up
     with its last item, so that `function` is compiled for one shape. Fewer items than `size` are one batch of their
-    number. Without items the result is empty, of shape (0,). This is the only place that pads batches.
+    number. Without items the result is empty, of shape (0,). This is the only place that pads batches. Raises UserError
+    for results that are not finite.
     """
     values, left = list[np.ndarray](), iter(items)
     while part := list(islice(left, size)):
         full = part + part[-1:] * (size - len(part) if values else 0)
         batch = tuple(map(np.stack, zip(*full, strict=True))) if isinstance(full[0], tuple) else np.stack(full)
-        values.append(np.asarray(function(batch))[: len(part)])
+        values.append(check_features(np.asarray(function(batch))[: len(part)]))
     return np.concatenate(values) if values else np.zeros(0, np.float32)
 
 
@@ -87,16 +98,9 @@ def embed_rows(
     def touches() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
         for row_ids, part in evaluation(
-            manifest,
-            rows,
-            config,
-            kind,
-            frames=frames,
-            unknown="universal",
-            prepare=encoder.prepare,
-            like=encoder.blank,
-            skipped=skipped,
-        ):
+            manifest, rows, config, kind, frames=frames, unknown="universal", prepare=encoder.prepare,
+            like=encoder.blank, skipped=skipped,
+        ):  # fmt: skip
             ids.append(row_ids)
             clips = part.clip[: len(row_ids)]
             clips = clips if edit is None else edit(clips, row_ids)
@@ -209,7 +213,7 @@ def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
         raise UserError(f"{path} is not a features file of `anytouch embed`: {error}") from None
     values, rows = (arrays.get(name, np.zeros(0, str)) for name in ("features", "rows"))
     numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
-    if values.ndim != 2 or not numeric or not len(rows) or rows.shape != values.shape[:1]:
+    if values.ndim != 2 or not numeric or rows.shape != values.shape[:1] or not len(rows):
         raise UserError(f"{path} needs numeric arrays features (n, d) and rows (n,), not {values.shape}, {rows.shape}.")
     if not values.shape[1] or not np.isfinite(values).all():
         raise UserError(f"{path}: the array features has no columns, or values that are not finite (NaN or infinite).")

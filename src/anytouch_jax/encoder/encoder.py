@@ -14,13 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anytouch_jax.data.images import decode
-from anytouch_jax.encoder.base import (
-    Encoder,
-    check_frames,
-    random_encoder,
-    touch_features,
-    touch_only,
-)
+from anytouch_jax.encoder.base import Encoder, check_frames, random_encoder, touch_features, touch_only
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays

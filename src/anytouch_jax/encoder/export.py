@@ -215,9 +215,10 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
     if not known:
         raise UserError(f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}")
     wrong = [name for name, kind in _FIELDS.items() if type(about.get(name)) is not kind]
+    wrong = wrong or [name for name in ("frames", "image_size", "features") if not 0 < about[name] < 1 << 20]
     if wrong or list(about["sensors"].values()) != list(range(len(about["sensors"]))):
         name = (wrong or ["sensors"])[0]
-        raise UserError(f"{describes(path)} is damaged: {name} is missing or of another type; export it again")
+        raise UserError(f"{describes(path)} is damaged: {name} is missing or wrong; export it again")
     if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:
         raise UserError(f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again")
     return data, about

@@ -23,7 +23,7 @@ import numpy as np
 
 from anytouch_jax.data.images import QUIET, frame_time, open_video, to_rgb
 from anytouch_jax.encoder.base import precision
-from anytouch_jax.encoder.embed import Join, Log, Pooling, warn
+from anytouch_jax.encoder.embed import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.encoder import Encoder, check_frames
 from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
@@ -182,7 +182,7 @@ def stream(
                 begin = time.perf_counter()
                 there = jax.device_put(clip.frames[None]).block_until_ready()
                 copied = time.perf_counter()
-                values = np.asarray(embed(there))[0]
+                values = check_features(np.asarray(embed(there))[0])
                 end = time.perf_counter()
                 last, at = clip.last, clip.last.read - start
                 seconds = (last.decode, clip.resize, copied - begin, end - copied)
@@ -282,10 +282,11 @@ def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame
             reason = f"its pictures have shape {pixels.shape}, and the first had {shape}"
             pixels = None
         if pixels is None:
-            missed, failing, fault = missed + 1, failing or decoded, reason
+            missed += 1
+            failing, fault = (decoded, reason) if failing is None else (failing, fault)
             if decoded - failing > RETRY:
                 raise CameraError(
-                    f"no frame of the camera could be read for {RETRY:g} s after {number} frames: {reason}. "
+                    f"no frame of the camera could be read for {RETRY:g} s after {number} frames: {fault}. "
                     "Check its cable and other programs that use it, and start again."
                 )
             time.sleep(_PAUSE)

@@ -202,7 +202,7 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     task = replace(task, label=_label_column(table, task))
     if not _has_values(table, task.label):
         known = ", ".join(name for name in table.table.column_names if name.startswith("label.")) or "none"
-        raise UserError(f"Task {task.name}: the manifest has no label in column {task.label!r}. It has {known}.")
+        raise UserError(f"Task {task.name}: no row has a value in column {task.label!r}. The labels are {known}.")
     labels, split = _labels(table, task), text_column(table, "split")
     if task.test_list is not None:  # whichever list decided the split of this manifest
         if "downstream_test" not in table.table.column_names:

@@ -26,6 +26,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
 from anytouch_jax.data.transforms import Flip, orient_frame
+from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.preprocess import Preprocess
@@ -220,8 +221,7 @@ class Live:
     def _nearest(self, values: Array) -> list[dict[str, Any]]:
         found, at = self._near
         if self._space is not None and time.perf_counter() - at > _SEARCH:
-            unit = values / max(float(np.linalg.norm(values)), 1e-12)
-            found = self._space.near(unit.astype(np.float32), count=5)
+            found = self._space.near(unit_rows(values[None])[0], count=5)
             self._near = found, time.perf_counter()
         return found
 

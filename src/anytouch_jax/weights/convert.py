@@ -51,7 +51,7 @@ def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, 
     """
     layout = detect_layout(weights)
     if layout == "own":
-        raise WeightsError("a file in our names does not store its model; use the configuration it was saved with")
+        raise WeightsError("its metadata lack the model; write the file again by `anytouch export --to safetensors`")
     try:
         return KEYMAPS[layout].detect(weights, heads)
     except (KeyError, IndexError, ValueError, TypeError) as error:  # an array is missing or has an odd shape
@@ -60,13 +60,13 @@ def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, 
         ) from None
 
 
-def refuse_unknown(stacks: Mapping[str, int], start: str = "") -> None:
-    """Raise WeightsError that names stacks of unknown head counts, by their widths, after `start`."""
+def refuse_unknown(stacks: Mapping[str, int]) -> None:
+    """Raise WeightsError that names stacks of unknown head counts, by their widths."""
     if stacks:
         names = " and ".join(f"{name} (width {width})" for name, width in stacks.items())
         example = ", ".join(f'"{name}": {{"heads": N}}' for name in stacks)
         raise WeightsError(
-            f"{start}the weights do not store the number of attention heads of {names}. Write it to a config.json "
+            f"the weights do not store the number of attention heads of {names}. Write it to a config.json "
             f'in its folder, as {{"model": {{{example}}}}}. Or write the file by `anytouch export --to safetensors`, '
             "which stores it."
         )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,7 +102,8 @@ def load_model(
         weights = read_weights(path) if weights is None else weights
         model, file_metadata = model_of_file(path, weights), read_file_metadata(path)
         background: Any = file_metadata.get(BACKGROUND_KEY, "keep")
-        params, config = to_params(weights, model), Config(model, data=DataConfig(background=background))
+        with _naming(path):
+            params, config = to_params(weights, model), Config(model, data=DataConfig(background=background))
         # A run without universal tokens was exported with the mean of its sensors in their place.
         trained, drawn, from_run = trained_sensors(file_metadata, model), True, False
         metadata = dict(file_metadata)
@@ -110,6 +112,16 @@ def load_model(
     if trained is not None and "touch" in params and (from_run or not stored_rows):
         params |= {"touch": serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
     return Loaded(path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run)
+
+
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Put the name of the file before an error about its content that lacks it."""
+    try:
+        yield
+    except UserError as error:
+        text = str(error.args[0])
+        raise error if str(path) in text else WeightsError(f"{path}: {text}") from None
 
 
 def _check_shapes(path: Path, params: Params, model: ModelConfig) -> None:
@@ -312,7 +324,8 @@ def read_weights(path: str | Path) -> dict[str, np.ndarray]:
         # numpy calls bfloat16 and float8 a "V" too, as it does records.
         if array.dtype.kind in "USOMmc" or array.dtype.type is np.void:
             raise WeightsError(f"{path} has no weights: {name} is {array.dtype}, not real numbers")
-    return {name: array if array.dtype.kind in "iub" else array.astype(np.float32) for name, array in arrays.items()}
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, which is refused by its name
+        return {name: one if one.dtype.kind in "iub" else one.astype(np.float32) for name, one in arrays.items()}
 
 
 def _read_file(path: Path) -> dict[str, np.ndarray]:
@@ -356,7 +369,8 @@ def _read_parts(index: Path) -> dict[str, np.ndarray]:
 def model_of_file(path: str | Path, weights: Weights) -> ModelConfig:
     """Return the model of a weights file, see `form_of_file`. Raises WeightsError for unknown head counts."""
     model, unknown = form_of_file(path, weights)
-    refuse_unknown(unknown, f"{path}: ")
+    with _naming(path):
+        refuse_unknown(unknown)
     return model
 
 
@@ -369,7 +383,8 @@ def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[
     if (text := read_file_metadata(path).get(MODEL_KEY)) is not None:
         return from_json(text, ModelConfig), {}
     config, openclip = _folder_config(path)
-    model, unknown = detect_form(weights, _stored_heads(path, config, openclip))
+    with _naming(path):
+        model, unknown = detect_form(weights, _stored_heads(path, config, openclip))
     activation: Any = _object(config, "model").get("activation")
     if detect_layout(weights) in ("clip", "openclip"):  # CLIP's configuration says nothing of the authors' weights
         activation = clip_activation(path)

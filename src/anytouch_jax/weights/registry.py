@@ -83,13 +83,9 @@ def _download(repository: str, revision: str | None) -> Path:
 
 
 def write_encoder(
-    folder: str | Path,
-    loaded: Loaded,
-    notes: str = "",
-    *,
-    parts: tuple[str, ...] = PARTS,
+    folder: str | Path, loaded: Loaded, notes: str = "", *, parts: tuple[str, ...] = PARTS,
     tokenizer: Path | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16, config.json, README.md.
 
     The copy computes in float32, whatever its training did.

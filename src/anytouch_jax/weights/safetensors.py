@@ -95,6 +95,5 @@ def existing_file(path: str | Path) -> Path:
             f"there is no weights file {path}; give the path of a .safetensors, .npz, .pth, .pt, .ckpt or .bin file"
         )
     if kind := placeholder(path):
-        advice = "run `git lfs pull`" if "LFS" in kind else "download the file itself"
-        raise WeightsError(f"{path} is {kind}, not the data that its name promises; {advice}")
+        raise WeightsError(f"{path} is {kind}")
     return path

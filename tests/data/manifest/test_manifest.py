@@ -195,7 +195,7 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
     for bad in ("link.png", "out/x.png"):
         with pytest.raises(m.ManifestError, match=r"leaves the folder .*, by a link; put the files there, or"):
             m.resolve_path(root, bad)
-    for bad in ("in\\a.png", r"C:\data\a.png", r".\in\a.png"):
+    for bad in ("in\\a.png", r"C:\data\a.png", r".\in\a.png", "C:/data/a.png"):
         with pytest.raises(m.ManifestError, match=r"as on Windows; write it relative .* forward slashes"):
             m.resolve_path(root, bad)
     (root / r"odd\name.png").write_bytes(b"x")
@@ -339,7 +339,9 @@ def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
         ("1.png,digit,s,1,tain,,2", "line 5 of .*csv: column 'split'"),
         ("1.png,digit,s,1,train", "line 5: 5 cells for 7 columns, in '1.png"),
         ("1.png,digit,s,1,train,soft, red,2", "line 5: 8 cells for 7 columns"),
-        ('1.png,digit,s,1,train,"open,2', "line 5: 6 cells for 7 columns"),
+        ('1.png,digit,s,1,train,"open,2', "the quote in line 5 is not closed"),
+        ('1.png,digit,s,1,train,,"open', "the quote in line 5 is not closed"),
+        ('1.png,digit,s,1,train,,"open\n1.png,digit,s,1,train,,"2', "the quote in line 5 is not closed"),
     ):
         with pytest.raises(m.ManifestError, match=words):
             m.read(_file(tmp_path, f"{head}\n{good}{bad}\n2.png,digit,s,2,train,,3\n"))
@@ -417,7 +419,7 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
         ("sequence,text\ns9,a\n", {}, "no key 'sequence' of it is in the manifest; its first one is 's9'"),
         ("sequence,text\ns0,a\n", {"key": "tuoch"}, "no column 'tuoch'"),
         ("grip,text\ns0,a\n", {}, "has no column 'grip'"),
-        ('sequence,text\n"s0,a\n', {}, "line 2: 1 cells for 2 columns"),
+        ('sequence,text\n"s0,a\n', {}, "the quote in line 2 is not closed"),
     ],
 )
 def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words):
@@ -473,6 +475,27 @@ def test_text_of_a_parquet_that_is_not_utf8_is_named(tmp_path, name):
     pa.parquet.write_table(_with_broken_text(GOOD_COLUMNS, name), tmp_path / "m.parquet")
     with pytest.raises(m.ManifestError, match=f"row 1 of .*parquet: column '{name}' must be UTF-8 text"):
         m.read(tmp_path / "m.parquet")
+
+
+@pytest.mark.parametrize("kind", [pa.large_string(), pa.string_view(), pa.dictionary(pa.int8(), pa.large_string())])
+def test_labels_of_every_text_type_are_text(tmp_path, kind):
+    labels = pa.array(["Wood", "wood"]).cast(pa.large_string())
+    labels = labels.dictionary_encode().cast(kind) if pa.types.is_dictionary(kind) else labels.cast(kind)
+    pa.parquet.write_table(pa.table(GOOD_COLUMNS | {"label.x": labels}), tmp_path / "m.parquet")
+    manifest = m.read(tmp_path / "m.parquet")
+    assert manifest.table["label.x"].type == pa.string()
+    assert "spelling" in [finding.kind for finding in verify(manifest, decode=False).findings]
+
+
+@pytest.mark.parametrize("name", ["m.csv", "m.parquet"])
+@pytest.mark.parametrize(
+    ("text", "kind"), [("<!DOCTYPE html>\n<a,b>\n", "a web page"), ("version https://git-lfs.x", "a Git")]
+)
+@pytest.mark.parametrize("read", [m.read, m.summarise_file])
+def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name, text, kind, read):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(m.ManifestError, match=rf"{name} is {kind}"):
+        read(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["path", "split", "object", "label.x"])

@@ -247,6 +247,17 @@ def test_one_class_in_several_spellings_is_named(make):
     assert found[0].column == "label.kind" and "'wood ' (1 rows)" in found[0].sentence
 
 
+def test_words_among_numbers_are_named(make):
+    columns = {
+        "label.force": ["1", "2.5", "N/K", "4"],
+        "label.code": ["1", "2", "3", "4"],
+        "label.size": ["1", "XL"] * 2,
+    }
+    report = verify(make([{"sequence": f"s{i}", **{k: v[i] for k, v in columns.items()}} for i in range(4)]))
+    (found,) = [one for one in report.findings if one.kind == "words_among_numbers"]
+    assert found.rows.tolist() == [2] and found.column == "label.force" and "'N/K'" in found.examples[0] and report.ok
+
+
 def test_frames_out_of_order_and_frames_twice(make):
     frames = [0, 2, 1, 3, 3, 0]
     rows = [{"sequence": "s" if i < 5 else "r", "frame_index": frame} for i, frame in enumerate(frames)]

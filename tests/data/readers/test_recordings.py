@@ -146,6 +146,8 @@ def test_labels_match_in_any_spelling_of_empty_spaces_and_unicode(tmp_path, read
         ("object,a\n\nmug,1,2\n", "line 3: 3 cells for 2 columns"),
         ("object,a,b\nmug,1\n", "line 2: 2 cells for 3 columns"),
         ("object,a\nmug,Wood\n\nball,wood\n", "line 4: column 'a' has 'wood', and .* line 2 has 'Wood'"),
+        ('object,a\nmug,"x\nball,1\n', "the quote in line 2 is not closed"),
+        ('object,a\nmug,"x\ny"\n,1\n', "line 4: there"),
         ("object,a\n,1\n", "line 2: there is neither an object nor a sequence"),
     ],
 )

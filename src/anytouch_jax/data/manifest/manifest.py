@@ -268,7 +268,7 @@ def write(manifest: Manifest, path: str | Path) -> None:
     Keys that two joined manifests share become different. Raises ManifestError for another ending, for a file outside
     the new folder, and for a column that the format cannot hold.
     """
-    target, table = _placed(manifest, path)
+    target, table = placed(manifest, path)
     table = with_distinct_keys(manifest, table)
     try:
         with atomic_path(target) as part, part.open("wb") as file:
@@ -280,13 +280,11 @@ def write(manifest: Manifest, path: str | Path) -> None:
         raise ManifestError(f"{target} cannot be written: {str(error).splitlines()[0]}") from None
 
 
-def check_target(manifest: Manifest, path: str | Path) -> None:
-    """Raise the ManifestError of `write` before long work: a wrong ending, or files outside the new folder."""
-    _placed(manifest, path)
+def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
+    """Return the absolute path of a manifest to be written, and its table with paths relative to that folder.
 
-
-def _placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
-    """Return the absolute path of a manifest to be written, and its table with paths relative to that folder."""
+    Raises ManifestError for a wrong ending, and for files outside the new folder.
+    """
     target, table = Path(path).expanduser().resolve(), manifest.table
     table_suffix(target)
     folder = target.parent
@@ -388,7 +386,7 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
     path = f"{_real_folder(root, head)}/{name}"
     if name in ("", ".", "..") or os.path.islink(path):
         path = os.path.realpath(path)
-    if "\\" in relative and not os.path.lexists(path):
+    if ("\\" in relative or relative[1:3] == ":/") and not os.path.lexists(path):
         raise ManifestError(
             f"the path {text} is written as on Windows; write it relative to the manifest's folder, with forward "
             "slashes (touch/0.png)"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import difflib
 import unicodedata
-from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
@@ -19,6 +19,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import csv_lines, placeholder
 
 SPLITS = ("train", "val", "test", "background", "unused")
 REQUIRED = ("path", "sensor", "sequence", "frame_index", "split")
@@ -30,7 +31,7 @@ EMPTY = ("", "na", "n/a", "n.a.", "#n/a", "<na>", "nan", "none", "null", "nil", 
 MAX_ROWS = 20_000_000  # of a manifest file
 MAX_TEXT = 10_000  # bytes of a text cell in the columns that are used
 _SPACES = r"[\s\p{Z}\x{200B}\x{FEFF}]+"
-_NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
+NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 _READERS = 2  # parts of a Parquet file that are read at once: more need more memory
 _PART = 1 << 22  # cells of a part: a large table is read column by column, so that it is never in memory twice
 BLOCK = 1 << 19  # rows that are read at once where a table is not needed whole
@@ -105,6 +106,8 @@ def listed(names: Sequence[str], count: int | None = None) -> str:
 def reading(path: Path) -> Iterator[None]:
     """Turn errors of reading a table into a ManifestError that names the file."""
     try:
+        if kind := placeholder(path):
+            raise ManifestError(f"{path} is {kind}")
         yield
     except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
         reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0][:500]
@@ -121,9 +124,11 @@ def read_text_csv(path: Path) -> pa.Table:
         parse = pa.csv.ParseOptions(newlines_in_values=True)
         try:
             table = pa.csv.read_csv(path, convert_options=convert, parse_options=parse)
+            if any(pc.any(pc.match_substring_regex(column, r"[\r\n]")).as_py() for column in table.columns):
+                deque(csv_lines(path), 0)  # Arrow takes the rows after a quote that is not closed for its text
             return table.rename_columns([name.strip() for name in table.column_names])
         except pa.ArrowInvalid:
-            odd = ((line, cells) for line, cells in _csv_lines(path) if len(cells) != len(names))
+            odd = ((line, cells) for line, cells in csv_lines(path) if len(cells) != len(names))
             line, cells = next(odd, (0, []))
             if not line:
                 raise
@@ -134,17 +139,7 @@ def read_text_csv(path: Path) -> pa.Table:
 
 
 def _csv_names(path: Path) -> list[str]:
-    return next(_csv_lines(path), (0, list[str]()))[1]
-
-
-def _csv_lines(path: Path) -> Generator[tuple[int, list[str]]]:
-    """Yield the number of the first line, from 1, and the cells of the rows of a CSV file. Blank lines are left out."""
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        line, rows = 1, csv.reader(file)
-        for cells in rows:
-            if cells:
-                yield line, cells
-            line = rows.line_num + 1
+    return next(csv_lines(path), (0, list[str]()))[1]
 
 
 def place_of(path: Path, row: int) -> str:
@@ -158,7 +153,7 @@ def place_of(path: Path, row: int) -> str:
 @lru_cache(4)
 def _csv_line_numbers(path: Path, changed: int) -> np.ndarray:
     """Return the first line of each row of a CSV file, i64 (1 + rows,). `changed` is the time of its last change."""
-    return np.fromiter((line for line, _ in _csv_lines(path)), np.int64)
+    return np.fromiter((line for line, _ in csv_lines(path)), np.int64)
 
 
 def _load_parquet(path: Path) -> pa.Table:
@@ -249,7 +244,7 @@ def _check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]
             f"{places[0]}: column {name!r} has {shown(other)}, and {places[1]} has {shown(first)}; write one class in "
             "one way"
         )
-    is_number = np.asarray(pc.fill_null(pc.match_substring_regex(column, _NUMBER), False))
+    is_number = np.asarray(pc.fill_null(pc.match_substring_regex(column, NUMBER), False))
     words = np.flatnonzero(np.asarray(pc.is_valid(column)) & ~is_number)
     # 007 is a name, and names may have letters too.
     is_name = pc.any(pc.match_substring_regex(column, r"^0\d")).as_py()
@@ -300,6 +295,8 @@ def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> 
             raise ManifestError(f"{path}: column {name!r} must be {kind}, is {column.type}") from None
     if name in REQUIRED:
         refuse(pc.is_null(column), lambda _: "is empty")
+    if name.startswith("label.") and is_text(column.type):  # polars writes large_string
+        column = column.cast(_TEXT)
     if pa.types.is_string(column.type) and (name in SCHEMA or name.startswith("label.")):
         length = pc.binary_length(column)
         refuse(pc.greater(length, MAX_TEXT), lambda row: f"has a text of {length[row]} bytes, more than {MAX_TEXT:,}")

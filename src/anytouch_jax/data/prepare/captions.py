@@ -277,22 +277,11 @@ def _parse_reply(reply: Any) -> tuple[str, str, int, int]:
 
 
 def annotate(
-    manifest: Manifest,
-    endpoint: Endpoint,
-    folder: str | Path,
-    *,
-    confirm: Callable[[CostEstimate], bool],
-    price_in: float | None = None,
-    price_out: float | None = None,
-    threads: int = 4,
-    side: int = 512,
-    split: str | None = None,
-    families: Mapping[str, str] | None = None,
-    overwrite: bool = False,
-    second_image: str = SECOND_IMAGE,
-    limit: int | None = None,
-    log: Callable[[str], None] | None = None,
-) -> CaptionResult:
+    manifest: Manifest, endpoint: Endpoint, folder: str | Path, *, confirm: Callable[[CostEstimate], bool],
+    price_in: float | None = None, price_out: float | None = None, threads: int = 4, side: int = 512,
+    split: str | None = None, families: Mapping[str, str] | None = None, overwrite: bool = False,
+    second_image: str = SECOND_IMAGE, limit: int | None = None, log: Callable[[str], None] | None = None,
+) -> CaptionResult:  # fmt: skip
     """Ask `endpoint` for every missing caption and return the manifest with all captions.
 
     Each touch, or each sequence without a touch, is one question. `threads` questions are open at a time. Images are

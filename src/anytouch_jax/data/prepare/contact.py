@@ -150,12 +150,9 @@ class ContactQuality:
 
 
 def contact_scores(
-    manifest: Manifest,
-    rows: np.ndarray | None = None,
-    *,
-    backgrounds: Mapping[str, UntouchedGel] | None = None,
+    manifest: Manifest, rows: np.ndarray | None = None, *, backgrounds: Mapping[str, UntouchedGel] | None = None,
     workers: int = 2,
-) -> ContactScores:
+) -> ContactScores:  # fmt: skip
     """Return the score of every row, or of `rows` only. Frames are read by `workers` threads.
 
     `backgrounds` are pictures from `read_backgrounds` for rows without one. A frame or background that cannot be read,
@@ -246,11 +243,7 @@ def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, Unto
 
 
 def _score_row(
-    manifest: Manifest,
-    faults: dict[int, str],
-    gel: UntouchedGel | Callable[[int], UntouchedGel],
-    source: str,
-    row: int,
+    manifest: Manifest, faults: dict[int, str], gel: UntouchedGel | Callable[[int], UntouchedGel], source: str, row: int
 ) -> _Scored:
     try:
         frame = decode(manifest.file(row))
@@ -337,13 +330,9 @@ def _load_or_none(manifest: Manifest, faults: dict[int, str], row: int) -> np.nd
 
 
 def mark_contact(
-    manifest: Manifest,
-    scores: ContactScores,
-    *,
-    thresholds: Mapping[str, float] | None = None,
-    share: float = 0.0,
+    manifest: Manifest, scores: ContactScores, *, thresholds: Mapping[str, float] | None = None, share: float = 0.0,
     drop: bool = False,
-) -> tuple[Manifest, ContactReport]:
+) -> tuple[Manifest, ContactReport]:  # fmt: skip
     """Return the manifest with `label.contact_score` and `label.contact` (1, 0 or null if unknown), and a report.
 
     An existing `label.contact` is kept. An existing score column is renamed to `<name>_given`. `thresholds` replaces
@@ -434,13 +423,9 @@ def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple
 
 
 def contact_quality(
-    manifest: Manifest,
-    scores: ContactScores,
-    *,
-    reference: str | None = None,
-    above: float | None = None,
+    manifest: Manifest, scores: ContactScores, *, reference: str | None = None, above: float | None = None,
     thresholds: Mapping[str, float] | None = None,
-) -> ContactQuality:
+) -> ContactQuality:  # fmt: skip
     """Compare the filter with column `reference` > `above` (default: the first existing one of REFERENCES).
 
     Rows with a value and a score are compared, except the split `background`. `thresholds` replaces entries of
@@ -451,7 +436,10 @@ def contact_quality(
     relevant = manifest.text_column("split") != "background"
     used = np.flatnonzero(relevant & ~np.isnan(truth) & ~np.isnan(scores.score))
     if not used.size:
-        raise UserError(f"no row has both a value in {name} and a score; name another column with --reference")
+        raise UserError(
+            f"no row has both a value in {name} and a score; name another column with --reference, or give a picture "
+            "of the untouched gel with --background"
+        )
     score, sources, sensors = scores.score[used], scores.reasons[used], manifest.text_column("sensor")[used]
     predicted, positive = score > threshold_of_rows(manifest, thresholds, 0.0)[used], truth[used] > limit
 

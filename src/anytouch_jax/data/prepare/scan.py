@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -96,9 +96,7 @@ class _FileState(NamedTuple):
     reason: str = ""
 
 
-def scan(
-    manifest: Manifest, *, decode: bool = True, threads: int = 4, log: Callable[[str], None] | None = None
-) -> Scan:
+def scan(manifest: Manifest, *, decode: bool = True, threads: int = 4) -> Scan:
     """Read every distinct file. Without `decode`, check only that it exists and is not empty.
 
     Memory holds some 100 bytes for each file and the images being decoded.
@@ -137,8 +135,6 @@ def scan(
                 result.pixels[file] = state.pixels
             if state.reason and len(result.reasons) < _MAX_REASONS:
                 result.reasons[file] = state.reason
-            if log and (file + 1) % 100_000 == 0:
-                log(f"{file + 1} of {count} files")
     return result
 
 

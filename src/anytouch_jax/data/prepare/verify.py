@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, misspelt_sensors
-from anytouch_jax.data.manifest.schema import SPLITS, listed, shown, spellings
+from anytouch_jax.data.manifest.schema import NUMBER, SPLITS, listed, shown, spellings
 from anytouch_jax.data.prepare.appearance import picture_faults
 from anytouch_jax.data.prepare.licences import NO, YES, Licence, commercial_use, licences
 from anytouch_jax.data.prepare.scan import EXAMPLES, OK, STATES, Finding, Level, Scan, finding, scan
@@ -93,20 +93,13 @@ def _table(*names: str) -> list[str]:
     return [*_row(*names), "|---" * len(names) + "|"]
 
 
-def verify(
-    manifest: Manifest,
-    *,
-    decode: bool = True,
-    objects: bool = False,
-    threads: int = 4,
-    log: Callable[[str], None] | None = None,
-) -> VerifyReport:
+def verify(manifest: Manifest, *, decode: bool = True, objects: bool = False, threads: int = 4) -> VerifyReport:
     """Check a manifest and every file that it names.
 
     `decode` reads every file and decodes every image completely. Without it, files must only exist and not be empty.
     With `objects`, an object in two learning splits is an error. The manifest is not changed (see `repair`).
     """
-    scanned = scan(manifest, decode=decode, threads=threads, log=log)
+    scanned = scan(manifest, decode=decode, threads=threads)
     findings = [
         *(fault for check in _FILE_CHECKS for fault in check(manifest, scanned)),
         *row_faults(manifest, objects=objects),
@@ -284,7 +277,10 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
 
 
 def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
-    """Yield label values, objects and units that differ by spaces, letter case or Unicode form only."""
+    """Yield label values, objects and units that differ by spaces, letter case or Unicode form only.
+
+    Yield labels too of which most are numbers and some are words.
+    """
     for name in manifest.table.column_names:
         column = manifest.table[name]
         if not pa.types.is_string(column.type) or not (name in ("object", "unit") or name.startswith("label.")):
@@ -296,6 +292,11 @@ def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
             places = [f"{manifest.where(ids[0])}: {shown(value)}" for value, ids in zip(group, rows, strict=True)]
             every = np.sort(np.concatenate(rows))
             yield Finding("spelling", "warning", sentence, every, tuple(places[:EXAMPLES]), name)
+        is_number = np.asarray(pc.fill_null(pc.match_substring_regex(column, NUMBER), False))
+        odd = np.flatnonzero(manifest.present(name) & ~is_number)
+        if name.startswith("label.") and is_number.sum() > len(odd):
+            words = f"values of {name} are words among numbers"
+            yield from finding(manifest, "words_among_numbers", "warning", odd, words, name)
 
 
 class SwapVerdict(NamedTuple):

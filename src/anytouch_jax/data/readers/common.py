@@ -25,7 +25,7 @@ from anytouch_jax.data.images import count_frames, frames_from_video, natural
 from anytouch_jax.data.manifest.remote import open_store
 from anytouch_jax.data.manifest.schema import REQUIRED
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_folder, atomic_write
+from anytouch_jax.files import atomic_folder, atomic_write, csv_lines
 
 Columns = dict[str, list[Any]]
 Frames = dict[int, str]  # frame number -> file name, by number
@@ -344,15 +344,13 @@ def published_splits(path: Path, lists: Mapping[str, Iterable[Any]], key: Callab
 
 
 def read_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Return (number of its last line, from 1, cells) of the rows of a CSV file (UTF-8) that are not blank.
+    """Return (number of its first line, from 1, cells) of the rows of a CSV file (UTF-8) that are not blank.
 
     Raises DatasetError.
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.reader(file)
-            lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
-            return [(line, row) for line, row in lines if any(row)]
+        lines = [(line, [cell.strip() for cell in cells]) for line, cells in csv_lines(path)]
+        return [(line, row) for line, row in lines if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DatasetError(f"{path} cannot be read as a CSV list: {error}") from None
 

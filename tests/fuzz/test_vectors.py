@@ -1,0 +1,124 @@
+"""Hostile vectors: of every length that float32 holds, zero, NaN or infinite, in functions of features."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from anytouch_jax.encoder.arrays import unit_rows
+from anytouch_jax.encoder.encoder import load_encoder
+from anytouch_jax.encoder.search import TouchIndex
+from anytouch_jax.evaluate.geometry import alignment, uniformity
+from anytouch_jax.evaluate.heads import ProbeHead, fit_head
+from anytouch_jax.evaluate.retrieval import Galleries, score_galleries
+from anytouch_jax.ops.losses import normalise
+from tests.fuzz.harness import Case, pick
+
+LENGTHS = (0.0, 1e-45, 1e-38, 1e-25, 1e-13, 1e-7, 1.0, 1e20, 1e37)
+WIDTH = 12
+load = lru_cache(1)(load_encoder)
+
+
+def unit(x: Any, least: float = 0.0) -> Any:
+    """Return rows over their lengths in float64, a row of zeros as it is."""
+    x = np.asarray(x, np.float64)
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    return x / np.maximum(np.where(length > 0, length, 1.0), least)
+
+
+def cosines(x: Any) -> Any:
+    return unit(x) @ unit(x).T
+
+
+def searched(x: Any, things: Any) -> Any:
+    index = TouchIndex(unit_rows(x), np.arange(len(x)), {}, {})
+    ids, values = index.search(x, len(x))
+    return np.take_along_axis(values, np.argsort(ids, axis=1), 1)
+
+
+def ranked(x: Any, things: Any) -> Any:
+    """The share of rows that find themselves, in galleries of all rows."""
+    rows = np.arange(len(x))
+    items = np.stack([np.concatenate([[row], np.delete(rows, row)]) for row in rows])[None]
+    return score_galleries(x, x, Galleries(rows, items, (0.0, 0.0), 0))[0]
+
+
+def ranks(x: Any) -> Any:
+    near = cosines(x)
+    return 1 / np.sum(near >= np.diag(near)[:, None] - 1e-6, axis=1)
+
+
+# What is computed, and what it is in float64.
+FUNCTIONS = {
+    "normalise": (lambda x, _: np.asarray(normalise(x)), lambda x: unit(x, 1e-12)),
+    "unit rows": (lambda x, _: unit_rows(x), unit),
+    "similarity": (lambda x, things: load(things.run).similarity(x, x), lambda x: unit(x, 1e-12) @ unit(x, 1e-12).T),
+    "search": (searched, cosines),
+    "recall": (ranked, ranks),
+    "alignment": (
+        lambda x, _: alignment(x, x[::-1]), lambda x: np.square(unit(x) - unit(x)[::-1]).sum(1).mean(),
+    ),
+    "uniformity": (
+        lambda x, _: uniformity(x),
+        lambda x: np.log(np.mean(np.exp(2 * np.minimum(cosines(x)[np.triu_indices(len(x), 1)] - 1, 0) * 2))),
+    ),
+}  # fmt: skip
+
+
+def make(rng, folder: Path, things) -> Case:
+    if rng.random() < 0.2:
+        return scaled(rng)
+    name = pick(rng, FUNCTIONS)
+    lengths = rng.choice(LENGTHS, (6, 1))
+    x = (unit(rng.standard_normal((6, WIDTH))) * lengths).astype(np.float32)
+    bad = rng.random() < 0.2
+    if bad:
+        x[int(rng.integers(6)), int(rng.integers(WIDTH))] = pick(rng, (np.nan, np.inf, -np.inf))
+    results = []
+
+    def compute() -> int:
+        function, _ = FUNCTIONS[name]
+        results.append(function(x, things))
+        return 0
+
+    def check(_):
+        if bad:
+            return "a value for a vector that is not finite" if np.isfinite(results[0]).all() else None
+        expected = FUNCTIONS[name][1](x)
+        error = np.abs(results[0] - expected).max()
+        return None if error < 1e-5 else f"an error of {error:.2g}"  # NaN is an error, too
+
+    return Case(f"{name}, lengths {lengths.ravel().tolist()}, {'not ' * bad}finite", compute, False, check)
+
+
+def scaled(rng) -> Case:
+    """A probe of features of another size predicts the same."""
+    power, x = int(rng.integers(-100, 100)), rng.standard_normal((24, 4)).astype(np.float32)
+    head = ProbeHead(pick(rng, ("linear", "knn")))
+    classes = int(pick(rng, (0, 3)))
+    y = np.arange(24) % 3 if classes else x[:, 0].astype(np.float64)
+    results = []
+
+    def compute() -> int:
+        for values in (x, np.ldexp(x, power)):
+            results.append(fit_head(head, values, y, classes).predict(values))
+        return 0
+
+    def check(_):
+        same = all(np.allclose(one, other, atol=1e-4) for one, other in zip(*results, strict=True))
+        return None if same else "other predictions"
+
+    return Case(f"{head.name} of {classes} classes, times 2**{power}", compute, False, check)
+
+
+def test_hostile_vectors(survives):
+    survives(make, 60)
+
+
+@pytest.mark.slow
+def test_many_hostile_vectors(survives):
+    survives(make, 0.04)

@@ -211,7 +211,8 @@ def novelty_scores(x: Array, references: Array, groups: Array | None = None, ref
 
     References of a row's own group (n,), (m,) are left out. A row without any reference gets infinity.
     """
-    scores, squares = np.empty(len(x)), np.square(references, dtype=np.float64).sum(1)
+    scores, references = np.empty(len(x)), references.astype(np.float64)  # once: live touch waits for it
+    squares = np.einsum("ij,ij->i", references, references)
     for start in range(0, len(x), _CHUNK):
         part = x[start : start + _CHUNK].astype(np.float64)
         square = np.square(part).sum(1)[:, None] + squares - 2 * part @ references.T

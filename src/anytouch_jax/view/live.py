@@ -33,13 +33,13 @@ from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.encoder.stream import Embedded, open_source, stream
 from anytouch_jax.errors import UserError
 from anytouch_jax.view.space import FeatureMap
-from anytouch_jax.view.tables import scale_down, touch_panels
+from anytouch_jax.view.tables import jpeg, scale_down, touch_panels
 
 Array = npt.NDArray[Any]
 _KEPT = 1000  # frames whose times make p50 and p99
-_SEARCH = 0.2  # seconds between searches for the nearest touches
+_TEXT = 10  # frames between two texts on the page
+_SEARCH = 0.5  # seconds between searches for the nearest touches
 _WAITING = 64  # pictures that wait for the disk: more are dropped and counted
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 85]
 
 
 class LoopedFilm:
@@ -102,6 +102,7 @@ class Live:
         self._count = 0
         self._near: tuple[list[dict[str, Any]], float] = ([], 0.0)
         self._times: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+        self._percentiles: dict[str, list[float]] = {}  # 50 and 99, in ms
         self._changed, self._packet, self._serial = threading.Condition(), b"", 0
         self._stopped = False
         self._thread: threading.Thread | None = None
@@ -193,17 +194,17 @@ class Live:
         if self.recorder is not None:
             self.recorder.add(picture)
         self._times.append((frame.seconds[-1], frame.age))
-        encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
+        if frame.number % _TEXT == 0 or not self._percentiles:
+            both = 1e3 * np.percentile(self._times, (50, 99), axis=0)
+            self._percentiles = dict(zip(("encoder", "age"), both.T.round(2).tolist(), strict=True))
         about: dict[str, Any] = {
             "frame": frame.number, "grabbed": 1e3 * (frame.started + frame.at), "picture": frame.picture,
             "panels": 1 if score != score else 3, "score": None if score != score else round(score, 2),
             "threshold": threshold, "contact": None if score != score else bool(score > threshold),
-            "encoder": encoder.round(2).tolist(), "age": age.round(2).tolist(), "missed": frame.missed,
-            "recording": None if self.recorder is None else self.recorder.state(),
+            "missed": frame.missed, "recording": None if self.recorder is None else self.recorder.state(),
         }  # fmt: skip
-        about |= self._classify(frame.values) | {"near": self._nearest(frame.values)}
-        jpeg = cv2.imencode(".jpg", view[..., ::-1], _JPEG)[1].tobytes()
-        self._publish(about, jpeg)
+        about |= self._percentiles | self._classify(frame.values) | {"near": self._nearest(frame.values)}
+        self._publish(about, jpeg(view, 85))
 
     def _classify(self, values: Array) -> dict[str, Any]:
         if self._head is None:
@@ -225,9 +226,9 @@ class Live:
             self._near = found, time.perf_counter()
         return found
 
-    def _publish(self, about: dict[str, Any], jpeg: bytes) -> None:
+    def _publish(self, about: dict[str, Any], picture: bytes) -> None:
         text = json.dumps(about | {"sent": 1e3 * time.time()}).encode()
-        packet = struct.pack("<I", len(text)) + text + struct.pack("<I", len(jpeg)) + jpeg
+        packet = struct.pack("<I", len(text)) + text + struct.pack("<I", len(picture)) + picture
         with self._changed:
             self._packet, self._serial = packet, self._serial + 1
             self._changed.notify_all()

@@ -69,12 +69,13 @@ document.addEventListener("keydown", (event) => {
 // ---- pictures ----------------------------------------------------------------------------------------------------
 
 class Pictures {
-  constructor(source) { this.source = source; this.held = new Map(); }
+  constructor(source, inTurn = false) { this.source = source; this.held = new Map(); this.inTurn = inTurn; this.last = null; }
   get(row) {
     let one = this.held.get(row);
     if (one) return one;
     one = { ready: false };
-    one.wait = this.load(row, one).catch((error) => { one.error = error.message; one.ready = true; });
+    const before = this.inTurn ? this.last : null; // live touch leaves no time for several at once
+    one.wait = this.last = Promise.resolve(before).then(() => this.load(row, one)).catch((error) => { one.error = error.message; one.ready = true; });
     this.held.set(row, one);
     if (this.held.size > KEPT) {
       const [oldest, gone] = this.held.entries().next().value;
@@ -498,7 +499,7 @@ function showRun(source) {
 function showLive(source, about) {
   const panels = panelSet(), facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" });
   const canvas = el("canvas", { className: "chart", role: "img", ariaLabel: "contact score" });
-  const pictures = about.table === null ? null : new Pictures(about.table), stopped = new AbortController();
+  const pictures = about.table === null ? null : new Pictures(about.table, true), stopped = new AbortController();
   const ages = [], scores = [], boxes = {}, view = { rotate: 0, flip: "none" };
   let shownNear = "", recording = false;
   const fact = (name, value, kind = "") => {

@@ -15,7 +15,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import cv2
 import numpy as np
 import uvicorn
 from starlette.applications import Starlette
@@ -31,7 +30,7 @@ from anytouch_jax.config import parse_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.tables import Table, open_film, open_folder, scale_down
+from anytouch_jax.view.tables import Table, jpeg, open_film, open_folder, scale_down
 from anytouch_jax.view.training import Run
 
 if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
@@ -258,7 +257,6 @@ def _json(value: Any, status: int = 200) -> Response:
 
 
 def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = 3 * 320) -> Response:
-    data = cv2.imencode(".jpg", scale_down(picture, side)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
     return Response(
-        data, media_type="image/jpeg", headers=_SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
+        jpeg(scale_down(picture, side), 90), media_type="image/jpeg", headers=_SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
     )

@@ -192,18 +192,30 @@ def group_weights(groups: Array) -> Array:
 
 
 def conformal_limit(scores: Array, groups: Array, share: float) -> float:
-    """Return the limit that a score of a new group is at most with probability `share` or more.
+    """Return the limit that a score of a new group is at most with probability `share`.
 
-    `scores` (n,) are calibration scores of rows in `groups` (n,), which have equal weight. One more group counts as
-    infinite, so the limit is infinite below share / (1 - share) groups. Raises UserError for a `share` outside 0..1.
+    `scores` (n,) are calibration scores of rows in `groups` (n,), which have equal weight. The limit is infinite below
+    share / (1 - share) groups. Else it is the level that covers each group in turn by the others alone. At most it is
+    the limit that holds however alike the rows of a group are: one more group counts as infinite there (Lee, Barber
+    and Willett 2023). Few groups of unlike rows would be covered too often by it, by up to 1 / groups. Raises UserError
+    for a `share` outside 0..1.
     """
     if not 0 < share < 1:
         raise UserError(f"A coverage must lie between 0 and 1, not {share:g}.")
-    count = len(np.unique(groups))
-    order = np.argsort(scores)
-    mass = np.cumsum(group_weights(groups)[order]) * count / (count + 1)
-    place = int(np.searchsorted(mass, share - 1e-12))
-    return float(scores[order][place]) if place < len(scores) else np.inf
+    order = np.argsort(scores, kind="stable")
+    scores, ids = scores[order], np.unique(groups, return_inverse=True)[1][order]
+    count, weights = ids.max() + 1, group_weights(ids)
+    mass = np.cumsum(weights)
+    place = int(np.searchsorted(mass * count / (count + 1), share - 1e-12))
+    if place == len(scores):
+        return np.inf
+    own, by_group = np.empty(len(ids)), np.argsort(ids, kind="stable")
+    own[by_group] = np.cumsum(weights[by_group]) - ids[by_group] / count  # mass of the row's group up to it
+    below = (mass - own) * count / max(count - 1, 1)  # mass of the others below each row
+    turn = np.argsort(below, kind="stable")
+    next_one = int(np.searchsorted(np.cumsum(weights[turn]), share - 1e-12)) + 1
+    level = below[turn][min(next_one, len(turn) - 1)]
+    return float(scores[min(place, int(np.searchsorted(mass, level - 1e-12)))])
 
 
 def novelty_scores(x: Array, references: Array, groups: Array | None = None, reference_groups: Any = None) -> Array:

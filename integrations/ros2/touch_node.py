@@ -3,7 +3,10 @@
 ros2 run needs a package. This file runs alone: python integrations/ros2/touch_node.py --ros-args -p sensor:=digit
 """
 
+import contextlib
+
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from std_msgs.msg import Bool, Float32MultiArray
 
@@ -15,8 +18,8 @@ from anytouch_jax.encoder.stream import open_source, stream
 
 def main() -> None:
     rclpy.init()
-    node = Node("touch")
-    values = {name: node.declare_parameter(name, default).value for name, default in (
+    node, any_type = Node("touch"), ParameterDescriptor(dynamic_typing=True)  # camera:=0 is a number for ROS
+    values = {name: str(node.declare_parameter(name, default, any_type).value) for name, default in (
         ("model", "anytouch-tiny"), ("camera", "0"), ("sensor", "digit"), ("background", ""))}  # fmt: skip
     features = node.create_publisher(Float32MultiArray, "touch/features", 1)  # a queue of one: the newest counts
     contact = node.create_publisher(Bool, "touch/contact", 1)
@@ -24,16 +27,16 @@ def main() -> None:
     gel = decode(values["background"]) if values["background"] else None
     preprocess, gate = at.Preprocess(encoder, gel), ContactGate(gel, values["sensor"])
     row = encoder.sensor_row(values["sensor"])
-    try:
-        for frame in stream(encoder, source, preprocess, live=live, sensor=row, contact=gate):
+    frames = stream(encoder, source, preprocess, live=live, sensor=row, contact=gate)
+    with contextlib.suppress(KeyboardInterrupt), contextlib.closing(frames):
+        for frame in frames:
+            if not rclpy.ok():  # Ctrl-C has ended ROS, which then refuses to publish
+                break
             features.publish(Float32MultiArray(data=frame.values.tolist()))
             if frame.contact == frame.contact:  # NaN without a background: contact is unknown
                 contact.publish(Bool(data=bool(frame.contact)))
-            if not rclpy.ok():
-                break
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder import health
 from anytouch_jax.encoder.health import UnitFrames
-from experiments.real.faults import FAULTS, LAYOUT, most_different
+from experiments.real.faults import FAULTS, LAYOUT, each, most_different
 
 SHARED = Path(__file__).parents[3] / "shared"
 
@@ -52,8 +52,12 @@ def check(unit: UnitFrames, name: str, others=()) -> health.Check:
     return one
 
 
+def large(unit: UnitFrames) -> UnitFrames:
+    return each(unit, lambda frame: cv2.resize(frame, None, fx=2, fy=2))
+
+
 def test_good_units_raise_no_alarm():
-    for result in health.check_units(UNITS, {"digit": REFERENCES}):
+    for result in health.check_units([large(unit) for unit in UNITS], {"digit": REFERENCES}):
         assert result.verdict == "good" and not result.faults
         assert all(one.ok for one in result.checks), [one for one in result.checks if not one.ok]
 
@@ -62,10 +66,26 @@ def test_good_units_raise_no_alarm():
 def test_a_made_fault_is_reported_by_its_check_with_advice(fault):
     name, make = FAULTS[fault]
     for unit in UNITS[:2]:
+        unit = large(unit) if name == "focus" else unit
         found = check(make(unit, None, np.random.default_rng(0)), name)
         assert found.ok is False and found.advice, (fault, found)
         if name == LAYOUT:
             assert fault in found.value
+
+
+def test_a_good_unit_that_looks_odd_raises_no_alarm():
+    """Too small a picture, deep touches of a soft gel, and one odd reference of three."""
+    assert check(UNITS[0], "focus").ok is None
+    rng, deep = np.random.default_rng(1), []
+    for frames in UNITS[0].recordings:
+        press = cv2.resize(rng.uniform(-90, 90, (3, 4, 3)), (160, 120), interpolation=cv2.INTER_CUBIC)
+        deep.append([np.clip(frame + press, 0, 255).astype(np.uint8) for frame in frames])
+    assert check(replace(UNITS[0], recordings=deep), "one unit").ok
+    own, *noise = rng.uniform(-60, 60, (4, 16, 16, 3))
+    shares = ((0.8, 0.7), (0.8, 0.7), (0.3, 0.9))  # of the picture and its mirror image: the last is odd
+    known = [a * own + b * own[:, ::-1] + 0.2 * grain for (a, b), grain in zip(shares, noise, strict=True)]
+    own, *known = (np.clip(128 + look, 0, 255).astype(np.uint8) for look in (own, *known))
+    assert health.check_layout(replace(UNITS[0], background=own), known).ok
 
 
 def test_the_advice_undoes_the_turn():

@@ -1,4 +1,4 @@
-"""Search by touch: recall and latency of the graph of neighbours (usearch) and of exact search (numpy).
+"""Search by touch: recall and latency of cells (FAISS) and of exact search (numpy).
 
     python -m experiments.benchmarks.search --count 1000000
 
@@ -26,7 +26,7 @@ from experiments.benchmarks import machine
 from experiments.command import run_script
 from experiments.records import write_record
 
-WAYS = {"exact (numpy)": False, "graph (usearch)": True}
+WAYS = {"exact (numpy)": False, "cells (FAISS)": True}
 
 
 @dataclass(frozen=True)

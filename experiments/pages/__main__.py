@@ -39,6 +39,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "torch": (speed.TORCH[0], speed.torch),
     "memory": (speed.MEMORY, speed.memory),
     "search": (speed.SEARCH, speed.search),
+    "view": (speed.VIEW, speed.view),
     "photometry": (speed.SIMULATOR, speed.photometry),
     "contact": (speed.SIMULATOR, speed.contact),
     "compare": (COMPARED, compare_encoders),

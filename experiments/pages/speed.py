@@ -14,7 +14,7 @@ from experiments.records import read_records
 VARIANTS = "speed_stage1_stage2_embed_small.json"
 TORCH = ("torch_small.json", "torch_small_epyc_stage1.json", "torch_small_epyc.json", "torch_large.json")
 MEMORY, SIMULATOR = "memory_large.json", "simulator.jsonl"
-SEARCH = "search.jsonl"
+SEARCH, VIEW = "search.jsonl", "view.jsonl"
 BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
 GIB = 2**30
 
@@ -83,32 +83,66 @@ def torch(folder: Path) -> Page:
 
 
 def search(folder: Path) -> Page:
-    """Exact search and the graph of neighbours."""
+    """Exact search and search in the nearest cells."""
     records = [*read_records(folder / SEARCH).values()]
     rows = [
         (f"{one['count']:,}", one["way"], Value(100 * one["recall"]), one["p50_ms"], one["p99_ms"],
          one["processor_ms"], one["opened_s"], one["opened_processor_s"]) for one in records
     ]  # fmt: skip
     largest = {one["way"].split()[0]: one for one in records if one["count"] == max(one["count"] for one in records)}
-    exact, graph = largest["exact"], largest["graph"]
+    exact, cells = largest["exact"], largest["cells"]
     loads = sorted(one["load"] for one in records)
     return Page(
         "search",
         "How fast is search by touch?",
         f"The {exact['nearest']} nearest of made features of {exact['width']} values are searched, in clusters of "
         "about 50. A query is one touch. Recall is the share of the exact result that is found. The exact way is "
-        f"numpy, the graph is usearch. The machine is {_machine(exact['machine'])}. Other work ran on it, and its load "
-        f"was {loads[0]:.0f} to {loads[-1]:.0f}. So compare processor times, which are sums over the threads.",
+        f"numpy, and FAISS looks into the nearest cells alone. The machine is {_machine(exact['machine'])}. Other work "
+        f"ran on it, and its load was {loads[0]:.0f} to {loads[-1]:.0f}. So compare processor times, which are sums over "
+        "the threads.",
         ("features", "way", Measure("recall, %"),
          *(Measure(name, ".1f", False) for name in ("p50, ms", "p99, ms", "processor ms", "s to open",
                                                      "processor s to open"))),
         rows,
         [f"Exact search among {exact['count']:,} features takes {exact['processor_ms']:.0f} ms of processor "
          "time a query.",
-         f"The graph takes {graph['processor_ms']:.1f} ms, with a recall of {100 * graph['recall']:.1f} %.",
-         f"The graph is built when the index opens, which takes {graph['opened_processor_s']:.0f} s of processor "
+         f"Cells take {cells['processor_ms']:.1f} ms, with a recall of {100 * cells['recall']:.1f} %.",
+         f"Cells are made when the index opens, which takes {cells['opened_processor_s']:.0f} s of processor "
          "time. For a few queries exact search is done earlier."],
-        (SEARCH,), "python -m experiments.benchmarks.search --count 100000",
+        (SEARCH,), "python -m experiments.benchmarks.search",
+    )  # fmt: skip
+
+
+def view(folder: Path) -> Page:
+    """Live touch on the page, and the opening of a large manifest."""
+    records = read_records(folder / VIEW)
+    named = {"camera alone": "camera alone", "all": "with a head and nearest touches"}
+    rows: list[Any] = [
+        (what, name, Value(one[what]["p50"], one[what]["p50"], one[what]["p99"]), one[what].get("largest"))
+        for key, name in named.items() if (one := records.get(key)) for what in ("encoder", "age")
+    ]  # fmt: skip
+    findings = [
+        f"{name[0].upper()}{name[1:]}: the oldest frame is {one['age']['largest']:.0f} ms old when the page shows it. The "
+        f"encoder takes {one['encoder']['p99']:.0f} ms at the 99th percentile."
+        for key, name in named.items() if (one := records.get(key))
+    ]  # fmt: skip
+    if opening := records.get("open"):
+        seconds = opening["seconds"]
+        about = f"{opening['rows']:,} rows opened"
+        rows.append((about, "a manifest", Value(1e3 * float(np.median(seconds))), 1e3 * max(seconds)))
+        findings.append(
+            f"A manifest of {opening['rows']:,} rows is on the page {max(seconds):.1f} s after the command, at most."
+        )
+    first = next(iter(records.values()))
+    return Page(
+        "view",
+        "How old is live touch on the page?",
+        "A film of 30 frames/s takes the place of a camera, and `anytouch-tiny` embeds each frame. Chromium draws the "
+        f"page on the same machine ({_machine(first['machine'])}). Age is the time from the arrival of a frame to the "
+        "page. Values are medians, and to is the 99th percentile. For age they are the largest of windows of 20 s.",
+        ("time", "of", Measure("ms", ".0f"), Measure("largest, ms", ".0f", False)),
+        rows, findings, (VIEW,),
+        "python -m experiments.benchmarks.view FILM --with MANIFEST FEATURES --head HEAD",
     )  # fmt: skip
 
 

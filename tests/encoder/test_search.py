@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from anytouch_jax.encoder import search
 from anytouch_jax.encoder.search import load_index
 from anytouch_jax.errors import UserError
 
@@ -38,14 +39,19 @@ def test_the_nearest_are_those_of_largest_cosine(tmp_path):
             index.search(wrong)
 
 
-def test_a_graph_finds_almost_the_same(tmp_path):
-    pytest.importorskip("usearch")
+@pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")  # of FAISS on Python 3.12
+def test_cells_find_almost_the_same(tmp_path, monkeypatch):
+    pytest.importorskip("faiss")
+    monkeypatch.setattr(search, "_OF_CELL", 8)
+    monkeypatch.setattr(search, "_LOOKED_INTO", 20)  # of 40 cells
     values = np.random.default_rng(1).standard_normal((400, 16)).astype(np.float32)
     path = write(tmp_path / "f.npz", values)
-    exact, graph = load_index(path).search(values[:20], 5), load_index(path, approximate=True).search(values[:20], 5)
-    assert np.mean([len(set(a) & set(b)) / 5 for a, b in zip(exact[0], graph[0], strict=True)]) > 0.9
-    np.testing.assert_array_equal(graph[0][:, 0], np.arange(20))
-    np.testing.assert_allclose(graph[1][:, 0], 1, atol=1e-4)
+    exact, index = load_index(path).search(values[:20], 5), load_index(path, approximate=True)
+    ids, cosines = index.search(values[:20], 5)
+    assert 0.9 < np.mean([len(set(a) & set(b)) / 5 for a, b in zip(exact[0], ids, strict=True)])
+    np.testing.assert_array_equal(ids[:, 0], np.arange(20))
+    np.testing.assert_allclose(cosines[:, 0], 1, atol=1e-4)
+    np.testing.assert_array_equal(index.search(values[:3], 400)[0], load_index(path).search(values[:3], 400)[0])
 
 
 def test_a_hostile_file_is_refused(tmp_path):

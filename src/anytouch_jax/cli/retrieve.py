@@ -39,7 +39,7 @@ class RetrieveOptions:
     sensor: str | None = None  # Sensor of the query. Without it the universal tokens are used.
     background: Path | None = None  # Picture of the untouched gel of the query.
     count: Count[int] = 10  # Nearest touches to list.
-    approximate: bool = False  # Search by a graph of neighbours (usearch), for very many features.
+    approximate: bool = False  # Search in the nearest cells alone (FAISS), for very many features.
     model: tuple[Path, ...] = ()  # Encoders to compare: names, run folders or weights files (default: anytouch-tiny).
     split: str = "test"  # Split to retrieve in.
     frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.

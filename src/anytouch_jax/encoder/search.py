@@ -1,7 +1,7 @@
 """Search by touch: the nearest of many stored features to a frame, a clip or a sentence.
 
-The index is a features file of `anytouch embed`. Search is exact, by numpy. With `approximate`, usearch (an extra)
-builds a graph of neighbours. `experiments/benchmarks/search.py` measures both.
+The index is a features file of `anytouch embed`. Search is exact, by numpy. With `approximate`, FAISS (an extra)
+compares a query with the features of the nearest cells alone. `experiments/benchmarks/search.py` measures both.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from anytouch_jax.encoder.embed import read_npz
 from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
+_OF_CELL, _LOOKED_INTO = 64, 64  # features of a cell that k-means reads, and cells that a search looks into
 SHOWN = ("path", "frame_index", "sensor", "unit", "sequence", "object")  # keys of a hit, besides labels
 
 
@@ -57,7 +58,7 @@ class TouchIndex:
     keys: dict[str, Array]
     about: dict[str, str]
     source: str = "the index"
-    graph: Any = field(default=None, repr=False)
+    cells: Any = field(default=None, repr=False)
 
     def search(self, features: Array, count: int = 10) -> tuple[Array, Array]:
         """Return row numbers i64 (m, count) and cosines f32 (m, count) of the nearest, nearest first, of (m, d).
@@ -70,11 +71,13 @@ class TouchIndex:
                 f"{self.source} holds features of {self.values.shape[1]} finite values, not {features.shape}."
             )
         count, query = min(count, len(self.values)), unit_rows(features)
-        if self.graph is None:
+        if self.cells is None:
             return nearest(self.values, query, count)
-        results = [self.graph.search(row, count) for row in query]
-        ids = np.stack([np.asarray(each.keys, np.int64) for each in results])
-        return ids, np.stack([1 - np.asarray(each.distances, np.float32) for each in results])
+        cosines, ids = self.cells.search(query, count)
+        missed = ids[:, -1] < 0  # the cells held fewer
+        if missed.any():
+            ids[missed], cosines[missed] = nearest(self.values, query[missed], count)
+        return ids, cosines
 
     def check(self, source: str, fingerprint: str) -> None:
         """Raise UserError unless the index was made by the encoder with that fingerprint."""
@@ -91,18 +94,22 @@ class TouchIndex:
 
 
 def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
-    """Return the index of a features file. Raises UserError for another file, and without usearch if `approximate`."""
+    """Return the index of a features file. Raises UserError for another file, and without FAISS if `approximate`."""
     features, about = read_npz(path)
     unit = unit_rows(features.values).astype(np.float32)
-    graph = _graph(unit) if approximate else None
-    return TouchIndex(unit, features.rows, features.keys, about, str(path), graph)
+    cells = _cells(unit) if approximate else None
+    return TouchIndex(unit, features.rows, features.keys, about, str(path), cells)
 
 
-def _graph(values: Array) -> Any:
+def _cells(values: Array) -> Any:
+    """Return an inverted file: cells around middles of k-means, of which a search looks into the nearest."""
     try:
-        from usearch.index import Index
+        import faiss
     except ImportError:
-        raise UserError('Approximate search needs usearch: pip install "anytouch_jax[search]"') from None
-    graph = Index(ndim=values.shape[1], metric="cos", dtype="f32", expansion_add=48)  # 128 takes three times as long
-    graph.add(np.arange(len(values)), values)
-    return graph
+        raise UserError('Approximate search needs FAISS: pip install "anytouch_jax[search]"') from None
+    count = max(1, min(int(2 * len(values) ** 0.5), len(values) // _OF_CELL))
+    index = faiss.index_factory(values.shape[1], f"IVF{count},Flat", faiss.METRIC_INNER_PRODUCT)
+    index.train(values[:: max(1, len(values) // (_OF_CELL * count))])
+    index.add(values)
+    index.nprobe = _LOOKED_INTO
+    return index

@@ -34,7 +34,8 @@ from experiments.records import write_record
 WINDOW = 20.0  # seconds, in which the page keeps the ages of all frames at 30 frames/s
 DRAWN = "Number(document.getElementById('main').dataset.frames ?? 0)"
 WARM = 8.0  # seconds until a browser has started
-FACTS = "Object.fromEntries([...document.querySelectorAll('.fact')].map((f) => [f.firstChild.data, f.lastChild.textContent]))"
+FACTS = """Object.fromEntries([...document.querySelectorAll('.fact')].map(
+    (fact) => [fact.firstChild.data, fact.lastChild.textContent]))"""
 
 
 @dataclass(frozen=True)

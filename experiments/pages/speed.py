@@ -98,8 +98,8 @@ def search(folder: Path) -> Page:
         f"The {exact['nearest']} nearest of made features of {exact['width']} values are searched, in clusters of "
         "about 50. A query is one touch. Recall is the share of the exact result that is found. The exact way is "
         f"numpy, and FAISS looks into the nearest cells alone. The machine is {_machine(exact['machine'])}. Other work "
-        f"ran on it, and its load was {loads[0]:.0f} to {loads[-1]:.0f}. So compare processor times, which are sums over "
-        "the threads.",
+        f"ran on it, and its load was {loads[0]:.0f} to {loads[-1]:.0f}. So compare processor times, which are sums "
+        "over the threads.",
         ("features", "way", Measure("recall, %"),
          *(Measure(name, ".1f", False) for name in ("p50, ms", "p99, ms", "processor ms", "s to open",
                                                      "processor s to open"))),
@@ -122,8 +122,8 @@ def view(folder: Path) -> Page:
         for key, name in named.items() if (one := records.get(key)) for what in ("encoder", "age")
     ]  # fmt: skip
     findings = [
-        f"{name[0].upper()}{name[1:]}: the oldest frame is {one['age']['largest']:.0f} ms old when the page shows it. The "
-        f"encoder takes {one['encoder']['p99']:.0f} ms at the 99th percentile."
+        f"{name}: the oldest frame is {one['age']['largest']:.0f} ms old when the page shows it. "
+        f"The encoder takes {one['encoder']['p99']:.0f} ms at the 99th percentile."
         for key, name in named.items() if (one := records.get(key))
     ]  # fmt: skip
     if opening := records.get("open"):

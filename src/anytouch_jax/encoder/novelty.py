@@ -92,12 +92,6 @@ class Calibration:
             raise ValueError(f"its temperature is {values['temperature']}")
         return Calibration(**values)
 
-    def _likely_sensors(self, x: Array) -> Array:
-        """Return the sensor (n,) str whose nearest references are nearest to each row of scaled features (n, d)."""
-        names, x = np.unique(self.sensors), x @ self.whitening
-        distances = [novelty_scores(x, self.references[self.sensors == name]) for name in names]
-        return np.asarray(names[np.argmin(distances, axis=0)])
-
     def sensor_warning(self, x: Array, sensor: str) -> str:
         """Return a sentence if scaled features (n, d) are not of the `sensor` that the user named, else "".
 
@@ -105,10 +99,11 @@ class Calibration:
         """
         if len(x) < _FEWEST:
             return ""
-        known = sorted(set(self.sensors.tolist()))
+        known = np.unique(self.sensors)
         if sensor not in known:
             return f"The head was fitted on {', '.join(known)}, not on {sensor}. Do not trust its classes."
-        looks, counts = np.unique(self._likely_sensors(x), return_counts=True)
+        away = [novelty_scores(x @ self.whitening, self.references[self.sensors == name]) for name in known]
+        looks, counts = np.unique(known[np.argmin(away, axis=0)], return_counts=True)
         if (counts[looks == sensor].sum() <= (1 - _OTHERS) * len(x)) and looks[counts.argmax()] != sensor:
             return (
                 f"{counts.max()} of {len(x)} frames look like {looks[counts.argmax()]}, not {sensor}. "
@@ -194,11 +189,10 @@ def group_weights(groups: Array) -> Array:
 def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     """Return the limit that a score of a new group is at most with probability `share`.
 
-    `scores` (n,) are calibration scores of rows in `groups` (n,), which have equal weight. The limit is infinite below
-    share / (1 - share) groups. Else it is the level that covers each group in turn by the others alone. At most it is
-    the limit that holds however alike the rows of a group are: one more group counts as infinite there (Lee, Barber
-    and Willett 2023). Few groups of unlike rows would be covered too often by it, by up to 1 / groups. Raises UserError
-    for a `share` outside 0..1.
+    `scores` (n,) are calibration scores of rows in `groups` (n,), which have equal weight. The limit covers each group
+    in turn by the others. It is at most the limit that holds however alike the rows of a group are, with one more group
+    that counts as infinite. Alone that one covers unlike rows too often, by up to 1 / groups. It is infinite below
+    share / (1 - share) groups. Raises UserError for a `share` outside 0..1.
     """
     if not 0 < share < 1:
         raise UserError(f"A coverage must lie between 0 and 1, not {share:g}.")

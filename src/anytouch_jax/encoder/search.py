@@ -108,7 +108,7 @@ def _cells(values: Array) -> Any:
     except ImportError:
         raise UserError('Approximate search needs FAISS: pip install "anytouch_jax[search]"') from None
     count = max(1, min(int(2 * len(values) ** 0.5), len(values) // _OF_CELL))
-    index = faiss.index_factory(values.shape[1], f"IVF{count},Flat", faiss.METRIC_INNER_PRODUCT)
+    index: Any = faiss.index_factory(values.shape[1], f"IVF{count},Flat", faiss.METRIC_INNER_PRODUCT)
     index.train(values[:: max(1, len(values) // (_OF_CELL * count))])
     index.add(values)
     index.nprobe = _LOOKED_INTO

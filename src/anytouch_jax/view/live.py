@@ -36,8 +36,7 @@ from anytouch_jax.view.space import FeatureMap
 from anytouch_jax.view.tables import jpeg, scale_down, touch_panels
 
 Array = npt.NDArray[Any]
-_KEPT = 1000  # frames whose times make p50 and p99
-_TEXT = 10  # frames between two texts on the page
+_KEPT = 600  # frames whose times make p50 and p99, as on the page
 _SEARCH = 0.5  # seconds between searches for the nearest touches
 _WAITING = 64  # pictures that wait for the disk: more are dropped and counted
 
@@ -49,21 +48,16 @@ class LoopedFilm:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._video = path, open_video(path)
+        self._path, self._video, self._due = path, open_video(path), 0.0
         rate = self._video.get(cv2.CAP_PROP_FPS)
         self._period = 1 / rate if 1 <= rate <= 240 else 1 / 30
-        self._due = 0.0
 
     def grab(self) -> bool:
         """Wait for the next frame."""
         now = time.perf_counter()
         self._due = max(self._due + self._period, now - self._period)
         time.sleep(max(0.0, self._due - now))
-        if self._video.grab():
-            return True
-        self._video.release()
-        self._video = open_video(self._path)
-        return bool(self._video.grab())
+        return self._video.grab() or (self._video.open(str(self._path)) and self._video.grab())
 
     def retrieve(self) -> tuple[bool, Any]:
         return self._video.retrieve()
@@ -102,7 +96,6 @@ class Live:
         self._count = 0
         self._near: tuple[list[dict[str, Any]], float] = ([], 0.0)
         self._times: deque[tuple[float, float]] = deque(maxlen=_KEPT)
-        self._percentiles: dict[str, list[float]] = {}  # 50 and 99, in ms
         self._changed, self._packet, self._serial = threading.Condition(), b"", 0
         self._stopped = False
         self._thread: threading.Thread | None = None
@@ -194,16 +187,15 @@ class Live:
         if self.recorder is not None:
             self.recorder.add(picture)
         self._times.append((frame.seconds[-1], frame.age))
-        if frame.number % _TEXT == 0 or not self._percentiles:
-            both = 1e3 * np.percentile(self._times, (50, 99), axis=0)
-            self._percentiles = dict(zip(("encoder", "age"), both.T.round(2).tolist(), strict=True))
+        encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
         about: dict[str, Any] = {
             "frame": frame.number, "grabbed": 1e3 * (frame.started + frame.at), "picture": frame.picture,
             "panels": 1 if score != score else 3, "score": None if score != score else round(score, 2),
             "threshold": threshold, "contact": None if score != score else bool(score > threshold),
-            "missed": frame.missed, "recording": None if self.recorder is None else self.recorder.state(),
+            "encoder": encoder.round(2).tolist(), "age": age.round(2).tolist(), "missed": frame.missed,
+            "recording": None if self.recorder is None else self.recorder.state(),
         }  # fmt: skip
-        about |= self._percentiles | self._classify(frame.values) | {"near": self._nearest(frame.values)}
+        about |= self._classify(frame.values) | {"near": self._nearest(frame.values)}
         self._publish(about, jpeg(view, 85))
 
     def _classify(self, values: Array) -> dict[str, Any]:

@@ -257,6 +257,5 @@ def _json(value: Any, status: int = 200) -> Response:
 
 
 def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = 3 * 320) -> Response:
-    return Response(
-        jpeg(scale_down(picture, side), 90), media_type="image/jpeg", headers=_SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
-    )
+    headers = _SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
+    return Response(jpeg(scale_down(picture, side), 90), media_type="image/jpeg", headers=headers)

@@ -30,7 +30,7 @@ UNKNOWN = "unknown"  # the sensor of a folder or a film
 SIDE = 320  # pixels of the long side of a picture on the page
 _MOST_ROWS, _MOST_CLIPS, _MOST_CHOICES = 5000, 12, 500  # frames of a clip, clips of a touch, values of a filter
 _FILTERS = ("sensor", "object", "split", "dataset", "unit")
-_TINT = (128, 60, 0, 0)  # added to half the picture at contact
+_TINTED = (np.arange(256)[None, :, None] / 2 + (127, 60, 0)).astype(np.uint8)  # colours of contact
 
 
 class Table:
@@ -226,9 +226,9 @@ def touch_panels(frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold
         return view, float("nan")
     background = gel[0] if gel[0].shape == view.shape else cv2.resize(gel[0], (width, height))
     (difference,) = subtract_background([view], background)
-    mask = cv2.compare(cv2.resize(change, (width, height)), threshold, cv2.CMP_GT)
+    mask = (cv2.resize(change, (width, height)) > threshold).astype(np.uint8)
     contact = cv2.convertScaleAbs(view, alpha=1 / 3, beta=40)
-    cv2.copyTo(cv2.add(cv2.convertScaleAbs(view, alpha=1 / 2), _TINT), mask, contact)
+    cv2.copyTo(cv2.LUT(view, _TINTED), mask, contact)
     return cv2.hconcat([view, difference, contact]), contact_score(change)
 
 

@@ -28,7 +28,7 @@ def _ratio(row: dict[str, Any]) -> Value:
 
 
 def _machine(about: dict[str, Any]) -> str:
-    return f"{about['processor'].replace('(R)', '')}, {about['cores']} cores"
+    return f"{about['processor'].replace('(R)', '')}, {about['cores']} core{'s' * (about['cores'] > 1)}"
 
 
 def variants(folder: Path) -> Page:

@@ -124,4 +124,4 @@ def most_different(unit: UnitFrames, units: Sequence[UnitFrames]) -> UnitFrames 
         other for other in units
         if other is not unit and other.sensor == unit.sensor and other.frames[0].shape == unit.frames[0].shape
     ]  # fmt: skip
-    return max(rivals, key=lambda other: float(np.abs(other.look - unit.look).mean()), default=None)
+    return max(rivals, key=lambda other: float(cv2.absdiff(other.usual, unit.usual).mean()), default=None)

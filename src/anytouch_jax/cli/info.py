@@ -287,7 +287,7 @@ def _arrays(path: Path) -> list[str]:
             f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
             f"for features of {len(head.mean)} with --pooling {head.pooling} --frames {head.frames}, "
             f"encoder {head.fingerprint}",
-            "without calibration: save it again" if head.calibration is None else head.calibration.summary(),
+            *(head.promises() or ["without calibration: save it again"]),
         ]
     if not {"features", "rows"} <= arrays.keys():
         return []

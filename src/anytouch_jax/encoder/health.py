@@ -90,11 +90,6 @@ class UnitFrames:
         """The median of all recordings at 160 pixels: what never moves."""
         return np.median(np.stack(self.middles), axis=0).astype(np.uint8)
 
-    @cached_property
-    def look(self) -> Array:
-        """The colours of the usual picture at a few places, f32 (n,)."""
-        return _look(self.usual)
-
     def untouched(self) -> Array:
         """Return the background, or the usual picture without one."""
         return self.usual if self.background is None else self.background
@@ -382,7 +377,7 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
     own = np.sqrt(np.mean((looks - middle) ** 2, axis=1))
     for other in others:
         if other.frames[0].shape == unit.frames[0].shape and len(other.recordings) >= _FEWEST:
-            away = np.sqrt(np.mean((looks - other.look) ** 2, axis=1))
+            away = np.sqrt(np.mean((looks - _look(other.usual)) ** 2, axis=1))
             share = float(((own > LIMITS["two units"] / 2) & (away < 0.4 * own)).mean())
             if share >= _SHARE:
                 advice = "Sort them by unit. Left and right may be exchanged."

@@ -99,7 +99,9 @@ class LinearHead:
         known = self.calibration
         if known is None:
             return []
-        return [known.summary()] + [
+        sets, novel = f"the true class in {known.coverage:.0%} of touches", f"{known.false_alarms:.0%} of known touches"
+        about = f"calibrated on {known.recordings} groups (temperature {known.temperature:.2f})"
+        return [f"{about}: sets hold {sets}, {novel} are called novel"] + [
             f"{share:.0%} takes {int(np.ceil(share / (1 - share) - 1e-9))} groups or more. With fewer {what}."
             for limit, share, what in (
                 (known.set_limit, known.coverage, "sets hold every class"),
@@ -126,7 +128,7 @@ def save_head(path: str | Path, head: LinearHead) -> None:
     known = head.calibration
     arrays = {"mark" if name == "fingerprint" else name: value for name, value in vars(head).items()}
     del arrays["calibration"]
-    arrays |= {} if known is None else known.arrays()
+    arrays |= {} if known is None else {f"calibration/{name}": np.asarray(value) for name, value in vars(known).items()}
     with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, format=FORMATS[known is None], **arrays)
 

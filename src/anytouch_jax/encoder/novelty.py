@@ -51,19 +51,9 @@ class Calibration:
     references: Array
     sensors: Array
 
-    def summary(self) -> str:
-        """Return a sentence on what the limits promise."""
-        sets = f"sets hold the true class in {self.coverage:.0%} of touches"
-        novel = f"{self.false_alarms:.0%} of known touches are called novel"
-        return f"calibrated on {self.recordings} groups (temperature {self.temperature:.2f}): {sets}, {novel}"
-
     def novelty(self, x: Array) -> Array:
         """Return the novelty f64 (n,) of scaled features (n, d): about 0 for a training touch."""
         return novelty_scores(x @ self.whitening, self.references)
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the fields as arrays of an .npz file."""
-        return {f"calibration/{name}": np.asarray(value) for name, value in vars(self).items()}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, Array], width: int) -> Calibration | None:
@@ -190,9 +180,8 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     """Return the limit that a score of a new group is at most with probability `share`.
 
     `scores` (n,) are calibration scores of rows in `groups` (n,), which have equal weight. The limit covers each group
-    in turn by the others. It is at most the limit that holds however alike the rows of a group are, with one more group
-    that counts as infinite. Alone that one covers unlike rows too often, by up to 1 / groups. It is infinite below
-    share / (1 - share) groups. Raises UserError for a `share` outside 0..1.
+    in turn by the others. At most it is the limit for groups of equal rows, with one more group that is infinite. It is
+    infinite below share / (1 - share) groups. Raises UserError for a `share` outside 0..1.
     """
     if not 0 < share < 1:
         raise UserError(f"A coverage must lie between 0 and 1, not {share:g}.")
@@ -207,8 +196,7 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     own[by_group] = np.cumsum(weights[by_group]) - ids[by_group] / count  # mass of the row's group up to it
     below = (mass - own) * count / max(count - 1, 1)  # mass of the others below each row
     turn = np.argsort(below, kind="stable")
-    next_one = int(np.searchsorted(np.cumsum(weights[turn]), share - 1e-12)) + 1
-    level = below[turn][min(next_one, len(turn) - 1)]
+    level = below[turn][min(int(np.searchsorted(np.cumsum(weights[turn]), share - 1e-12)) + 1, len(turn) - 1)]
     return float(scores[min(place, int(np.searchsorted(mass, level - 1e-12)))])
 
 

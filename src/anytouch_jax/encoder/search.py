@@ -75,8 +75,7 @@ class TouchIndex:
             return nearest(self.values, query, count)
         cosines, ids = self.cells.search(query, count)
         missed = ids[:, -1] < 0  # the cells held fewer
-        if missed.any():
-            ids[missed], cosines[missed] = nearest(self.values, query[missed], count)
+        ids[missed], cosines[missed] = nearest(self.values, query[missed], count)
         return ids, cosines
 
     def check(self, source: str, fingerprint: str) -> None:

@@ -181,8 +181,7 @@ class Live:
         if not pictures:
             return
         picture = self._oriented(pictures[0])
-        sensor = self._sensor or UNIVERSAL
-        threshold = THRESHOLDS.get(sensor, DEFAULT_THRESHOLD)
+        threshold = THRESHOLDS.get(self._sensor or UNIVERSAL, DEFAULT_THRESHOLD)
         view, score = touch_panels(picture, self._gel, threshold)
         if self.recorder is not None:
             self.recorder.add(picture)

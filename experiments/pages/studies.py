@@ -342,29 +342,31 @@ def untouched_gel(folder: Path) -> Page:
     """Contact in recordings without a picture of the untouched gel."""
     path = folder / GELS
     rows: list[Any] = []
-    findings = []
+    findings, every = [], list[Mapping[str, int]]()
     for sensor, record in records_of(path).items():
-        shares = record["pressed"]
-        for share, ways in shares.items():
+        least: dict[str, list[float]] = {way: [100.0, 100.0] for way in WAYS}
+        for share, ways in record["pressed"].items():
             for way, one in ways.items():
-                right = 100 * one["right"] / one["frames"] if one["frames"] else None
                 low, high = binomtest(one["decided"], one["films"]).proportion_ci(method="wilson")
                 decided = Value(one["decided"] / one["films"], low, high).times(100)
+                right = 100 * one["right"] / one["frames"] if one["frames"] else 100.0
                 rows.append((sensor, f"{share} % pressed", way, decided, right, one["inverted"]))
-        least = {way: min(ways[way]["decided"] / ways[way]["films"] for ways in shares.values()) for way in WAYS}
+                least[way] = [min(*both) for both in zip(least[way], (decided.mean, right), strict=True)]
+                every.append(one)
+        alone, others, picture = least.values()
         findings.append(
-            f"`{sensor}`: at least {least[WAYS[0]]:.0%} are decided alone, and {least[WAYS[1]]:.0%} {WAYS[1]}."
+            f"`{sensor}`: at least {alone[0]:.0f} % of recordings are decided alone, and {others[0]:.0f} % "
+            f"{WAYS[1]}. At least {alone[1]:.0f} % of their frames are right alone, and {picture[1]:.0f} % {WAYS[2]}."
         )
-    every = [
-        one for record in records_of(path).values() for ways in record["pressed"].values() for one in ways.values()
-    ]
-    inverted, decided = (sum(one[name] for one in every) for name in ("inverted", "decided"))
-    findings.append(f"{inverted} of {decided:,} decided recordings are inverted.")
+    findings.append(
+        f"{sum(one['inverted'] for one in every)} of {sum(one['decided'] for one in every):,} are inverted."
+    )
     return Page(
         "untouched_gel", "Is contact found without a picture of the untouched gel?",
         "`anytouch data contact` estimates the untouched gel from the frames of a recording, or leaves the label "
-        "empty. Recordings are films of simulated frames, pressed for some share of the time. Light and noise "
-        f"change from frame to frame. A recording is decided {WAYS[0]}, or {WAYS[1]}, which are pressed as long.",
+        "empty. Recordings are films of simulated frames, pressed for some share of the time. Light and noise change "
+        "from frame to frame. A press is deeper than 0.08 mm, so some are too light to see. Each film is decided "
+        f"{WAYS[0]}, {WAYS[1]}, or {WAYS[2]}. Films of one unit are of different touches.",
         ("sensor", "recordings", "decided", Measure("decided, %", ".0f"), Measure("frames right, %", ".1f", False),
          Measure("inverted", ".0f", False)),
         rows, findings, (GELS,), "python -m experiments.benchmarks.untouched_gel MANIFEST",

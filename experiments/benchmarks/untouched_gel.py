@@ -1,6 +1,6 @@
 """Estimates of the untouched gel: how many recordings `anytouch data contact` decides, and how well.
 
-    anytouch data simulate --out data/units --touches 40 --sensors gelsight_mini digit gelsight 9dtact duragel gelslim \
+    anytouch data simulate --out data/units --touches 60 --sensors gelsight_mini digit gelsight 9dtact duragel gelslim \
         --units one --size 120 --seed 46
     python -m experiments.benchmarks.untouched_gel data/units/manifest.parquet
 

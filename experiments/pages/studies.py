@@ -364,8 +364,8 @@ def untouched_gel(folder: Path) -> Page:
     return Page(
         "untouched_gel", "Is contact found without a picture of the untouched gel?",
         "`anytouch data contact` estimates the untouched gel from the frames of a recording, or leaves the label "
-        "empty. Recordings are films of simulated frames, pressed for some share of the time. Light and noise change "
-        "from frame to frame. A press is deeper than 0.08 mm, so some are too light to see. Each film is decided "
+        "empty. Recordings are films of simulated frames of 120 pixels, pressed for some share of the time. Light and "
+        "noise change from frame to frame. A press is deeper than 0.08 mm, so some are too light to see. Each film is decided "
         f"{WAYS[0]}, {WAYS[1]}, or {WAYS[2]}. Films of one unit are of different touches.",
         ("sensor", "recordings", "decided", Measure("decided, %", ".0f"), Measure("frames right, %", ".1f", False),
          Measure("inverted", ".0f", False)),

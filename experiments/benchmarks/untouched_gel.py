@@ -31,7 +31,7 @@ from experiments.encoders.corpus import TOUCHED
 from experiments.records import write_record
 
 NAME = "untouched_gel.jsonl"
-WAYS = "alone", "with others of its unit", "with a picture of the gel"
+WAYS = "alone", "with a picture of the gel"
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def decided(table: manifests.Manifest, sensor: str, percent: int, options: GelOp
             "frame_index": numbers, "split": ["train"] * len(rows),
         }  # fmt: skip
         gels = [f"gel{film}.png" for film in films]
-        more = {}, {"unit": ["unit"] * len(rows)}, {"background_path": gels}
+        more: tuple[dict[str, list[str]], ...] = {}, {"background_path": gels}
         for way, others in zip(WAYS, more, strict=True):
             manifest = manifests.from_columns(columns | others, Path(folder) / "m.csv")
             score, limit = contact_scores(manifest).score, threshold_of_rows(manifest, None, 0.0)[0]

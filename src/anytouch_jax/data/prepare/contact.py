@@ -32,7 +32,7 @@ from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_co
 from anytouch_jax.data.manifest.schema import shown
 from anytouch_jax.data.prepare.scan import EXAMPLES
 from anytouch_jax.data.prepare.untouched_gel import (
-    ALIKE,
+    DIFFERENT,
     EDGE,
     UntouchedGel,
     estimate_untouched_gel,
@@ -301,7 +301,7 @@ def _estimates(
         rivals = by_shape.get(shape, []) if agreed is None else [agreed]
         if gel is None and agreed is not None:
             yield recording, agreed, "estimated from other recordings of the unit"
-        elif gel is not None and any(rival.score(gel.picture) >= ALIKE for rival in rivals):
+        elif gel is not None and any(rival.score(gel.picture) >= DIFFERENT for rival in rivals):
             yield recording, None, "recordings of its unit show different untouched gels"
         else:
             yield recording, gel, reason

@@ -177,7 +177,7 @@ class Live:
             self._publish({"error": str(error)}, b"")
 
     def _show(self, frame: Embedded) -> None:
-        pictures = [picture for number, picture in self._raw if number == frame.number]
+        pictures = [picture for number, picture in tuple(self._raw) if number == frame.number]
         if not pictures:
             return
         picture = self._oriented(pictures[0])

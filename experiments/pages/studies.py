@@ -21,6 +21,7 @@ from experiments.tables.by_object import gathered
 from experiments.translation.settings import OURS, PIXELS, TRANSLATIONS, one_table, runs_of
 
 PATCHES = {"": "plain", "_convolutional": "convolutional"}
+HELD_OUT = "held_out.jsonl"
 NAMED, UNNAMED = ("hardness", "roughness", "material"), "indenter"
 
 
@@ -99,17 +100,39 @@ def left_out(folder: Path) -> Page:
             rows.append((sensor, data, f"{patches} patches", title, by_objects(counts, right[best]), *change.values()))
             what = f"{sensor}, {data}, {patches} patches, {title}"
             findings += [compare("AnyTouch", "an untrained encoder", change["untrained"], what)]
+    found, also = _held_out(folder)
+    rows, findings = rows + found, findings + also
     return Page(
         "left_out", "Do features carry over to a sensor left out of training?",
-        "One sensor is left out of training. Its touches get the universal tokens. Linear probes read "
-        "the labels of its "
+        "One sensor is left out of training, DIGIT only of stage 2. Linear probes read the labels of its "
         "contact frames, on objects never touched in training. Captions name hardness, roughness and material. They do "
-        "not name the indenter. Intervals are over objects.",
+        "not name the indenter. How well these labels can be learned at all is on the page [named](named.md). "
+        "Intervals are over objects.",
         ("sensor", "training", "encoder", "label", Measure("AnyTouch, %"), Measure("minus untrained", "+.1f"),
          Measure("minus pixels", "+.1f")),
-        rows, findings, [f"{name}{suffix}.jsonl" for name in ("teaching", "named") for suffix in PATCHES],
+        rows, findings, [
+            *(f"{name}{suffix}.jsonl" for name in ("teaching", "named") for suffix in PATCHES),
+            *([HELD_OUT] if found else []),
+        ],
         "python -m experiments.tables.teaching",
     )  # fmt: skip
+
+
+def _held_out(folder: Path) -> tuple[list[tuple[Any, ...]], list[str]]:
+    """Return rows and findings of the recipe of the shipped encoder, with one sensor left out of stage 2."""
+    rows, findings = [], []
+    for sensor, record in (read_records(folder / HELD_OUT) if (folder / HELD_OUT).exists() else {}).items():
+        for label, scores in record["labels"].items():
+            change = {
+                name: Value(scores[name]["minus"], *scores[name]["minus_interval"]).times(100)
+                for name in ("untrained", "pixels")
+            }  # fmt: skip
+            ours = Value(scores["AnyTouch"]["share"], *scores["AnyTouch"]["interval"]).times(100)
+            words = (sensor.upper(), "stage 2 for minutes on a GPU", "convolutional patches", label)
+            rows.append((*words, ours, *change.values()))
+            what = f"{words[0]}, left out of stage 2, {label}"
+            findings.append(compare("AnyTouch", "an untrained encoder", change["untrained"], what))
+    return rows, findings
 
 
 def _left_out(folder: Path) -> Iterator[tuple[str, str, str, list[Mapping[str, Any]], str]]:
@@ -404,12 +427,13 @@ def lookalikes(folder: Path) -> Page:
     """The same touch by another sensor, among 50 that resemble it."""
     path = folder / "lookalikes.jsonl"
     rows, findings = [], []
-    for grade, record in sorted(records_of(path).items(), reverse=True):
-        scores = record["scores"]
+    for key, record in sorted(records_of(path).items(), reverse=True):
+        scores, sensor = record["scores"], record.get("left_out")
+        grade = key.partition(" ")[0] + " alignment" + (f", queries by {sensor}, left out of stage 2" if sensor else "")
         for name, one in sorted(scores.items(), key=lambda item: -item[1]["share"]):
-            rows.append((f"{grade} alignment", name, Value(one["share"], *one["interval"]).times(100)))
+            rows.append((grade, name, Value(one["share"], *one["interval"]).times(100)))
         findings += [
-            f"{grade} alignment: `{name}` names {100 * scores[name]['share']:.0f} % of the touches, pixels "
+            f"{grade}: `{name}` names {100 * scores[name]['share']:.0f} % of the touches, pixels "
             f"{100 * scores['pixels']['share']:.0f} %."
             for name in record["encoders"]
         ]

@@ -36,7 +36,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "pouring": ("pouring.jsonl", studies.pouring),
     "translation": ("translation.jsonl", studies.translation),
     "variants": (speed.VARIANTS, speed.variants),
-    "torch": (speed.TORCH[0], speed.torch),
+    "torch": (speed.TORCH, speed.torch),
     "memory": (speed.MEMORY, speed.memory),
     "search": (speed.SEARCH, speed.search),
     "view": (speed.VIEW, speed.view),

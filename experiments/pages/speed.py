@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,11 @@ import numpy as np
 from experiments.pages.page import Measure, Page, Value
 from experiments.records import read_records
 
-VARIANTS = "speed_stage1_stage2_embed_small.json"
-TORCH = ("torch_small.json", "torch_small_epyc_stage1.json", "torch_small_epyc.json", "torch_large.json")
-MEMORY, SIMULATOR = "memory_large.json", "simulator.jsonl"
-SEARCH, VIEW = "search.jsonl", "view.jsonl"
+VARIANTS, TORCH, MEMORY = "variants.jsonl", "torch.jsonl", "memory.jsonl"
+SIMULATOR, SEARCH, VIEW = "simulator.jsonl", "search.jsonl", "view.jsonl"
+RUNS = ("small", "small_epyc_stage1", "small_epyc", "large")  # of TORCH
 BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
 GIB = 2**30
-
-
-def _numbers(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
 def _ratio(row: dict[str, Any]) -> Value:
@@ -33,7 +27,7 @@ def _machine(about: dict[str, Any]) -> str:
 
 def variants(folder: Path) -> Page:
     """Variants of a step: time, error and memory."""
-    numbers = _numbers(folder / VARIANTS)
+    numbers = read_records(folder / VARIANTS)["small"]
     rows, ratios = [], {}
     for several in numbers["results"].values():
         for row in several:
@@ -62,8 +56,9 @@ def torch(folder: Path) -> Page:
     """Ours next to PyTorch."""
     names = ("ours, bfloat16", "PyTorch, eager float32", "PyTorch, eager bfloat16", "PyTorch, compiled bfloat16")
     rows, ratios = [], {name: [] for name in names}  # type: ignore[var-annotated]
-    for file in TORCH:
-        numbers = _numbers(folder / file)
+    records = read_records(folder / TORCH)
+    for run in RUNS:
+        numbers = records[run]
         for work, found in numbers["results"].items():
             by_name = {row["name"]: _ratio(row) for row in found["rows"]}
             rows.append((_machine(numbers["machine"]), numbers["preset"], work, *(by_name.get(name) for name in names)))
@@ -78,7 +73,7 @@ def torch(folder: Path) -> Page:
         "Both train and embed with the same weights, batches and masks, in turns. The value is the time as a share of "
         f"ours in float32. {BATCHES} From and to are quartiles.",
         ("machine", "preset", "work", *(Measure(name, ".2f") for name in names)),
-        rows, findings, TORCH, "make bench-torch",
+        rows, findings, (TORCH,), "make bench-torch",
     )  # fmt: skip
 
 
@@ -146,7 +141,7 @@ def view(folder: Path) -> Page:
 
 def memory(folder: Path) -> Page:
     """Memory and communication of a device."""
-    numbers = _numbers(folder / MEMORY)
+    numbers = read_records(folder / MEMORY)["large"]
     several = [row for one in numbers["results"].values() for row in one]
     rows = [
         (f"{row['devices']} device{'s' * (row['devices'] > 1)}", "split" if row["fsdp"] > 1 else "whole",

@@ -13,6 +13,7 @@ from anytouch_jax.weights import convert, load, safetensors
 from experiments.benchmarks import compilation, speed, workloads
 from experiments.benchmarks import run as bench
 from experiments.benchmarks.pytorch import run as pytorch
+from experiments.records import read_records
 from tests.support.release_keys import release_names
 
 RESULTS = EXPERIMENTS / "results"
@@ -119,8 +120,8 @@ def test_mistakes(tiny, tmp_path, capsys):
 def test_a_page_is_made_from_its_numbers_alone(tiny, tmp_path):
     assert run("embed", "--quick", "--out", tmp_path) == 0
     assert (tmp_path / "speed_embed_tiny.md").read_text() == bench.page_of(numbers_of(tmp_path, "embed_tiny"))
-    for name, page_of in (("speed_stage1_stage2_embed_small", bench.page_of), ("torch_small", pytorch.page_of)):
-        numbers = json.loads((RESULTS / f"{name}.json").read_text())
+    for name, page_of in (("variants", bench.page_of), ("torch", pytorch.page_of)):
+        numbers = read_records(RESULTS / f"{name}.jsonl")["small"]
         page = page_of(numbers)
         assert page.startswith("# ") and page == page_of(json.loads(json.dumps(numbers))), name
 

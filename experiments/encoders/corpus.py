@@ -23,7 +23,7 @@ from anytouch_jax.train.mesh import enable_compilation_cache
 
 SENSORS = ("gelsight_mini", "digit", "gelsight", "gelslim", "duragel", "9dtact")
 SHARD = 850  # touches, each by every sensor
-GRADES = ("fine", "fine", "coarse", "coarse")  # of one shard after the other
+GRADES = ("fine", "fine", "coarse", "fine")  # of one shard after the other
 TOUCHED = 0.08  # mm of the deepest point that count as contact
 
 

@@ -1,9 +1,10 @@
-"""Training of the encoder in the package: both stages, then the folder with its card.
+"""Training of the encoder in the package: stage 1, stage 2 in two parts, then the folder with its card.
 
     python -m experiments.encoders.train --corpus data/corpus --real a.csv b.csv --out runs/anytouch-tiny
 
 The same command again continues. The recipe is the paper's two losses. The pictures lie in the memory of the device
-(`resident.py`), which should be a GPU. `--without SENSOR` leaves a sensor out of stage 2, to test what carries over.
+(`resident.py`). The first two parts are for a GPU, the last one fits a CPU: stills only, small batches. `--without
+SENSOR` leaves a sensor out of stage 2, to test what carries over to it.
 """
 
 from __future__ import annotations
@@ -23,26 +24,33 @@ from experiments.encoders.resident import ResidentLoader
 
 NOTES = Path(__file__).with_name("anytouch-tiny.md")
 DATA = [
-    "--preset", "tiny", "--model.patch-encoder", "convolutional", "--batch", "256", "--data.background", "subtract",
-    "--data.contact-only", "--data.jitter", "0", "0", "0", "0", "--data.affine", "8", "0.04", "0.1",
-    "--run.figure-every", "0",
+    "--preset", "tiny", "--data.background", "subtract", "--data.contact-only", "--data.jitter", "0", "0", "0", "0",
+    "--data.affine", "8", "0.04", "0.1", "--run.figure-every", "0",
 ]  # fmt: skip
 SMALL = ("width=128", "depth=2", "heads=4", "mlp=512")  # the image tower: photographs are few and simple
 STAGE2 = [
-    *DATA, "--data.clip-share", "0.2", "--optim.layer-decay", "0.75", "--model.match-head", "cosine",
-    "--objective.match-weight", "8", "--objective.match-keep", "0.75",
+    *DATA, "--optim.layer-decay", "0.75", "--model.match-head", "cosine", "--objective.match-weight", "8",
     "--data.negatives", "same_sensor", "--model.text.stack.depth", "2",
     *(word for part in SMALL for word in (f"--model.image.{part.partition('=')[0]}", part.partition("=")[2])),
 ]  # fmt: skip
 
 
-# How often an epoch draws each real recording.
-REAL_SHARE = ["--data.weights", "incipient_slip-gelsight_mini_markers", "5", "gelslam-gelsight_mini", "10"]
-# Folder, stage, steps, options. Each part starts from the one before.
+def real_share(slip: int, press: int) -> list[str]:
+    """Return the options that say how often an epoch draws each real recording."""
+    return ["--data.weights", "incipient_slip-gelsight_mini_markers", str(slip), "gelslam-gelsight_mini", str(press)]
+
+
+# Folder, stage, steps, steps after which it stops, options, draws of real recordings. Each starts from the one before.
 PARTS = (
-    ("stage1", 1, 12000, [*DATA, "--optim.learning-rate", "1.5e-3", "--objective.norm-pix-loss"]),
-    ("stage2", 2, 12000, [*STAGE2, "--optim.learning-rate", "1e-3"]),
-)
+    ("stage1", 1, 12666, None,
+     [*DATA, "--batch", "256", "--optim.learning-rate", "1.5e-3", "--objective.norm-pix-loss"], real_share(10, 20)),
+    ("stage2-wide", 2, 2109, 175,
+     [*STAGE2, "--batch", "256", "--optim.learning-rate", "1e-3", "--objective.match-keep", "0.75",
+      "--data.clip-share", "0.2"], real_share(8, 20)),
+    ("stage2", 2, 850, None,
+     [*STAGE2, "--batch", "64", "--optim.learning-rate", "5e-4", "--optim.warmup", "30",
+      "--objective.match-keep", "0.5", "--data.clip-share", "0"], real_share(8, 20)),
+)  # fmt: skip
 
 
 def leave_out(manifest: Path, sensor: str) -> Path:
@@ -58,18 +66,22 @@ def main() -> None:
     parser.add_argument("--corpus", type=Path, required=True)
     parser.add_argument("--real", type=Path, nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--without", help="a sensor that stage 2 does not see")
+    parser.add_argument("--without", help="a simulated sensor that stage 2 does not see")
     parser.add_argument("--processes", type=int, default=2, help="processes that read the pictures")
     options = parser.parse_args()
-    shards, init = sorted(options.corpus.glob("*/manifest.parquet")), list[str]()
+    shards = sorted(options.corpus.glob("*/manifest.parquet"))
+    init: list[str] = []
     ResidentLoader.processes = options.processes
-    for folder, stage, steps, recipe in PARTS:
+    for folder, stage, steps, stop, recipe, share in PARTS:
         if stage == 2 and options.without:
-            shards = [leave_out(path, options.without) for path in shards]
-        data, run = [str(path) for path in (*shards, *options.real)], str(options.out / folder)
-        words = ["--stage", str(stage), "--data", *data, "--run", run, "--steps", str(steps), *recipe, *init]
-        request = train.parse(train.TrainOptions, "train", words + (REAL_SHARE if options.real else []))
-        result = pretrain(request.config, run, init=request.options.init, make_loader=ResidentLoader, log=log)
+            shards = [leave_out(path.with_name("manifest.parquet"), options.without) for path in shards]
+        data = [str(path) for path in (*shards, *options.real)]
+        run, more = str(options.out / folder), [*recipe, *(share if options.real else []), *init]
+        words = ["--stage", str(stage), "--data", *data, "--run", run, "--steps", str(steps), *more]
+        request = train.parse(train.TrainOptions, "train", words)
+        result = pretrain(
+            request.config, run, init=request.options.init, stop_after=stop, make_loader=ResidentLoader, log=log
+        )
         if result.interrupted:
             raise SystemExit(130)
         init = ["--init", run]

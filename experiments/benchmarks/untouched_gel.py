@@ -1,7 +1,7 @@
 """Estimates of the untouched gel: how many recordings `anytouch data contact` decides, and how well.
 
     anytouch data simulate --out data/units --touches 60 --sensors gelsight_mini digit gelsight 9dtact duragel gelslim \
-        --units one --size 120 --seed 46
+        --units one --size 240 --seed 46
     python -m experiments.benchmarks.untouched_gel data/units/manifest.parquet
 
 Films are made of simulated frames, pressed for some share of the time. Light and noise change from frame to frame. A
@@ -109,7 +109,8 @@ def run(options: GelOptions) -> int:
     table = manifests.read(options.data)
     for sensor in sorted(set(table.text_column("sensor"))):
         shares = {str(percent): decided(table, sensor, percent, options) for percent in options.pressed}
-        write_record(options.out, sensor, {"pressed": shares})
+        side = min(decode(table.file(int(np.flatnonzero(table.text_column("sensor") == sensor)[0]))).shape[:2])
+        write_record(options.out, f"{sensor}, {side} pixels", {"pressed": shares})
         rows = [(f"{share} %", way, *map(str, one.values())) for share, both in shares.items()
                 for way, one in both.items()]  # fmt: skip
         print(markdown_table((sensor, "way", "films", "decided", "frames", "right", "inverted"), rows), flush=True)

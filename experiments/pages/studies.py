@@ -387,8 +387,9 @@ def untouched_gel(folder: Path) -> Page:
     return Page(
         "untouched_gel", "Is contact found without a picture of the untouched gel?",
         "`anytouch data contact` estimates the untouched gel from the frames of a recording, or leaves the label "
-        "empty. Recordings are films of simulated frames of 120 pixels, pressed for some share of the time. Light and "
-        "noise change from frame to frame. A press is deeper than 0.08 mm, so some are too light to see. Each film is "
+        "empty. Recordings are films of simulated frames, pressed for some share of the time. Their short side is 120 "
+        "or 240 pixels. Light and noise change from frame to frame. A press is deeper than 0.08 mm, so some are too "
+        "light to see. Each film is "
         f"decided {WAYS[0]} or {WAYS[1]}.",
         ("sensor", "recordings", "decided", Measure("decided, %", ".0f"), Measure("frames right, %", ".1f", False),
          Measure("inverted", ".0f", False)),

@@ -77,10 +77,15 @@ def main() -> None:
         print(sentence, file=sys.stderr, flush=True)
 
     works = [work for what in options.what for work in workloads(what, options.preset, options.batch)]
+    rows_of = {work.name: variants_of(work, jax.default_backend()) for work in works}
+    names = {one.name for several in rows_of.values() for one in several}
+    if unknown := set(options.variants) - names:
+        parser.error(f"{', '.join(sorted(unknown))}: choose among {'; '.join(sorted(names))}")
     for work in works:
         try:
-            known = variants_of(work, jax.default_backend())
-            chosen = [one for one in known if one.name in options.variants] or known
+            chosen = [one for one in rows_of[work.name] if one.name in (options.variants or names)]
+            if not chosen:
+                continue
             result = speed.measure(
                 work, chosen, rounds=options.rounds, with_errors=not options.no_errors, peak_size=options.peak_size,
                 log=log,

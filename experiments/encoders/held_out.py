@@ -1,4 +1,4 @@
-"""What does stage 2 teach that carries over to a sensor it never saw? Linear probes of labels that captions name.
+"""Linear probes of a sensor that stage 2 left out: what carries over of the labels that captions name?
 
     python -m experiments.encoders.held_out --model runs/held_out/stage2 --sensor digit --data data/corpus/00*/*.parquet
 
@@ -25,7 +25,6 @@ from experiments.real.scores import recording_score
 from experiments.records import write_record
 
 LABELS = ("material", "hardness", "roughness", "indenter")
-PIXELS = "pixels"
 
 
 def main() -> None:
@@ -42,7 +41,7 @@ def main() -> None:
     encoders = {"AnyTouch": load(options.model), "untrained": load(UNTRAINED + options.model)}
     features = {
         name: embed_rows(one, table, rows, pooling="class", log=silent)[1] for name, one in encoders.items()
-    } | {PIXELS: background_difference(table, rows)}  # fmt: skip
+    } | {"pixels": background_difference(table, rows)}  # fmt: skip
     record = {
         "data": table.content_hash, "sensor": options.sensor, "encoder": encoders["AnyTouch"].fingerprint,
         "machine": dataclasses.asdict(machine.describe()), "recordings": int((columns["split"] == "test").sum()),

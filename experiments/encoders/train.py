@@ -54,7 +54,7 @@ PARTS = (
 
 
 def leave_out(manifest: Path, sensor: str) -> Path:
-    """Write the rows of the other sensors to a manifest beside this one, and return its path."""
+    """Write the rows of the other sensors to a manifest next to this one, and return its path."""
     table, path = pq.read_table(manifest), manifest.with_name(f"without_{sensor}.parquet")
     with atomic_path(path) as part:
         pq.write_table(table.filter(pc.not_equal(pc.cast(table["sensor"], "string"), sensor)), part)

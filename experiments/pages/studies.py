@@ -119,7 +119,7 @@ def left_out(folder: Path) -> Page:
 
 
 def _held_out(folder: Path) -> tuple[list[tuple[Any, ...]], list[str]]:
-    """Return rows and findings of the recipe of the shipped encoder, with one sensor left out of stage 2."""
+    """Return rows and findings of an encoder whose stage 2 on a GPU left one sensor out."""
     rows, findings = [], []
     for sensor, record in (read_records(folder / HELD_OUT) if (folder / HELD_OUT).exists() else {}).items():
         for label, scores in record["labels"].items():
@@ -442,7 +442,8 @@ def lookalikes(folder: Path) -> Page:
         "lookalikes", "Does the encoder in the package find the same touch by another sensor?",
         "Touches are simulated, of objects that training left out, by the six sensors of training. The right answer "
         "stands among 50 touches that resemble it most in place, depth and force. With fine alignment all sensors "
-        "touch in the same way. With coarse alignment each touches as by hand. Intervals are over objects.",
+        "touch in the same way. With coarse alignment each touches as by hand. Intervals are over objects. The rows "
+        "`convolutional` and `held_out` are other encoders, with convolutional patches.",
         ("touches", "features", Measure("recall@1, %")), rows, findings, (path.name,),
         "python -m experiments.encoders.lookalikes anytouch-tiny --fine data/corpus/00000 --coarse data/corpus/01700",
     )  # fmt: skip

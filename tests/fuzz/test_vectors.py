@@ -24,7 +24,7 @@ load = lru_cache(1)(load_encoder)
 
 
 def unit(x: Any, least: float = 0.0) -> Any:
-    """Return rows over their lengths in float64, a row of zeros as it is."""
+    """Return rows over their lengths in float64, a row of zeros unchanged."""
     x = np.asarray(x, np.float64)
     length = np.linalg.norm(x, axis=1, keepdims=True)
     return x / np.maximum(np.where(length > 0, length, 1.0), least)

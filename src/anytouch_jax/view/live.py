@@ -48,7 +48,7 @@ class LoopedFilm:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._video, self._due = path, open_video(path), 0.0
+        self._path, self._video, self._due = path.absolute(), open_video(path), 0.0
         rate = self._video.get(cv2.CAP_PROP_FPS)
         self._period = 1 / rate if 1 <= rate <= 240 else 1 / 30
 

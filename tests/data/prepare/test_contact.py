@@ -194,6 +194,19 @@ def test_a_recording_that_contradicts_its_unit_is_undecided(world):
     assert contact == more
 
 
+def test_a_worn_gel_does_not_contradict_its_unit(world):
+    first, _ = film("a", 0.5, unit="u")
+    second, _ = film("b", 0.5, "bar", unit="u")
+    worn, _ = film("c", 0.5, "pins", unit="u")
+    rng = np.random.default_rng(0)
+    dirt = cv2.GaussianBlur(rng.normal(0, 1, gel_frame("dotted", 0).shape).astype(np.float32), (0, 0), 6)
+    for size, decided in ((10, 3), (18, 2)):  # they differ by 5.4, slight wear, and by 9.5, another gel
+        marked = [(name, np.clip(picture + size * dirt / np.abs(dirt).max(), 0, 255).astype(np.uint8), cells)
+                  for name, picture, cells in worn]  # fmt: skip
+        scores = c.contact_scores(world(first + second + marked))
+        assert scores.decided == decided
+
+
 def test_a_picture_of_the_untouched_gel_decides_what_the_frames_cannot(world, tmp_path):
     always, _ = film("a", 1.0, unit="u")
     other, _ = film("b", 1.0, "bar", unit="v")

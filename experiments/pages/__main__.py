@@ -36,6 +36,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "pouring": ("pouring.jsonl", studies.pouring),
     "translation": ("translation.jsonl", studies.translation),
     "variants": (speed.VARIANTS, speed.variants),
+    "versions": (speed.VERSIONS, speed.versions),
     "torch": (speed.TORCH, speed.torch),
     "memory": (speed.MEMORY, speed.memory),
     "search": (speed.SEARCH, speed.search),

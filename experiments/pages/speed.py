@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from experiments.benchmarks.versions import WORKS
 from experiments.pages.page import Measure, Page, Value
 from experiments.records import read_records
 
 VARIANTS, TORCH, MEMORY = "variants.jsonl", "torch.jsonl", "memory.jsonl"
-SIMULATOR, SEARCH, VIEW = "simulator.jsonl", "search.jsonl", "view.jsonl"
+SIMULATOR, SEARCH, VIEW, VERSIONS = "simulator.jsonl", "search.jsonl", "view.jsonl", "versions.jsonl"
 RUNS = ("small", "small_epyc_stage1", "small_epyc", "large")  # of TORCH
 BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
 GIB = 2**30
@@ -49,6 +50,36 @@ def variants(folder: Path) -> Page:
          Measure("error", ".0e", False),
          Measure("memory, MiB", ".0f", False)),
         rows, findings, (VARIANTS,), 'make bench WHAT="stage1 stage2 embed" PRESET=small',
+    )  # fmt: skip
+
+
+def versions(folder: Path) -> Page:
+    """Versions of jax and flags of its compiler."""
+    records = [*read_records(folder / VERSIONS).values()]
+    base = records[0]["version"]
+    records.sort(key=lambda one: (WORKS.index(one["work"]), one["dtype"] != "float32", one["version"]))
+    rows, ratios = [], {}
+    for one in records:
+        ratio = Value(one["ratio"], one["ratio_low"], one["ratio_high"])
+        error = one["error"].get("gradient", one["error"]["output"])
+        rows.append((one["work"], one["dtype"], one["version"], one["ms"], ratio, error, one["temp_bytes"] / 2**20,
+                     str(one["onednn"])))  # fmt: skip
+        ratios.setdefault((one["version"], one["dtype"]), []).append(one["ratio"])
+    findings = [
+        f"{version}, {dtype}: {min(several):.2f} to {max(several):.2f} of the time of {base}."
+        for (version, dtype), several in ratios.items()
+        if version != base
+    ]
+    return Page(
+        "versions",
+        "Which version of jax, and which flags of its compiler?",
+        f"Each version is a process, and the processes take turns ({_machine(records[0]['machine'])}, preset "
+        f"{records[0]['preset']}). The ratio is to {base} without flags, in the same type. The error is that of the "
+        "gradient, or of the output of an embedding, against float64. From and to are quartiles. YNNPACK is a library "
+        "of products that jax uses on a CPU by default, and the flag oneDNN puts another in its place.",
+        ("work", "type", "version", Measure("ms", ".1f", False), Measure("time / baseline", ".2f"),
+         Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False), "calls of oneDNN"),
+        rows, findings, (VERSIONS,), "python -m experiments.benchmarks.versions --python PATH",
     )  # fmt: skip
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -116,7 +118,8 @@ def test_frames_of_parquet_and_film_have_the_indices_and_times_of_the_data_set(r
 
 def test_films_in_av1_need_the_extra(root, monkeypatch):
     av = pytest.importorskip("av")
-    for file in (root / "videos" / FILM / "chunk-000").glob("*.mp4"):
+
+    def encode(file):
         values = [int(frame.mean()) for frame in frames_from_video(file)]
         with av.open(file, "w") as film:
             stream = film.add_stream("libsvtav1", FPS)
@@ -124,6 +127,11 @@ def test_films_in_av1_need_the_extra(root, monkeypatch):
             for value in values:
                 film.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64, 3), value, np.uint8), "rgb24")))
             film.mux(stream.encode())
+
+    before = os.sched_getscheduler(0)
+    with ThreadPoolExecutor(1) as pool:  # for root, the encoder gives its thread the highest priority of the system
+        list(pool.map(encode, (root / "videos" / FILM / "chunk-000").glob("*.mp4")))
+    assert os.sched_getscheduler(0) == before
     with monkeypatch.context() as changed, pytest.raises(UserError, match=r"anytouch_jax\[lerobot\]"):
         changed.setitem(sys.modules, "av", None)
         rows_of(root, keys=(FILM,), export=True)

@@ -466,8 +466,10 @@ def test_the_loss_of_preset_tiny_falls_on_a_fixed_batch(stage):
     assert int(state.step) == 12 and np.isfinite(losses).all()
 
 
-@pytest.mark.parametrize("devices", [2, 4])
-@pytest.mark.parametrize("stage", [1, 2])
+@pytest.mark.parametrize(
+    ("stage", "devices"),
+    [(1, 2), pytest.param(1, 4, marks=pytest.mark.slow), pytest.param(2, 2, marks=pytest.mark.slow), (2, 4)],
+)
 def test_devices_share_the_batch_and_change_nothing(stage, devices):
     (one, wanted), (many, result) = steps(stage, 1, 2), steps(stage, devices, 2)
     for a, b in zip(result, wanted, strict=True):

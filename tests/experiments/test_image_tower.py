@@ -30,6 +30,7 @@ def stored(folder, config, params):
 
 
 @pytest.mark.parametrize("rank", [0, 2])
+@pytest.mark.slow
 def test_a_still_gives_the_towers_own_embedding(tmp_path, rank):
     config = run_config(tmp_path, 2, towers="pretrained" if rank else "scratch")
     net = build(config.model)

@@ -47,6 +47,7 @@ def test_another_page_and_a_measurement_are_not_replaced(numbers, tiny, tmp_path
     assert "--out" in capsys.readouterr().err and page.read_text() == "as it was"
 
 
+@pytest.mark.slow
 def test_a_table_of_numbers_of_words_and_a_figure(tiny, tmp_path, capsys):
     assert run("embed", "--quick", "--out", tmp_path) == 0
     text, numbers = (tmp_path / "speed_embed_tiny.md").read_text(), numbers_of(tmp_path, "embed_tiny")
@@ -60,6 +61,7 @@ def test_a_table_of_numbers_of_words_and_a_figure(tiny, tmp_path, capsys):
     assert "| bfloat16 | 1 |" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_what_was_measured_outlives_what_fails_later(tiny, tmp_path, capsys, monkeypatch):
     def fail(*_):
         raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
@@ -117,6 +119,7 @@ def test_mistakes(tiny, tmp_path, capsys):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_page_is_made_from_its_numbers_alone(tiny, tmp_path):
     assert run("embed", "--quick", "--out", tmp_path) == 0
     assert (tmp_path / "speed_embed_tiny.md").read_text() == bench.page_of(numbers_of(tmp_path, "embed_tiny"))

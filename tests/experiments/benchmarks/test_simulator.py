@@ -62,6 +62,7 @@ def test_only_what_a_touch_changes_is_scored():
     assert simulator._picture_error(result, right, bare) == 2 and simulator._picture_error(result, bare, bare) == 0
 
 
+@pytest.mark.slow
 def test_shear_moves_the_markers_of_the_picture():
     still, pushed = np.zeros((32, 32)), np.full((32, 32), 0.1)
     aside = np.zeros((32, 32, 2))

@@ -68,6 +68,7 @@ def noise_of(work):
     pytest.param(Workload("stage2 match", shallow(preset("small", stage=2)), 4, 3), marks=pytest.mark.slow),
     Workload("embed", shallow(preset("small")), 2, 3),
 ], ids=lambda work: work.name)  # fmt: skip
+@pytest.mark.slow
 def test_useful_operations_are_nearly_all_that_xla_counts(work):
     batch, net = normalised(make_batch(work)), build(work.config.model)
     one, two = (
@@ -90,6 +91,7 @@ def test_operations_of_a_loop_count_for_each_turn():
     assert products(jaxpr.jaxpr) == 5 * 2 * 2 * 3 * 3
 
 
+@pytest.mark.slow
 def test_slots_remat_and_precision_are_no_useful_operations():
     model = replace(ALIGN.config.model, remat=True, dtype="bfloat16", attention="mapped")
     other = replace(ALIGN, config=replace(ALIGN.config, model=model), dense=True)
@@ -107,6 +109,7 @@ def test_the_compiled_encoder_of_preset_large_costs_at_most_27_percent_of_the_un
     assert 0.2 < masked / whole <= 0.27
 
 
+@pytest.mark.slow
 def test_a_batch_without_vision_costs_nothing_for_the_image_tower():
     config = shallow(preset("tiny", stage=2))
     work, net = Workload("stage2 align", config, 4, 3), build(config.model)
@@ -140,6 +143,7 @@ def test_a_batch_is_the_same_for_the_same_seed_and_has_the_shares_it_says():
     assert make_batch(names["stage1 stills"]).clip.shape == (8, 1, 112, 112, 3)
 
 
+@pytest.mark.slow
 def test_dense_slots_give_the_same_loss():
     dense = replace(ALIGN, dense=True)
     assert make_batch(dense).align.image.shape[0] == 8
@@ -161,6 +165,7 @@ def test_relative_is_the_norm_of_the_difference():
 
 
 @pytest.mark.parametrize("work", [pytest.param(STAGE1, marks=pytest.mark.slow), MATCH], ids=lambda w: w.name)
+@pytest.mark.slow
 def test_errors_are_rounding_in_float32_and_coarser_in_bfloat16(work):
     params = build(work.config.model).init(jax.random.key(0))
     single, half = speed.errors(FAST, work, params)
@@ -177,6 +182,7 @@ def test_the_reference_is_float64_and_nothing_else_becomes_so():
     assert [speed.widened(np.zeros(1, kind)).dtype for kind in (np.float32, np.int32)] == [np.float64, np.int32]
 
 
+@pytest.mark.slow
 def test_the_output_of_stage_1_belongs_to_its_loss():
     params = build(STAGE1.config.model).init(jax.random.key(0))
     batch, noise = normalised(make_batch(STAGE1)), jnp.asarray(np.random.default_rng(0).random((4, 16)), jnp.float32)
@@ -188,6 +194,7 @@ def test_the_output_of_stage_1_belongs_to_its_loss():
     np.testing.assert_allclose(values["loss"], error[..., :3].mean(-1)[hidden].mean() + error[..., 3].mean(), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_other_gelu_is_another_program_only_while_it_is_traced():
     args = abstract_state(STAGE1.config), shapes(make_batch(STAGE1)), jax.eval_shape(lambda: jax.random.key(0))
 
@@ -250,6 +257,7 @@ def test_a_step_is_measured_and_what_does_not_run_here_is_a_row_with_a_note():
     json.dumps([speed.record_of(row) for row in rows], allow_nan=False)
 
 
+@pytest.mark.slow
 def test_an_embedding_is_measured_from_pixels_on_the_host():
     one = EMBED.resized(1)
     rows = speed.measure(one, FAST, rounds=2, peak_size=64)

@@ -51,6 +51,7 @@ def test_a_manifest_without_a_sensor(tmp_path):
     assert left.file(0).exists()
 
 
+@pytest.mark.slow
 def test_probes_of_a_sensor_left_out(tmp_path, monkeypatch):
     """Features that hold a label read it on new objects, and noise does not."""
     data = make_touches(tmp_path / "data", touches={"test": 30, "train": 60, "val": 20}, frames=1)

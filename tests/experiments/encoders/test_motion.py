@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import jax
 import numpy as np
+import pytest
 
 from experiments.encoders import motion
 
 RNG = np.random.default_rng(0)
 
 
+@pytest.mark.slow
 def test_two_frames_in_the_other_order_turn_the_other_way():
     params = motion.init(8)
     params |= {name: jax.random.normal(jax.random.key(1), params[name].shape) for name in ("place", "scale", "bias")}
@@ -21,6 +23,7 @@ def test_two_frames_in_the_other_order_turn_the_other_way():
     assert np.abs(turn).max() > 0.01
 
 
+@pytest.mark.slow
 def test_it_learns_a_field_that_no_mean_shows():
     """The first two values of a token change with the field of a turn, whose mean over the picture is zero."""
     n, side = 300, 4

@@ -14,6 +14,8 @@ from anytouch_jax.sim.sensing.sensors import unit_gel
 from experiments.pouring import physics, render
 from experiments.pouring.physics import Load, Task
 
+pytestmark = pytest.mark.slow
+
 SIDE = 56
 
 

@@ -20,6 +20,8 @@ from experiments.pouring.physics import POUR, RETRACT, WAIT, Task
 from experiments.pouring.policy import Learning
 from experiments.pouring.trials import START
 
+pytestmark = pytest.mark.slow
+
 TASK, SIDE = Task(), 28
 FAST = Learning(steps=600, width=32, tune_steps=2, tune_runs=2)
 

@@ -103,6 +103,7 @@ def test_the_page_has_every_row_and_refuses_mixed_data(data, tmp_path):
         real(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_small_network_learns_what_the_pictures_show(data, monkeypatch):
     """Objects differ by their colour. A shift moves no colour."""
     y = np.searchsorted(data.names, data.object)

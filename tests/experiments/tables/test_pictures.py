@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 import synthetic
 
 from experiments.tables import pictures, plan
@@ -12,6 +13,7 @@ from experiments.tables.results import read
 LEAVES = plan.leaves(plan.FULL)
 
 
+@pytest.mark.slow
 def test_every_picture_is_drawn(tmp_path):
     synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.seed < 2])
     runs = read(tmp_path / "matrix.jsonl")
@@ -33,6 +35,7 @@ def test_the_four_spaces_have_a_mark_for_every_touch_and_sensor(tmp_path):
     assert len(hues) > 8  # a colour a touch
 
 
+@pytest.mark.slow
 def test_the_four_spaces_are_of_one_seed(tmp_path):
     synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed != 0])
     runs = [run for run in read(tmp_path / "matrix.jsonl") if (run.name, run.seed) != ("masked", 1)]
@@ -44,6 +47,7 @@ def test_the_four_spaces_are_of_one_seed(tmp_path):
     assert pictures.q2(apart, tmp_path / "c.png") is None
 
 
+@pytest.mark.slow
 def test_a_touch_without_points_in_one_space_is_left_out_of_it(tmp_path):
     synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed == 0])
     runs = read(tmp_path / "matrix.jsonl")

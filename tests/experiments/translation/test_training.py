@@ -36,6 +36,8 @@ from experiments.translation.generator import (
 from experiments.translation.networks import STATES, Conv, Translation, UNet, doubled, halved, thumbnail_side
 from experiments.translation.pictures import picture_grid
 
+pytestmark = pytest.mark.slow
+
 X, Y, FIELDS = arrays(24)
 ENCODER = random_encoder(tiny_config())
 MODEL = ENCODER.config.model
@@ -64,7 +66,7 @@ def regressed() -> Generator:
 
 @pytest.mark.parametrize(
     ("tune", "adversarial"),
-    [("frozen", 0.0), ("frozen", 0.05), pytest.param("fine", 0.05, marks=pytest.mark.slow)],
+    [("frozen", 0.0), ("frozen", 0.05), ("fine", 0.05)],
     ids=["frozen", "critic", "fine"],
 )
 def test_the_error_falls_on_a_fixed_batch(tune, adversarial):

@@ -8,7 +8,6 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.made
 TORCH  := .venv-torch
-ONNX   := .venv-onnx
 DOCS   := .venv-docs
 
 PRESET     ?= tiny
@@ -34,9 +33,7 @@ DEMO_STEPS ?= 200
 DEMO_STEPS1 ?= 400
 
 train-stage1: RUN ?= runs/stage1
-train-stage2 probe export-onnx: RUN ?= runs/stage2
-export-onnx: OUT ?= encoder.onnx
-export-onnx: FRAMES ?= 1
+train-stage2 probe: RUN ?= runs/stage2
 
 # The demo learns from scratch in minutes on two cores: small towers, contact frames less the untouched gel, and each
 # touch against all others of its batch (experiments/tables/teaching.py says why).
@@ -56,7 +53,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu compare pouring translation long-clips export-onnx experiments results notebooks corpus weights figures release-check docs clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu compare pouring translation long-clips experiments results notebooks corpus weights figures release-check docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -137,10 +134,6 @@ long-clips: RUN ?= runs/stage2
 long-clips: $(STAMP) $(scenes) ## longer clips, what they add and what they cost: [RUN= DATA= QUICK=1 OUT=]
 	RUN="$(RUN)" DATA="$(DATA)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.tables.long_clips
 
-export-onnx: $(ONNX)/.made
-export-onnx: $(STAMP) ## a run's touch encoder as ONNX, checked, in a separate venv: RUN= OUT= [FRAMES=1]
-	$(PY) -m experiments.onnx_export.run --run $(RUN) --out $(OUT) --frames $(FRAMES) --python $(ONNX)/bin/python
-
 experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
 	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
 
@@ -173,7 +166,7 @@ docs: $(STAMP) ## the documentation site, in build/site, in a separate venv
 	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
 
 clean: ## remove .venv, builds and caches; runs stay
-	rm -rf $(VENV) $(TORCH) $(ONNX) $(DOCS) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(TORCH) $(DOCS) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SCENES)/manifest.parquet: | $(STAMP)
@@ -183,12 +176,6 @@ $(TORCH)/.made: experiments/benchmarks/pytorch/requirements.txt
 	$(PYTHON) -m venv $(TORCH)
 	@echo '*' > $(TORCH)/.gitignore
 	$(TORCH)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
-	@touch $@
-
-$(ONNX)/.made: experiments/onnx_export/requirements.txt
-	$(PYTHON) -m venv $(ONNX)
-	@echo '*' > $(ONNX)/.gitignore
-	$(ONNX)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
 $(DOCS)/.made: docs/requirements.txt

@@ -41,6 +41,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "memory": (speed.MEMORY, speed.memory),
     "search": (speed.SEARCH, speed.search),
     "view": (speed.VIEW, speed.view),
+    "engines": (speed.ENGINES, speed.engines),
     "photometry": (speed.SIMULATOR, speed.photometry),
     "contact": (speed.SIMULATOR, speed.contact),
     "compare": (COMPARED, compare_encoders),

@@ -13,6 +13,7 @@ from experiments.records import read_records
 
 VARIANTS, TORCH, MEMORY = "variants.jsonl", "torch.jsonl", "memory.jsonl"
 SIMULATOR, SEARCH, VIEW, VERSIONS = "simulator.jsonl", "search.jsonl", "view.jsonl", "versions.jsonl"
+ENGINES = "engines.jsonl"
 RUNS = ("small", "small_epyc_stage1", "small_epyc", "large")  # of TORCH
 BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
 GIB = 2**30
@@ -168,6 +169,59 @@ def view(folder: Path) -> Page:
         rows, findings, (VIEW,),
         "python -m experiments.benchmarks.view FILM --with MANIFEST FEATURES --head HEAD",
     )  # fmt: skip
+
+
+def engines(folder: Path) -> Page:
+    """One encoder on several engines."""
+    records = [one for one in read_records(folder / ENGINES).values() if "p50_ms" in one and "error" in one]
+    live = {one["encoder"]: one for one in records if one["engine"] == "XLA, float32"}
+
+    def change(one: dict[str, Any], name: str) -> float | None:
+        return 100 * (one[name] - live[one["encoder"]][name]) if name in one else None
+
+    rows: list[Any] = [
+        (one["encoder"], one["engine"], one["p50_ms"], one["p99_ms"], Value(one["ratio"]), one["per_s"],
+         one["start_s"], one["memory_mib"], one["error"], change(one, "accuracy"), change(one, "recall"))
+        for one in records
+    ]  # fmt: skip
+    findings = []
+    for name, base in live.items():
+        own = [one for one in records if one["encoder"] == name]
+        best = min(own, key=lambda one: one["p50_ms"])
+        findings.append(
+            f"{name}: {best['engine']} is the fastest, with {best['p50_ms']:.1f} ms at the median and "
+            f"{best['p99_ms']:.1f} ms at the 99th percentile. XLA in float32 takes {base['p50_ms']:.1f} and "
+            f"{base['p99_ms']:.1f} ms."
+        )
+    if small := [one for one in records if one["encoder"] == "small"]:
+        met = any(one["p50_ms"] < 15 and one["p99_ms"] < 25 for one in small)
+        findings.append(f"small: the goal of 15 and 25 ms is {'met' if met else 'missed'}.")
+    findings += [_fused(one) for one in records if one["encoder"] == "small" and "kinds" in one]
+    first = records[0]
+    known = live["anytouch-tiny"]
+    return Page(
+        "engines",
+        "Which engine embeds touch fastest?",
+        f"One exported encoder runs on several engines, with {first['machine']['cores']} threads each "
+        f"({_machine(first['machine'])}). Engines take turns, one still at a time, {first['rounds']} times. `small` "
+        "(384 wide, 224 pixels) and `demo` (128 wide, 84 pixels) are untrained. Batches have 16 touches. Start is from "
+        "the imported package to the first features, in a fresh process. Memory is what that process grew by. Error is "
+        "the largest difference as a share of the largest feature. int8 is calibrated on 200 other touches. On "
+        f"simulated objects held out, `anytouch-tiny` names the indenter of {100 * known['accuracy']:.1f} %. Its "
+        f"recall@1 is {100 * known['recall']:.1f} %, among 50 look-alikes by another sensor. The last columns are "
+        "changes from that, in points.",
+        ("encoder", "engine", Measure("p50, ms", ".1f", False), Measure("p99, ms", ".1f", False),
+         Measure("time / XLA float32", ".2f"), Measure("touches/s in batches", ".0f", False),
+         Measure("start, s", ".1f", False), Measure("memory, MiB", ".0f", False), Measure("error", ".0e", False),
+         Measure("accuracy", "+.1f", False), Measure("recall@1", "+.1f", False)),
+        rows, findings, (ENGINES,), "python -m experiments.benchmarks.engines time --corpus MANIFEST",
+    )  # fmt: skip
+
+
+def _fused(one: dict[str, Any]) -> str:
+    """Return a sentence about the operations in the program of an engine."""
+    kinds = [f"{count} {kind}" for kind, count in one["kinds"].items()][:6]
+    return f"{one['engine']} runs {sum(one['kinds'].values())} operations at small: most are {', '.join(kinds)}."
 
 
 def memory(folder: Path) -> Page:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import stat
 from dataclasses import replace
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -48,6 +49,44 @@ def test_the_file_for_jax_gives_the_features_of_the_live_model(anytouch, tmp_pat
     np.testing.assert_allclose(export.load(out)(frames, "digit"), live, atol=1e-5)
     assert anytouch("export", "--model", tiny_run, "--out", out, "--dtype", "bfloat16").status == 0
     assert 1e-5 < np.abs(export.load(out)(frames, "digit") - live).max() / np.abs(live).max() < 0.05
+
+
+def test_a_file_for_engines_embeds_and_streams_like_the_run(anytouch, tmp_path, tiny_run):
+    pytest.importorskip("onnxruntime")
+    rng, out, plain = np.random.default_rng(0), tmp_path / "model.onnx", tmp_path / "plain.npz"
+    for number in range(200):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), rng.integers(0, 256, (28, 28, 3), np.uint8))
+    rows = "".join(f"{number}.png,digit,s,{number},train\n" for number in range(200))
+    table = tmp_path / "table.csv"
+    table.write_text(f"path,sensor,sequence,frame_index,split\n{rows}")
+    done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", out)
+    assert done.status == 0 and f"{out}.json" in done.out, done
+    assert anytouch("embed", "--model", tiny_run, "--data", table, "--out", plain).status == 0
+    with np.load(plain) as file:
+        live = file["features"]
+    small = tmp_path / "int8.onnx"
+    done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", small, "--int8", "--data", table)
+    assert done.status == 0 and "in int8" in done.out and "on 200 touches" in done.out, done
+    for model, tolerance in ((out, 1e-5), (small, 0.1)):
+        made = tmp_path / f"{model.stem}.npz"
+        assert anytouch("embed", "--model", model, "--data", table, "--out", made).status == 0
+        with np.load(made) as file:
+            assert np.abs(file["features"] - live).max() < tolerance * np.abs(live).max()
+            assert str(file["about/weights"]) == load_encoder(tiny_run).fingerprint
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10, (28, 28))
+    for number in range(3):
+        writer.write(cv2.imread(str(tmp_path / f"{number}.png")))
+    writer.release()
+    found = []
+    for words in (("--model", tiny_run), ("--model", tiny_run, "--engine", "onnxruntime"), ("--model", out)):
+        made = tmp_path / f"stream{len(found)}.npz"
+        assert anytouch("stream", *words, "--data", film, "--sensor", "digit", "--out", made).status == 0
+        with np.load(made) as file:
+            found.append(file["features"])
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-5)
+    done = anytouch("stream", "--model", out, "--engine", "xla", "--data", film, "--out", tmp_path / "no.npz")
+    assert done.status == 2 and "not on xla" in done.err and not (tmp_path / "no.npz").exists()
 
 
 def test_a_difference_from_the_live_model_is_a_failed_check(anytouch, tmp_path, tiny_run, monkeypatch):
@@ -122,6 +161,12 @@ def test_a_run_between_itself_is_itself(tiny_run, tmp_path, weights):
         (["--out", "m.bin", "--join", "sum"], "--join"),
         (["--out", "m.bin", "--share", 0.3], "--share"),
         (["--out", "afile/m.bin"], "--out"),
+        (["--out", "m.onnx", "--int8"], "--int8 has no effect with --to jax"),
+        (["--out", "m.onnx", "--to", "onnx", "--int8"], "--int8 and --data"),
+        (["--out", "m.onnx", "--to", "onnx", "--data", "few.csv"], "--int8 and --data"),
+        (["--out", "m.onnx", "--to", "onnx", "--int8", "--data", "few.csv"], "needs 200 touches and --data has 3"),
+        (["--out", "m.onnx", "--to", "onnx", "--dtype", "bfloat16"], "--dtype"),
+        (["--out", "m.bin", "--to", "onnx"], ".onnx"),
         (["--out", "w.bin", "--to", "release"], ".safetensors"),
         (["--out", "w.safetensors", "--to", "release"], "--to safetensors"),  # it lacks a decoder
         (["--out", "w.safetensors", "--to", "release", "--model", "gone.pth"], "gone.pth"),
@@ -141,6 +186,8 @@ def test_mistakes_write_nothing(two, tmp_path, mistake, monkeypatch, words, name
     write(tmp_path / "eps.safetensors", replace(touch_model(), norm_eps=1e-3), params)
     write(tmp_path / "gel.safetensors", touch_model(), params, **{safetensors.BACKGROUND_KEY: "subtract"})
     (tmp_path / "afile").write_text("")
+    rows = "".join(f"{number}.png,digit,s,{number},train\n" for number in range(3))
+    (tmp_path / "few.csv").write_text(f"path,sensor,sequence,frame_index,split\n{rows}")
     before = sorted(tmp_path.iterdir())
     model = [] if "--model" in words else ["--model", "b.safetensors"]
     assert named in mistake("export", *model, *words)

@@ -171,7 +171,7 @@ NOT_RUN = {
     "demo": "it trains for minutes, and the tests above read its commands",
     "bench": "it measures for minutes, and tests/experiments/benchmarks runs its parts",
     "compare": "it measures encoders of full size, and test_compare.py runs a small one",
-    "docs": "it installs packages from the network", "export-onnx": "it installs packages from the network",
+    "docs": "it installs packages from the network",
 }  # fmt: skip
 SMALL = " ".join(f"--{name} {value}" for name, value in SIZES.items())
 RUN = {

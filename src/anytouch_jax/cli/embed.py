@@ -200,13 +200,7 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
 
     manifest = manifests.read(options.data)
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
-    fields = np.isin(embedding.text_column(manifest, "sensor")[rows], FIELD_SENSORS)
-    if fields.any():
-        log(f"{fields.sum()} rows of force-field sensors have no images and are left out")
-        rows = rows[~fields]
-    usable = rows if options.frames == 1 else np.intersect1d(rows, manifest.clips(options.frames)[:, -1])
-    if len(usable) < len(rows):
-        log(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {options.frames} frames and are left out")
+    usable = usable_rows(manifest, rows, options.frames)
     rows, values = embedding.embed_rows(
         encoder, manifest, usable, options.frames, pooling, options.join, batch=options.batch,
         on_bad_sample=options.on_bad_sample, log=log,
@@ -218,6 +212,22 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
     keys |= {name: embedding.plain_column(manifest, name)[rows] for name in more}
     touched = {} if options.head is None else {"contact": contact_of_rows(manifest, rows)}
     return embedding.Features(values, rows, keys, len(usable) - len(rows), touched)
+
+
+def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray:
+    """Return those of `rows` that have images and end a clip of `frames` frames; log how many others there are."""
+    import numpy as np
+
+    from anytouch_jax.encoder.embed import text_column
+
+    fields = np.isin(text_column(manifest, "sensor")[rows], FIELD_SENSORS)
+    if fields.any():
+        log(f"{fields.sum()} rows of force-field sensors have no images and are left out")
+        rows = rows[~fields]
+    usable = rows if frames == 1 else np.intersect1d(rows, manifest.clips(frames)[:, -1])
+    if len(usable) < len(rows):
+        log(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {frames} frames and are left out")
+    return usable
 
 
 def contact_of_rows(manifest: Manifest, rows: np.ndarray) -> np.ndarray:

@@ -1,16 +1,22 @@
-"""`anytouch export`: an encoder for jax alone, or weights as safetensors."""
+"""`anytouch export`: an encoder for jax alone or for other engines, or weights as safetensors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import UNIVERSAL, ModelConfig, to_json
 from anytouch_jax.config.parsing import Share
 from anytouch_jax.errors import UserError
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from anytouch_jax.encoder.encoder import Encoder
+
+_INT8 = ("int8", "data")
 # What two networks must share to be interpolated.
 _SAME = (
     "touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "pre_norm", "activation", "sensors",
@@ -19,26 +25,31 @@ _SAME = (
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Export a touch encoder as one file for jax alone, or weights as safetensors.
+    """Export a touch encoder as one file for jax alone or as ONNX, or weights as safetensors.
 
     Example: anytouch export --model runs/stage2 --out encoder.bin --frames 3
 
-    The file for jax takes uint8 frames and sensor rows, and returns features. OUT.json describes how to call it. It is
-    compared with the live model before it is written.
+    The first two take uint8 frames and sensor rows, and return features. OUT.json describes how to call them. They are
+    compared with the live model before they are written.
+    Example: anytouch export --to onnx --out encoder.onnx --int8 --data manifest.parquet
     Example: anytouch export --to safetensors --model runs/stage2 --out weights.safetensors
     """
 
     model: Path  # Run folder or weights file (.pth, .safetensors).
-    out: Path | None = None  # The file to write. Weights must end in .safetensors.
+    out: Path | None = None  # The file to write. Weights must end in .safetensors, ONNX in .onnx.
     card: Path | None = None
     """Write a folder to upload instead: config.json, model.safetensors as float16, and README.md, the model card."""
     notes: Path | None = None  # Markdown for the card: the data with their licences, results, limits.
-    to: Literal["jax", "safetensors", "release"] = "jax"
-    """jax: the touch encoder as a program. safetensors: all weights by this package's names. release: weights by the
-    names of the authors' files."""
-    frames: int = 1  # jax: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
+    to: Literal["jax", "onnx", "safetensors", "release"] = "jax"
+    """jax: the touch encoder as a program. onnx: the same for onnxruntime and OpenVINO. safetensors: all weights
+    by this package's names. release: weights by the names of the authors' files."""
+    int8: bool = False  # onnx: integer products of 8 bits, calibrated on 200 touches of --data.
+    data: tuple[Path, ...] = ()  # onnx: manifests (.csv, .parquet) with touches like those to come.
+    frames: int = 1  # jax, onnx: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")  # jax: the platforms it runs on.
-    pooling: Literal["class", "mean", "both"] = "class"  # jax: the class token, the mean of the patch tokens, or both.
+    pooling: Literal["class", "mean", "both"] = (
+        "class"  # jax, onnx: the class token, the mean of the patch tokens, or both.
+    )
     join: Literal["mean", "sum", "concat"] = "mean"  # jax: how the segments of a long clip are joined.
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
@@ -54,31 +65,65 @@ def run(options: ExportOptions) -> int:
     refuse_unused(options, ("notes",), "without --card")
     if options.out is None:
         raise UserError("Name the file to write with --out, or a folder to upload with --card.")
-    if options.to != "jax":
-        refuse_unused(options, ("frames", "platforms", "pooling", "join", "dtype"), f"with --to {options.to}")
+    if options.to not in ("jax", "onnx"):
+        refuse_unused(options, ("frames", "platforms", "pooling", "join", "dtype", *_INT8), f"with --to {options.to}")
         return _export_weights(options)
-    refuse_unused(options, ("between", "share"), "with --to jax")
+    onnx = options.to == "onnx"
+    foreign = ("platforms", "join", "dtype") if onnx else _INT8
+    refuse_unused(options, ("between", "share", *foreign), f"with --to {options.to}")
+    if options.int8 != bool(options.data):
+        raise UserError("--int8 is calibrated on the touches of manifests: give both --int8 and --data, or neither.")
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.export import describes, export
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    check_folder(options.out, read=(options.model,))
+    check_folder(options.out, read=(options.model, *options.data), suffix=".onnx" if onnx else "")
     enable_compilation_cache()
-    encoder = load_encoder(options.model).computed_in(options.dtype)
+    encoder = load_encoder(options.model).computed_in("float32" if onnx else options.dtype)
     refuse_join(options, encoder.config.model.frames)
     names = ("frames", "platforms", "pooling", "join")
-    about = export(encoder, options.out, **{name: getattr(options, name) for name in names})
-    print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(options.platforms)}; {about['input']}")
+    about = export(
+        encoder, options.out, form="onnx" if onnx else "jax",
+        calibration=_calibration(encoder, options) if options.int8 else None,
+        **{name: getattr(options, name) for name in names},
+    )  # fmt: skip
+    print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; {about['input']}")
     print(f"largest difference from the live model: {about['worst_difference']:.1e} of the largest feature")
+    if options.int8:
+        print("in int8 {worst_difference:.1e}, mean cosine {cosine:.4f}, on {touches} touches".format(**about["int8"]))
     print(f"{describes(options.out)}: how to call it")
     return 0
+
+
+def _calibration(encoder: Encoder, options: ExportOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Return touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), evenly spaced in the manifests."""
+    import numpy as np
+
+    from anytouch_jax.cli.embed import usable_rows
+    from anytouch_jax.data.manifest import manifest as manifests
+    from anytouch_jax.encoder.embed import embed_rows, text_column
+    from anytouch_jax.encoder.engines import CALIBRATION
+
+    manifest, clips = manifests.read(options.data), list[np.ndarray]()
+    rows = usable_rows(manifest, np.arange(len(manifest)), options.frames)
+    if len(rows) < CALIBRATION:
+        raise UserError(f"--int8 needs {CALIBRATION} touches and --data has {len(rows)}. Name more manifests.")
+    rows = rows[np.linspace(0, len(rows) - 1, CALIBRATION).astype(int)]
+
+    def keep(part: np.ndarray, _: np.ndarray) -> np.ndarray:
+        clips.append(part)
+        return part
+
+    given, _ = embed_rows(encoder, manifest, rows, options.frames, edit=keep, log=log)
+    sensors = text_column(manifest, "sensor")[given]
+    return np.concatenate(clips), np.array([encoder.sensor_row(name, lambda _: None) for name in sensors], np.int32)
 
 
 def _export_card(options: ExportOptions, folder: Path) -> int:
     from anytouch_jax.encoder.encoder import find_tokenizer
     from anytouch_jax.weights import load, registry
 
-    jax_only = ("to", "frames", "platforms", "pooling", "join", "dtype", "between", "share", "out")
+    jax_only = ("to", "frames", "platforms", "pooling", "join", "dtype", "between", "share", "out", *_INT8)
     refuse_unused(options, jax_only, "with --card, which writes all weights of MODEL")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} is not an empty folder. Name a new one with --card.")

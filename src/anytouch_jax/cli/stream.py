@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
@@ -28,6 +28,9 @@ class StreamOptions(embed.FrameOptions):
 
     data: str  # Number of a camera, such as 0, or a video file.
     out: Path  # The .npz to write, or - for one JSON line per frame on standard output.
+    engine: Literal["xla", "onnxruntime", "openvino"] | None = None
+    """What runs the encoder: xla, or for an .onnx file of `anytouch export` onnxruntime. The others need the extra
+    engines, and export the encoder first."""
     stride: int = 1  # Frames from one frame of a clip to the next, as in the training data.
 
 
@@ -42,8 +45,10 @@ def run(options: StreamOptions) -> int:
     encoder, pooling, head = embed.load_inputs(options)
     from anytouch_jax.encoder import stream
     from anytouch_jax.encoder.embed import Features
+    from anytouch_jax.encoder.encoder import on_engine
 
     source, live = stream.open_source(data)
+    encoder = on_engine(encoder, options.engine, options.frames, pooling)
     row, preprocess, gate, about = embed.frames_input(encoder, options, data)
     embedded = stream.stream(
         encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,

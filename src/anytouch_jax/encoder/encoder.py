@@ -7,14 +7,24 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.data.images import decode
+from anytouch_jax.encoder import export
+from anytouch_jax.encoder.arrays import rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, check_frames, random_encoder, touch_features, touch_only
+from anytouch_jax.encoder.embed import Join, Pooling
+from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
@@ -22,8 +32,8 @@ from anytouch_jax.weights import load, registry
 from anytouch_jax.weights.families import Size, load_family
 
 __all__ = [
-    "Encoder", "ExampleTouch", "check_frames", "example_touches", "find_tokenizer", "load_encoder", "random_encoder",
-    "touch_features",
+    "Encoder", "EngineEncoder", "ExampleTouch", "check_frames", "example_touches", "find_tokenizer", "load_encoder",
+    "load_engine", "on_engine", "random_encoder", "touch_features",
 ]  # fmt: skip
 FOLDER = Path(__file__).parent / "examples"  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg of the untouched gel
 
@@ -33,6 +43,7 @@ def load_encoder(
 ) -> Encoder:
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
+    An .onnx file of `anytouch export` runs on onnxruntime, see `load_engine`.
     Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, ViT-MAE, ViT and DeiT). `heads` is
     their number of attention heads, where neither the file nor a config.json next to it has it. `image_size` (a side,
     or height and width) changes the size of their images. Then the result is a `FamilyEncoder`.
@@ -48,6 +59,8 @@ def load_encoder(
             names = set(read_arrays(path, only=lambda _: False))
     if {"features", "rows"} <= names:
         raise UserError(f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`")
+    if path.suffix == ".onnx":
+        return load_engine(path)
     model, weights = load_family(path, heads=heads, image_size=image_size)
     if model is not None:
         return family_encoder(model, name, path)
@@ -61,6 +74,62 @@ def load_encoder(
         touch_only(loaded.config), {"touch": loaded.params["touch"]}, name, loaded.trained_sensors,
         loaded.universal_drawn, loaded.config.model, others, find_tokenizer(path), loaded.metadata,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EngineEncoder(Encoder):
+    """An exported encoder on an engine: for one number of frames and one pooling. It has no parameters."""
+
+    run: export.Exported = field(kw_only=True, repr=False)
+
+    @cached_property
+    def fingerprint(self) -> str:  # that of the encoder it was exported from
+        return str(self.run.about["weights"])
+
+    @property
+    def contract(self) -> str:
+        return str(self.run.about["sha256"])
+
+    def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
+        if dtype == "bfloat16":
+            raise UserError(f"{self.source} is computed in float32 or int8; leave out --dtype")
+        return self
+
+    def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., Any]:
+        raise UserError(f"{self.source} has no parameters for jax; name the encoder that it was exported from")
+
+    def encode_touch(
+        self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
+        join: Join = "mean",
+    ) -> np.ndarray:  # fmt: skip
+        frames, about = np.asarray(frames), self.run.about
+        frames = frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+        if pooling != about["pooling"]:
+            raise UserError(f"{self.source} has pooling {about['pooling']}, not {pooling}; export it again with that")
+        rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
+        return self.run(frames, rows) if len(frames) else np.zeros((0, about["features"]), np.float32)
+
+
+def load_engine(path: str | Path, engine: Engine | None = None) -> EngineEncoder:
+    """Load an ONNX model of `export` as an encoder, on onnxruntime or another engine. Raises UserError."""
+    run = export.load(path, engine)
+    if run.about["form"] != "onnx":
+        raise UserError(f"{path} is for jax alone; call it by anytouch_jax.load_exported, or export it with --to onnx")
+    config, trained = from_json(json.dumps(run.about["config"])), run.about.get("trained_sensors")
+    sensors = trained and tuple(map(str, trained))
+    return EngineEncoder(config, {}, str(path), sensors, run.about["universal_drawn"], run=run)
+
+
+def on_engine(encoder: Encoder, engine: Engine | None, frames: int, pooling: Pooling = "class") -> Encoder:
+    """Return the same encoder on an engine, exported for touches of `frames` frames; None leaves it where it is."""
+    if isinstance(encoder, EngineEncoder):
+        return encoder if engine is None else load_engine(encoder.source, engine)
+    if engine in (None, "xla"):
+        return encoder
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "encoder.onnx"
+        export.export(encoder, path, frames=frames, pooling=pooling, form="onnx")
+        return replace(load_engine(path, engine), source=encoder.source)
 
 
 def find_tokenizer(path: Path) -> Path | None:

@@ -1,8 +1,8 @@
-"""Export of a touch encoder as one file that needs jax alone, and loading of that file.
+"""Export of a touch encoder as one file that needs jax or an engine alone, and loading of that file.
 
-The file is a `jax.export` artefact: uint8 frames and sensor rows in, features out, for any number of touches.
-Normalisation and parameters are inside. A JSON description says how to call it and has its checksum. Loading imports
-none of the network's code.
+The file is a `jax.export` artefact or an ONNX model: uint8 frames and sensor rows in, features out, for any number of
+touches. Normalisation and parameters are inside. A JSON description says how to call it and has its checksum. Loading
+imports none of the network's code.
 """
 
 from __future__ import annotations
@@ -13,35 +13,45 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import numpy as np
 from jax import export as jax_export
 
-from anytouch_jax.config import UNIVERSAL, parse_json
-from anytouch_jax.encoder.arrays import rows_of_sensors
+from anytouch_jax.config import UNIVERSAL, parse_json, to_json
+from anytouch_jax.encoder import engines
+from anytouch_jax.encoder.arrays import rows_of_sensors, unit_rows
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Join, Pooling
     from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.encoder.engines import Engine
 
 FORMAT = "anytouch_jax.export.1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+ONNX_TOLERANCE = 1e-5
 TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "float64": 1e-4}  # of the largest feature; the platform's own rounding
 # The fields of a description that a caller needs.
 _FIELDS: dict[str, type] = {
     **dict.fromkeys(("bytes", "frames", "image_size", "features"), int),
-    **dict.fromkeys(("sha256", "jax", "background", "pooling", "join", "dtype"), str),
+    **dict.fromkeys(("sha256", "jax", "background", "pooling", "join", "dtype", "form"), str),
     **{"platforms": list, "sensors": dict},
 }
+_ONNX_FIELDS: dict[str, type] = {"source": str, "config": dict, "weights": str, "universal_drawn": bool}
+_ENGINES = {"jax": ("xla",), "onnx": ("onnxruntime", "openvino")}
 _CHECKED = (1, 5)  # batch sizes
-_EXAMPLE = """import pathlib
+_EXAMPLE = {
+    "jax": """import pathlib
 import jax
 run = jax.export.deserialize(bytearray(pathlib.Path({name!r}).read_bytes()))
-features = jax.jit(run.call)(frames, sensor)  # {shape}, int32 (B,)"""
+features = jax.jit(run.call)(frames, sensor)  # {shape}, int32 (B,)""",
+    "onnx": """import onnxruntime
+run = onnxruntime.InferenceSession({name!r}).run
+features = run(["features"], {{"frames": frames, "sensor": sensor}})[0]  # {shape}, int32 (B,)""",
+}
 
 
 @dataclass(frozen=True)
@@ -79,20 +89,32 @@ def describes(path: Path) -> Path:
     return path.with_name(f"{path.name}.json")
 
 
-def load(path: str | Path) -> Exported:
-    """Load the encoder that `export` wrote to `path`. Raises UserError if it is damaged or for another platform."""
+def load(path: str | Path, engine: Engine | None = None) -> Exported:
+    """Load the encoder that `export` wrote to `path`, to run on an `engine`.
+
+    That is XLA for a file for jax. An ONNX model runs on "onnxruntime" or "openvino". Raises UserError for a file that
+    is damaged, for another platform or for another engine.
+    """
     path = Path(path)
     data, about = read_checked(path)
-    if _here() not in about["platforms"]:
+    form, runs_on = about["form"], _ENGINES[about["form"]]
+    if engine not in (None, *runs_on):
+        raise UserError(f"{path} runs on {' or '.join(runs_on)}, not on {engine}; name the encoder that it was made of")
+    if form == "jax" and _here() not in about["platforms"]:
         raise UserError(
             f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs jax on {_here()}; "
             "export it again for this machine"
         )
     try:
+        if form == "onnx":
+            return Exported(about, engines.session(data, engine or "onnxruntime"))
         module = jax_export.deserialize(bytearray(data))
-    except Exception as error:  # its checksum is right, so it was written by another jax
+    except UserError:
+        raise
+    except Exception as error:  # its checksum is right, so it was written by another version
+        reader = f"jax {jax.__version__}" if form == "jax" else engine or "onnxruntime"
         raise UserError(
-            f"{path} cannot be read by jax {jax.__version__}, it was exported by {about['jax']} "
+            f"{path} cannot be read by {reader}, it was exported by {about['jax']} "
             f"({' '.join(str(error).split())[:200]}); export it again"
         ) from None
     return Exported(about, jax.jit(module.call))
@@ -100,15 +122,22 @@ def load(path: str | Path) -> Exported:
 
 def export(
     encoder: Encoder, path: str | Path, *, frames: int = 1, platforms: Sequence[str] = ("cpu", "cuda"),
-    pooling: Pooling = "class", join: Join = "mean",
+    pooling: Pooling = "class", join: Join = "mean", form: Literal["jax", "onnx"] = "jax",
+    calibration: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
 
-    The artefact is first called with 1 and 5 touches and compared with the live model. Raises CheckError if they
-    differ, UserError if it cannot be compared on this machine, OSError for a full disk.
+    The artefact is first called with 1 and 5 touches and compared with the live model. ONNX is float32, for CPUs. With
+    `calibration`, touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), its linear layers become int8 after the
+    comparison. Raises CheckError if they differ, UserError for what ONNX is not written for and if it cannot be
+    compared on this machine, OSError for a full disk.
     """
-    from anytouch_jax.encoder.encoder import check_frames
+    from anytouch_jax.encoder.base import check_frames
 
+    if form == "onnx":
+        encoder, platforms = encoder.computed_in("float32"), (_here(),)
+        if encoder.blank.dtype != np.uint8:
+            raise UserError(f"ONNX is written for AnyTouch's own network; export {encoder.source} with --to jax")
     path, model = Path(path), encoder.config.model
     check_frames(model, frames)
     wrong = ", ".join(name for name in platforms if name not in PLATFORMS)
@@ -117,23 +146,41 @@ def export(
     if _here() not in platforms:
         raise UserError(f"this machine runs jax on {_here()}: add it to --platforms, to check the artefact")
     if path.suffix == ".json":
-        raise UserError(f"{path} is the name of the description; name the artefact .bin")
+        raise UserError(f"{path} is the name of the description; name the artefact .bin or .onnx")
     # The only form of attention that every platform has and that takes any number of touches.
     plain = replace(encoder, config=replace(encoder.config, model=replace(model, attention="xla")))
     live = plain if model.attention == "cudnn" and _here() != "cuda" else encoder
     with jax.enable_x64(model.dtype == "float64"):
-        data = _artefact(plain, frames, platforms, pooling, join)
-        differs, width = _worst(live, data, frames, pooling, join)
+        if form == "onnx":
+            data = engines.touch_graph(encoder.params, model, frames, pooling)
+            run: Any = engines.session(data)
+        else:
+            data = _artefact(plain, frames, platforms, pooling, join)
+            run = jax.jit(jax_export.deserialize(bytearray(data)).call)
+        differs, width = _worst(live, run, frames, pooling, join)
+    if differs > (tolerance := ONNX_TOLERANCE if form == "onnx" else TOLERANCE[model.dtype]):
+        raise CheckError(
+            f"the artefact differs from the live model by {differs:.2g} of its largest feature, more than "
+            f"{tolerance:g}: not written"
+        )
+    more: dict[str, Any] = {"platforms": list(platforms)}
+    if form == "onnx":
+        config, drawn = json.loads(to_json(encoder.config)), encoder.universal_drawn
+        more = {"platforms": ["cpu"], "config": config, "weights": encoder.fingerprint, "universal_drawn": drawn}
+    if calibration is not None:
+        data = engines.quantised(data, *calibration)
+        more["int8"] = _int8_error(live, engines.session(data), *calibration, pooling)
     about = {
         "format": FORMAT,
+        "form": form,
         "file": path.name,
         "bytes": len(data),
         "sha256": hashlib.sha256(data).hexdigest(),
         "jax": jax.__version__,
-        "platforms": list(platforms),
+        **more,
         **call_of(encoder, frames=frames, width=width, pooling=pooling, join=join),
         "worst_difference": differs,
-        "example": _EXAMPLE.format(name=path.name, shape=_shape(encoder, frames)),
+        "example": _EXAMPLE[form].format(name=path.name, shape=_shape(encoder, frames)),
     }
     atomic_write(path, data)
     atomic_write(describes(path), json.dumps(about, indent=2) + "\n")
@@ -179,9 +226,8 @@ def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: 
     return bytes(jax_export.export(jax.jit(run), platforms=tuple(platforms))(touches, rows).serialize())
 
 
-def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: Join) -> tuple[float, int]:
+def _worst(encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join) -> tuple[float, int]:
     """Return the largest difference from the live model, as a share of the largest feature, and the feature count."""
-    run = jax.jit(jax_export.deserialize(bytearray(data)).call)
     model, rng, worst, width, blank = encoder.config.model, np.random.default_rng(0), 0.0, 0, encoder.blank
     for count in _CHECKED:
         clips = rng.integers(0, 256, (count, frames, *blank.shape), np.uint8)
@@ -193,9 +239,24 @@ def _worst(encoder: Encoder, data: bytes, frames: int, pooling: Pooling, join: J
             raise CheckError(f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite")
         worst = max(worst, float(np.abs(exported - live).max() / np.abs(live).max()))
         width = live.shape[1]
-    if worst > TOLERANCE[model.dtype]:
-        raise CheckError(f"the artefact differs from the live model by {worst:.2g} of its largest feature: not written")
     return worst, width
+
+
+def _int8_error(
+    encoder: Encoder, run: Any, touches: np.ndarray, rows: np.ndarray, pooling: Pooling
+) -> dict[str, float]:
+    """Return the largest difference of int8 on its calibration touches, and the mean cosine with the live features."""
+    from anytouch_jax.encoder.embed import run_in_batches
+
+    items = list(zip(touches, rows, strict=True))
+    live = run_in_batches(lambda part: encoder.encode_touch(*part, pooling=pooling), items, 20)
+    own = run_in_batches(lambda part: run(*part), items, 20)
+    cosine = float((unit_rows(own) * unit_rows(live)).sum(1).mean())
+    return {
+        "touches": len(rows),
+        "worst_difference": float(np.abs(own - live).max() / np.abs(live).max()),
+        "cosine": cosine,
+    }
 
 
 def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
@@ -214,7 +275,10 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
         raise UserError(f"{describes(path)} is not the description of an exported encoder; export it again") from None
     if not known:
         raise UserError(f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}")
-    wrong = [name for name, kind in _FIELDS.items() if type(about.get(name)) is not kind]
+    about.setdefault("form", "jax")  # files of version 0.2
+    fields = _FIELDS | (_ONNX_FIELDS if about["form"] == "onnx" else {})
+    wrong = [name for name, kind in fields.items() if type(about.get(name)) is not kind]
+    wrong += [] if "form" in wrong or about["form"] in _ENGINES else ["form"]
     wrong = wrong or [name for name in ("frames", "image_size", "features") if not 0 < about[name] < 1 << 20]
     if wrong or list(about["sensors"].values()) != list(range(len(about["sensors"]))):
         name = (wrong or ["sensors"])[0]

@@ -14,6 +14,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ import numpy as np
 from anytouch_jax.data.images import QUIET, frame_time, open_video, to_rgb
 from anytouch_jax.encoder.base import precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, check_features, warn
-from anytouch_jax.encoder.encoder import Encoder, check_frames
+from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
 from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 
@@ -202,10 +203,14 @@ def stream(
 
 def compile_for_one(
     encoder: Encoder, sensor: int, frames: int, pooling: Pooling = "class", join: Join = "mean"
-) -> Callable[[jax.Array], jax.Array]:
+) -> Callable[[jax.Array], jax.Array | np.ndarray]:
     """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm, parameters on the device."""
-    run = jax.jit(encoder.traceable(pooling, join))
     touch = np.tile(encoder.blank, (1, frames, 1, 1, 1))
+    if isinstance(encoder, EngineEncoder):
+        call = partial(encoder.encode_touch, sensor=np.full(1, sensor), pooling=pooling, join=join)
+        call(touch)
+        return call
+    run = jax.jit(encoder.traceable(pooling, join))
     with precision(encoder.config):
         given = jax.device_put((encoder.params, touch, np.full(1, sensor, "i4")))
         compiled = run.lower(*given).compile()

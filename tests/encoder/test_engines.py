@@ -1,0 +1,181 @@
+"""Encoders as ONNX: the live model's features in every form of the network, int8, and encoders on engines."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_models import touch_model
+
+from anytouch_jax.config import Config
+from anytouch_jax.encoder import engines
+from anytouch_jax.encoder.encoder import EngineEncoder, load_encoder, on_engine, random_encoder
+from anytouch_jax.encoder.export import describes, export, load, read_checked
+from anytouch_jax.errors import CheckError, UserError
+
+pytest.importorskip("onnxruntime")
+RNG = np.random.default_rng(0)
+CLIPS = RNG.integers(0, 256, (5, 4, 28, 28, 3), np.uint8)
+ROWS = np.asarray([1, 0, 9, 3, 1], np.int32)
+
+
+def perturbed(encoder, seed=0):
+    """The encoder with biases and scales that are not 0 and 1, so that a forgotten one shows."""
+    import jax
+
+    rng = np.random.default_rng(seed)
+    moved = jax.tree.map(lambda x: x + 0.1 * rng.standard_normal(x.shape).astype(np.float32), encoder.params)
+    return replace(encoder, params=moved)
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    return perturbed(random_encoder(Config(touch_model())))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    """200 touches u8 and their sensor rows."""
+    return RNG.integers(0, 256, (200, 3, 28, 28, 3), np.uint8), RNG.integers(0, 10, 200).astype(np.int32)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory, encoder, calibration):
+    """Paths of clips of three frames, float32 and int8."""
+    folder = tmp_path_factory.mktemp("engines")
+    export(encoder, folder / "f32.onnx", frames=3, form="onnx")
+    export(encoder, folder / "int8.onnx", frames=3, form="onnx", calibration=calibration)
+    return folder / "f32.onnx", folder / "int8.onnx"
+
+
+@pytest.mark.parametrize(
+    ("changes", "frames", "pooling"),
+    [
+        ({}, 1, "class"),
+        ({"dtype": "bfloat16"}, 3, "both"),
+        ({"patch_encoder": "convolutional"}, 1, "mean"),
+        ({"patch_encoder": "convolutional", "activation": "quick_gelu"}, 3, "class"),
+        ({"patch_encoder": "sensor", "pre_norm": False}, 1, "class"),
+        ({"patch_encoder": "sensor"}, 3, "both"),
+    ],
+)
+def test_the_graph_gives_the_features_of_the_live_model(changes, frames, pooling):
+    encoder = perturbed(random_encoder(Config(touch_model(**changes))).computed_in("float32"))
+    data = engines.touch_graph(encoder.params, encoder.config.model, frames, pooling)
+    run = engines.session(data)
+    for count in (1, 5):
+        touches, rows = CLIPS[:count, :frames], ROWS[:count]
+        live = encoder.encode_touch(touches, rows, pooling=pooling)
+        assert np.abs(run(touches, rows) - live).max() < 1e-5 * np.abs(live).max()
+
+
+def test_blocks_are_written_out_in_operations_that_engines_fuse(encoder):
+    import onnx
+
+    nodes = onnx.load_from_string(engines.touch_graph(encoder.params, encoder.config.model, 3)).graph.node
+    kinds = [node.op_type for node in nodes]
+    depth = encoder.config.model.touch.depth
+    assert kinds.count("Gelu") == kinds.count("Softmax") == depth and kinds.count("LayerNormalization") == 2 * depth + 2
+    assert not {"Loop", "Scan", "If", "Erf"} & set(kinds)
+
+
+def test_an_exported_encoder_takes_the_place_of_the_live_one(exported, encoder):
+    run, own = load(exported[0]), load_encoder(exported[0])
+    assert isinstance(own, EngineEncoder) and own.fingerprint == encoder.fingerprint
+    assert own.contract != load_encoder(exported[1]).contract  # else features of one were taken for the other's
+    live = encoder.encode_touch(CLIPS[:, :3], "digit")
+    for features in (run(CLIPS[:, :3], "digit"), own.encode_touch(CLIPS[:, :3], "digit")):
+        np.testing.assert_allclose(features, live, atol=1e-5 * np.abs(live).max())
+    assert own.encode_touch(CLIPS[:0, :3], ROWS[:0]).shape == (0, 12)
+    about = json.loads(describes(exported[0]).read_text())
+    assert about["platforms"] == ["cpu"] and about["worst_difference"] < 1e-5
+    space = {"frames": CLIPS[:, :3], "sensor": ROWS}
+    exec(about["example"].replace("f32.onnx", str(exported[0])), space)
+    np.testing.assert_allclose(space["features"], encoder.encode_touch(CLIPS[:, :3], ROWS), atol=1e-5)
+
+
+def test_int8_is_calibrated_on_the_touches(exported, encoder, calibration):
+    import onnx
+
+    _, about = read_checked(exported[1])
+    live = encoder.encode_touch(*calibration)
+    error = np.abs(load(exported[1])(*calibration) - live).max() / np.abs(live).max()
+    assert 1e-4 < error < 0.1 and about["int8"]["worst_difference"] == pytest.approx(error, rel=1e-3)
+    assert about["int8"]["touches"] == 200 and about["int8"]["cosine"] > 0.99
+    weights = {one.name: one for one in onnx.load(exported[1]).graph.initializer}
+    small = [one for one in weights.values() if one.data_type == onnx.TensorProto.INT8 and len(one.dims) == 2]
+    assert len(small) == 1 + 4 * encoder.config.model.touch.depth  # the last block asks with its own product
+    assert all(list(weights[one.name.replace("quantized", "scale")].dims) == one.dims[1:] for one in small)
+    narrow = (calibration[0] // 64 + 96, calibration[1])  # ranges of other touches do not serve these
+    other = engines.quantised(engines.touch_graph(encoder.params, encoder.config.model, 3), *narrow)
+    assert np.abs(engines.session(other)(*calibration) - live).max() / np.abs(live).max() > 2 * error
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of forks, by packages that OpenVINO imports
+def test_openvino_gives_the_same_features(exported, encoder):
+    pytest.importorskip("openvino")
+    for path, tolerance in zip(exported, (1e-5, 0.1), strict=True):
+        for count in (1, 5):
+            live = encoder.encode_touch(CLIPS[:count, :3], ROWS[:count])
+            run = load(path, "openvino")
+            assert np.abs(run(CLIPS[:count, :3], ROWS[:count]) - live).max() < tolerance * np.abs(live).max()
+
+
+def test_a_live_encoder_goes_to_an_engine(encoder):
+    assert on_engine(encoder, "xla", 1) is encoder and on_engine(encoder, None, 1) is encoder
+    there = on_engine(encoder, "onnxruntime", 1)
+    assert there.source == encoder.source and there.fingerprint == encoder.fingerprint
+    live = encoder.encode_touch(CLIPS[:, :1], ROWS)
+    np.testing.assert_allclose(there.encode_touch(CLIPS[:, 0], ROWS), live, atol=1e-5 * np.abs(live).max())
+
+
+# What is refused ----------------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_run_is_one_sentence(exported, encoder, calibration, tmp_path, monkeypatch):
+    own = load_encoder(exported[0])
+    clips = CLIPS[:, :3]
+    for call, word in (
+        (lambda: load(exported[0], "xla"), "runs on onnxruntime or openvino, not on xla"),
+        (lambda: on_engine(own, "xla", 3), "runs on onnxruntime or openvino, not on xla"),
+        (lambda: own.encode_touch(clips, pooling="mean"), "has pooling class, not mean"),
+        (lambda: own.encode_touch(CLIPS), r"\(B, 3, 28, 28, 3\)"),
+        (lambda: own.computed_in("bfloat16"), "float32 or int8"),
+        (lambda: export(encoder, tmp_path / "m.onnx", frames=4, form="onnx"), "touches of 1 or 3 frames, not of 4"),
+        (own.traceable, "has no parameters for jax"),
+        (lambda: export(own, tmp_path / "m.bin"), "has no parameters for jax"),
+        (lambda: engines.quantised(b"", calibration[0][:199], calibration[1][:199]), "on 200 touches, not on 199"),
+    ):
+        with pytest.raises(UserError, match=word):
+            call()
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    with pytest.raises(UserError, match=r'onnxruntime is not installed: pip install "anytouch_jax\[engines\]"'):
+        load(exported[0])
+
+
+def test_a_graph_that_differs_from_the_live_model_is_not_written(encoder, tmp_path, monkeypatch):
+    honest = engines.touch_graph
+    other = perturbed(encoder, seed=5).params
+    monkeypatch.setattr(engines, "touch_graph", lambda _, *rest: honest(other, *rest))
+    with pytest.raises(CheckError, match="differs from the live model"):
+        export(encoder, tmp_path / "m.onnx", form="onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_model_or_description_is_refused(exported, tmp_path):
+    import hashlib
+
+    path = tmp_path / "m.onnx"
+    about = json.loads(describes(exported[0]).read_text())
+    path.write_bytes(b"no model")
+    same = {"bytes": 8, "sha256": hashlib.sha256(b"no model").hexdigest()}
+    for change, word in (
+        ({}, r"cannot be read by onnxruntime"),
+        ({"form": "tflite"}, "form is missing or wrong"),
+        ({"config": "tiny"}, "config is missing or wrong"),
+        ({"config": {}}, "m.onnx"),
+    ):
+        describes(path).write_text(json.dumps(about | same | change))
+        with pytest.raises(UserError, match=word):
+            load(path)

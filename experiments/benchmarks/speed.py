@@ -85,16 +85,17 @@ def errors(variants: Sequence[Variant], work: Workload, params: Tree) -> list[di
     small = work.resized(min(work.samples, ERROR_SAMPLES))
     rng = np.random.default_rng(1)
     noise = rng.random((small.samples, small.config.model.patches)).astype(np.float32)
-    exact = _values(replace(BASELINE, model={"dtype": "float64"}), small, params, noise)
+    exact = values_in(replace(BASELINE, model={"dtype": "float64"}), small, params, noise)
     found = []
     for variant in variants:
-        values = _values(variant, small, params, noise)
+        values = values_in(variant, small, params, noise)
         found.append({name: relative(values[name], exact[name]) for name in exact})
         del values
     return found
 
 
-def _values(variant: Variant, small: Workload, params: Tree, noise: Any) -> dict[str, list[np.ndarray]]:
+def values_in(variant: Variant, small: Workload, params: Tree, noise: Any) -> dict[str, list[np.ndarray]]:
+    """Return what a workload computes in the types of a variant, in float64 if it asks for that."""
     work = variant.of(small)
     wide = work.config.model.dtype == "float64"
     batch = normalised(make_batch(work))

@@ -15,8 +15,9 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import numpy as np
 
 from anytouch_jax.config import PresetName
 from anytouch_jax.errors import UserError
+from experiments.benchmarks.speed import relative
 from experiments.command import run_script
 from experiments.records import write_record
 
@@ -83,15 +85,30 @@ def work_on(options: VersionOptions) -> int:
     calls[0]()
     print(json.dumps(facts), flush=True)
     for line in sys.stdin:
-        if line.startswith("error"):
-            from anytouch_jax.train.step import merge
-
-            params = merge(first_state(work.config).trainable, first_state(work.config).frozen)
-            answer: Any = speed.errors([variant], work, jax.device_get(params))[0]
-        else:
+        question, _, path = line.strip().partition(" ")
+        if question == "time":
             answer = speed.interleaved(calls, 1, [SINGLE if work.samples == 1 else 1])[0].ravel().tolist()
+        else:
+            answer = None
+            chosen = replace(variant, model={"dtype": "float64"}) if question == "exact" else variant
+            _write_values(Path(path), chosen, work)
         print(json.dumps(answer), flush=True)
     return 0
+
+
+def _write_values(path: Path, variant: Any, work: Any) -> None:
+    """Write what a workload computes on a few samples, in the types of `variant`."""
+    import jax
+
+    from anytouch_jax.train.step import merge
+    from experiments.benchmarks import speed
+    from experiments.benchmarks.workloads import first_state
+
+    small, state = work.resized(min(work.samples, speed.ERROR_SAMPLES)), first_state(work.config)
+    noise = np.random.default_rng(1).random((small.samples, small.config.model.patches)).astype(np.float32)
+    values = speed.values_in(variant, small, jax.device_get(merge(state.trainable, state.frozen)), noise)
+    arrays = {f"{name}/{number}": x for name, several in values.items() for number, x in enumerate(several)}
+    np.savez(path, **{name: x.astype(np.float64) for name, x in arrays.items()})
 
 
 # The command ----------------------------------------------------------------------------------------------------------
@@ -144,13 +161,14 @@ def _workers(work: str, dtype: str, options: VersionOptions) -> Iterator[dict[st
 
 def compare(work: str, dtype: str, options: VersionOptions) -> None:
     """Time one workload in one type under all versions, and store a line for each."""
-    with _workers(work, dtype, options) as workers:
+    with _workers(work, dtype, options) as workers, tempfile.TemporaryDirectory() as folder:
         times: dict[str, list[np.ndarray]] = {name: [] for name in workers}
         names = list(workers)
         for turn in range(options.rounds):
             for name in names[turn % len(names) :] + names[: turn % len(names)]:
                 times[name].append(np.array(workers[name].ask("time")))
         base = np.median(times[names[0]], 1)
+        exact = _values_of(workers[names[0]], "exact", Path(folder))
         for name, one in workers.items():
             seconds = np.array(times[name])
             ratio = np.median(seconds, 1) / base
@@ -159,10 +177,25 @@ def compare(work: str, dtype: str, options: VersionOptions) -> None:
                 "work": work, "dtype": dtype, "version": name, "preset": options.preset, "batch": options.batch,
                 "ms": 1e3 * float(np.median(seconds)), "p99_ms": 1e3 * float(np.percentile(seconds, 99)),
                 "ratio": float(np.median(ratio)), "ratio_low": float(low), "ratio_high": float(high),
-                "error": one.ask("error"),
+                "error": _errors(_values_of(one, "values", Path(folder)), exact),
             }  # fmt: skip
             write_record(options.out, f"{options.preset}, {work}, {dtype}, {name}", record)
             print(f"{work}, {dtype}, {name}: {record['ms']:.1f} ms, {record['ratio']:.2f}", flush=True)
+
+
+def _values_of(worker: _Worker, question: str, folder: Path) -> dict[str, np.ndarray]:
+    worker.ask(f"{question} {folder / question}.npz")
+    with np.load(folder / f"{question}.npz") as file:
+        return dict(file)
+
+
+def _errors(values: dict[str, np.ndarray], exact: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return the relative L2 error of the output, the loss and the gradient."""
+    found = {}
+    for kind in dict.fromkeys(name.partition("/")[0] for name in exact):
+        names = [name for name in exact if name.startswith(f"{kind}/")]
+        found[kind] = relative([values[name] for name in names], [exact[name] for name in names])
+    return found
 
 
 def run(options: VersionOptions) -> int:

@@ -177,7 +177,7 @@ def test_errors_are_rounding_in_float32_and_coarser_in_bfloat16(work):
 def test_the_reference_is_float64_and_nothing_else_becomes_so():
     params, noise = build(EMBED.config.model).init(jax.random.key(0)), np.asarray(noise_of(EMBED))
     wide = replace(variants.BASELINE, model={"dtype": "float64"})
-    dtypes = [speed._values(v, EMBED, params, noise)["output"][0].dtype for v in (wide, variants.BASELINE)]
+    dtypes = [speed.values_in(v, EMBED, params, noise)["output"][0].dtype for v in (wide, variants.BASELINE)]
     assert dtypes == [np.float64, np.float32] and not jax.config.jax_enable_x64
     assert [speed.widened(np.zeros(1, kind)).dtype for kind in (np.float32, np.int32)] == [np.float64, np.int32]
 

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from experiments.benchmarks.optimiser import WAYS
 from experiments.benchmarks.versions import WORKS
 from experiments.pages.page import Measure, Page, Value
 from experiments.records import read_records
 
 VARIANTS, TORCH, MEMORY = "variants.jsonl", "torch.jsonl", "memory.jsonl"
-SIMULATOR, SEARCH, VIEW, VERSIONS = "simulator.jsonl", "search.jsonl", "view.jsonl", "versions.jsonl"
-ENGINES = "engines.jsonl"
+SIMULATOR, SEARCH, VIEW = "simulator.jsonl", "search.jsonl", "view.jsonl"
+VERSIONS, OPTIMISER, ENGINES = "versions.jsonl", "optimiser.jsonl", "engines.jsonl"
 RUNS = ("small", "small_epyc_stage1", "small_epyc", "large")  # of TORCH
 BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
 GIB = 2**30
@@ -81,6 +82,39 @@ def versions(folder: Path) -> Page:
         ("work", "type", "version", Measure("ms", ".1f", False), Measure("time / baseline", ".2f"),
          Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False), "calls of oneDNN"),
         rows, findings, (VERSIONS,), "python -m experiments.benchmarks.versions --python PATH",
+    )  # fmt: skip
+
+
+def optimiser(folder: Path) -> Page:
+    """Forms of AdamW: time of an update, size of its state and loss after training."""
+    records = read_records(folder / OPTIMISER)
+    names = [way.name for way in WAYS]
+    rows, findings = [], []
+    for name in names:
+        record = records[name]
+        loss = record.get("loss_ratio")
+        shown = None if loss is None else Value(float(np.mean(loss)), min(loss), max(loss), len(loss))
+        for size in ("tiny", "small"):
+            one = record[size]
+            ratio = Value(one["ratio"], one["ratio_low"], one["ratio_high"])
+            rows.append((name, size, one["ms"], ratio, one["state_bytes"] / 2**20, shown))
+        times = [record[size]["ratio"] for size in ("tiny", "small")]
+        if name != names[0]:
+            findings.append(f"{name}: {min(times):.2f} to {max(times):.2f} of the time of an update.")
+        if loss is not None and name != names[0]:
+            findings.append(f"{name}: after {record['steps']:,} steps the loss is {min(loss):.4f} to {max(loss):.4f} "
+                            "of that with float32.")  # fmt: skip
+    first = records[names[0]]
+    return Page(
+        "optimiser",
+        "Which form of AdamW?",
+        f"An update of all parameters is timed by itself, and all ways take turns ({_machine(first['machine'])}). The "
+        "state holds both moments. The loss is that of the last 100 steps of stage 1 on stills of 56 pixels, as a "
+        "share of the loss with float32 and the same seed. From and to are quartiles of the time, and the least and "
+        "largest of the seeds of the loss.",
+        ("way", "preset", Measure("ms", ".1f", False), Measure("time / ours", ".2f"),
+         Measure("state, MiB", ".0f", False), Measure("loss / float32", ".4f")),
+        rows, findings, (OPTIMISER,), "python -m experiments.benchmarks.optimiser MANIFEST",
     )  # fmt: skip
 
 

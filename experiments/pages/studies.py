@@ -112,8 +112,9 @@ def by_contact(folder: Path) -> Page:
         f"A small encoder learns {one['touches'][0]:,} stills of 56 pixels for {one['steps']:,} steps, less the "
         f"untouched gel. It is judged on {one['touches'][1]:,} stills of other objects, with masks by chance. "
         "The error is that of all hidden patches, and of hidden patches with contact. Recall@1 is the share of "
-        "touches whose nearest other touch by the same sensor is of the same object. A gain is the number of steps after which the "
-        "paper's way ends, divided by the steps until this way is as good. From and to are the seeds.",
+        "touches whose nearest other touch by the same sensor is of the same object. A gain is the number of "
+        "steps after which the paper's way ends, divided by the steps until this way is as good. From and to "
+        "are the seeds.",
         ("way", Measure("error", ".4f"), Measure("error of contact", ".4f"), Measure("recall@1, %", ".1f"),
          *(Measure(f"gain, {what}", ".2f", False) for what in ("error", "error of contact", "recall@1"))),
         rows, findings, (CONTACTS,), "python -m experiments.encoders.by_contact MANIFEST",

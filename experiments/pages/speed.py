@@ -78,10 +78,12 @@ def versions(folder: Path) -> Page:
         f"Each version is a process, and the processes take turns ({_machine(records[0]['machine'])}, preset "
         f"{records[0]['preset']}). The ratio is to {base} without flags, in the same type. The error is that of the "
         "gradient, or of the output of an embedding, against float64. From and to are quartiles. YNNPACK is a library "
-        "of products that jax uses on a CPU by default, and the flag oneDNN puts another in its place.",
+        "of products that jax uses on a CPU by default, and the flag oneDNN puts another in its place. Other work ran "
+        "beside, at a low priority.",
         ("work", "type", "version", Measure("ms", ".1f", False), Measure("time / baseline", ".2f"),
          Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False), "calls of oneDNN"),
-        rows, findings, (VERSIONS,), "python -m experiments.benchmarks.versions --python PATH",
+        rows, [*findings, "a newer jax without flags is the best choice here: no flag is faster in all works."],
+        (VERSIONS,), "python -m experiments.benchmarks.versions --python PATH",
     )  # fmt: skip
 
 

@@ -42,6 +42,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "torch": (speed.TORCH, speed.torch),
     "memory": (speed.MEMORY, speed.memory),
     "search": (speed.SEARCH, speed.search),
+    "scene": (speed.SCENE, speed.scene),
     "view": (speed.VIEW, speed.view),
     "engines": (speed.ENGINES, speed.engines),
     "photometry": (speed.SIMULATOR, speed.photometry),

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 
 from experiments.benchmarks.optimiser import WAYS
+from experiments.benchmarks.pareto import pareto
 from experiments.benchmarks.versions import WORKS
-from experiments.pages.page import Measure, Page, Value
+from experiments.pages.page import Measure, Page, Value, compare
 from experiments.records import read_records
 
 VARIANTS, TORCH, MEMORY = "variants.jsonl", "torch.jsonl", "memory.jsonl"
 SIMULATOR, SEARCH, VIEW = "simulator.jsonl", "search.jsonl", "view.jsonl"
 VERSIONS, OPTIMISER, ENGINES = "versions.jsonl", "optimiser.jsonl", "engines.jsonl"
+SCENE = "scene.jsonl"
 RUNS = ("small", "small_epyc_stage1", "small_epyc", "large")  # of TORCH
 BATCHES = "A training step has 16 samples, and 8 in matching. Preset large has 4."
 GIB = 2**30
@@ -173,6 +175,56 @@ def search(folder: Path) -> Page:
          f"Cells are made when the index opens, which takes {cells['opened_processor_s']:.0f} s of processor "
          "time. For a few queries exact search is done earlier."],
         (SEARCH,), "python -m experiments.benchmarks.search",
+    )  # fmt: skip
+
+
+def scene(folder: Path) -> Page:
+    """Frames and patches left out of a stream."""
+    records = read_records(folder / SCENE)
+    measured = records.pop("times")
+    programs, (whole, *others) = measured["programs"], records.values()
+    rows, points = [], {}
+    good: dict[str, list[str]] = {"simulated": [], "real": []}
+    for one in (whole, *others):
+        fine, real = one["fine"], one["slip"]
+        lost = [Value(*part["minus"]).times(100) for part in (fine, one["coarse"], real["kNN"], real["linear"])]
+        times = [sum(share * programs[name]["ratio"] for name, share in part["runs"].items()) for part in (fine, real)]
+        rows.append((one["name"], times[0], 100 * fine["share"], *lost[:2], times[1], 100 * real["kNN"]["share"],
+                     *lost[2:]))  # fmt: skip
+        points[one["name"]] = times[0], 100 * (1 - fine["share"])
+        for data, time, values in zip(good, times, (lost[:2], lost[2:]), strict=True):
+            good[data] += [one["name"]] if time <= 0.5 and min(value.mean for value in values) > -1 else []
+    ms = {name: program["ms"] for name, program in programs.items()}
+    half = {one["name"]: Value(*one["fine"]["minus"]).times(100) for one in others if "50 %" in one["name"]}
+    goals = [f"{data} touch: the goal is met by {', '.join(names) or 'no row'}." for data, names in good.items()]
+    return Page(
+        "scene",
+        "Which frames and patches can a stream leave out?",
+        f"`{whole['encoder']}` embeds frames one by one. Some patches or frames are left out. The goal is half the "
+        "time at less than one point. A limit in grey levels keeps a quarter, a half or all of the patches: the "
+        "fewest that hold those which changed more since the background. Merging gives one mean token a quarter of the "
+        "picture. A tenth of a camera's changes from one frame to the next are below its noise. Recall@1 is that of 50 "
+        "look-alikes, by another sensor. Slip is judged on objects left out, with heads fitted on whole frames. Times "
+        "are ratios to the whole encoder in turns with it, medians "
+        f"of {measured['rounds']} rounds on {_machine(measured['machine'])}. Other work ran on it, at a load of "
+        f"{measured['machine']['load']:.0f}. They leave out the camera and the "
+        "preparation of a frame. Nearly all frames show touch, so a stream with pauses reuses more.",
+        ("left out", Measure("time, simulated", ".2f", False), Measure("fine recall@1, %", ".1f", False),
+         Measure("minus whole", "+.1f"), Measure("coarse recall@1 minus whole", "+.1f"),
+         Measure("time, real", ".2f", False), Measure("slip by kNN, %", ".1f", False), Measure("minus whole", "+.1f"),
+         Measure("slip, linear, minus whole", "+.1f")),
+        rows,
+        [*goals, *(compare(name, "the whole encoder", lost, "fine recall@1") for name, lost in half.items()),
+         *(f"{one['name']}: {100 * one['slip']['reused_free']:.0f} % of real frames of an untouched gel are reused, "
+           f"and {100 * one['fine']['reused_free']:.0f} % of simulated ones." for one in others
+           if "compare" in one["slip"]["runs"]),
+         f"The whole encoder takes {ms['100 %']:.1f} ms. Comparing a frame takes {ms['compare']:.2f} ms, and "
+         f"choosing patches {ms['choose']:.2f} ms.",
+         f"The projection of patches takes {100 * ms['projection of a clip'] / ms['clip']:.0f} % of a clip's time. "
+         "None of it can be reused. Each place in the clip has a kernel, and a frame meets each kernel once."],
+        (SCENE,), "python -m experiments.benchmarks.scene scores`, and then `... scene times",
+        "Time ratio against the share of touches that are not found first, fine look-alikes.",
+        lambda path: pareto(path, points, y="not found first, %"),
     )  # fmt: skip
 
 

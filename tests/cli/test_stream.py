@@ -35,12 +35,13 @@ def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video,
         np.testing.assert_allclose(a["features"], b["features"], atol=1e-5)
         assert a["key/frame_index"].tolist() == b["key/frame_index"].tolist() == [2, 3, 4, 5]
         np.testing.assert_allclose(a["key/time"], [0.2, 0.3, 0.4, 0.5])  # in the film of ten frames a second
-        assert str(a["about/stride"]) == "1" and "about/started" not in a
+        assert str(a["about/stride"]) == "1" and "about/started" not in a and not a["key/reused"].any()
 
     done = anytouch("stream", *args, "--out", "-")
     lines = [json.loads(line) for line in done.out.splitlines()]
     assert done.status == 0 and [line["frame"] for line in lines] == [2, 3, 4, 5]
     assert [line["time"] for line in lines] == [0.2, 0.3, 0.4, 0.5]
+    assert [line["reused"] for line in lines] == [False] * 4
     with np.load(streamed) as a:
         np.testing.assert_array_equal(np.asarray([line["features"] for line in lines], np.float32), a["features"])
     assert "4 frames embedded" in done.err
@@ -52,6 +53,7 @@ def test_what_cannot_be_streamed(mistake, tmp_path, video, tiny_run):
     assert "3 frames" in mistake(*args, "--data", video, "--frames", 2)
     assert "--stride" in mistake(*args, "--data", video, "--stride", 4)
     assert ".npz" in mistake(*args, "--data", video, "--out", tmp_path / "f.csv")
+    assert "0 or more, not -1" in mistake(*args, "--data", video, "--reuse", -1)
     assert "gone.avi" in mistake(*args, "--data", tmp_path / "gone.avi")
     assert list(tmp_path.iterdir()) == []
 

@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+from itertools import pairwise
 
 import cv2
 import jax
@@ -22,6 +23,7 @@ from anytouch_jax.encoder.stream import (
     Frame,
     Mailbox,
     Result,
+    Reuse,
     budget,
     collect,
     open_source,
@@ -275,6 +277,8 @@ def test_a_frozen_and_a_black_picture_are_reported_once(encoder, kind):
     assert sum(f"is {kind} at frame" in line for line in logged) == (kind != "ok")
     counts = {"frozen": result.frozen, "black": result.black}
     assert counts == {name: pictures.count(name) for name in counts}
+    reused = [one.picture for one in outcome if one.reused]
+    assert ("frozen" in reused) == (kind == "frozen"), "its features are reused, and it is reported all the same"
 
 
 def test_a_camera_that_does_not_answer_is_not_waited_for(encoder, monkeypatch):
@@ -336,6 +340,88 @@ def test_a_number_is_a_camera_unless_a_file_has_that_name(monkeypatch, tmp_path)
         open_source("7")
     (tmp_path / "3").write_bytes(b"")
     assert not open_source("3")[1] and asked[-1] == str(tmp_path / "3")
+
+
+# Reuse --------------------------------------------------------------------------------------------------------------
+
+
+class Film:
+    """A video of given frames BGR u8 (n, h, w, 3), without the errors of a codec."""
+
+    def __init__(self, frames) -> None:
+        self.frames = iter(frames)
+
+    def grab(self) -> bool:
+        self.frame = next(self.frames, None)
+        return self.frame is not None
+
+    def retrieve(self):
+        return True, self.frame
+
+    def get(self, name) -> float:
+        return 0.0
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.fixture
+def embedded_clips(monkeypatch):
+    """The clips that reached the encoder."""
+    clips, compile_for_one = [], streams.compile_for_one
+
+    def watched(*args):
+        embed = compile_for_one(*args)
+        return lambda clip: (clips.append(np.asarray(clip)[0]), embed(clip))[1]
+
+    monkeypatch.setattr(streams, "compile_for_one", watched)
+    return clips
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_reuse_of_equal_clips_changes_no_bit(encoder, embedded_clips, frames):
+    """Pictures stand still, move, and stand still again. One changed pixel of the network's input is a new clip."""
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 256, (28, 28, 3), np.uint8)
+    dotted = picture.copy()
+    dotted[5, 7, 1] ^= 1
+    film = np.stack([picture] * 5 + [dotted] * 4 + [picture] * 4)
+    found = collect(stream(encoder, Film(film), live=False, sensor=DIGIT, frames=frames))
+    small = touch_evaluation(list(film[..., ::-1]), 28)
+    clips = np.stack([small[end - frames : end] for end in range(frames, len(film) + 1)])
+    embed = streams.compile_for_one(encoder, DIGIT, frames)
+    np.testing.assert_array_equal(found.values, [np.asarray(embed(jax.device_put(one[None])))[0] for one in clips])
+    new = [True, *(not np.array_equal(a, b) for a, b in pairwise(clips))]
+    assert found.reused.tolist() == [not one for one in new] and sum(new) == (3 if frames == 1 else 7)
+    np.testing.assert_array_equal(embedded_clips[: sum(new)], clips[new])
+    assert budget(found)[-1].endswith(f"{len(clips) - sum(new)} reused")
+
+
+def test_a_gel_that_nobody_touches_is_embedded_once(encoder, embedded_clips):
+    film = Film(np.full((6, 28, 28, 3), 90, np.uint8))
+    assert collect(stream(encoder, film, live=False, sensor=DIGIT)).reused.tolist() == [False] + [True] * 5
+    assert len(embedded_clips) == 1
+
+
+def test_noise_is_reused_and_a_small_touch_is_not():
+    """The noise is learned first. A slow drift adds up, since clips are compared with the one that was embedded."""
+    rng = np.random.default_rng(0)
+
+    def noisy(level=0.0, touch=0.0):
+        clip = rng.normal(100 + level, 2, (1, 112, 112, 3))
+        clip[:, :14, 14:28] += touch
+        return clip.round().astype(np.uint8)
+
+    reuse = Reuse(1.5)
+    assert not any(reuse(noisy()) for _ in range(streams.LEARNED + 1)), "what is noise is not known yet"
+    assert all(reuse(noisy()) for _ in range(50))
+    assert not reuse(noisy(touch=8)) and reuse(noisy(touch=8)) and not reuse(noisy())
+    drifted = [reuse(noisy(level)) for level in np.linspace(0, 20, 40)]
+    assert 3 <= drifted.count(False) <= 20
+    exact = Reuse(0.0)
+    assert not any(exact(noisy()) for _ in range(streams.LEARNED + 20))
+    with pytest.raises(UserError, match="must be 0 or more, not -1"):
+        Reuse(-1.0)
 
 
 # The mailbox --------------------------------------------------------------------------------------------------------

@@ -32,6 +32,9 @@ class StreamOptions(embed.FrameOptions):
     """What runs the encoder: xla, or for an .onnx file of `anytouch export` onnxruntime. The others need the extra
     engines, and export the encoder first."""
     stride: int = 1  # Frames from one frame of a clip to the next, as in the training data.
+    reuse: float = 0.0
+    """Reuse features while no place changes by more than so many times the camera's noise (0: while frames are
+    equal)."""
 
 
 def run(options: StreamOptions) -> int:
@@ -52,7 +55,7 @@ def run(options: StreamOptions) -> int:
     row, preprocess, gate, about = embed.frames_input(encoder, options, data)
     embedded = stream.stream(
         encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,
-        pooling=pooling, join=options.join, log=log, contact=gate,
+        pooling=pooling, join=options.join, log=log, contact=gate, reuse=options.reuse,
     )  # fmt: skip
     result = stream.collect(embedded, (lambda frame: _print_line(frame, live, head)) if lines else None)
     if result.error is not None and not result.total:
@@ -70,6 +73,7 @@ def run(options: StreamOptions) -> int:
             about |= {"started": f"{result.started:.6f}"}
             about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}
         features = Features(result.values, result.numbers, {"frame_index": result.numbers, "time": result.time})
+        features.keys["reused"] = result.reused
         features.predictions["contact"] = result.contact
         embed.save_features(options.out, encoder, features, head, options, about)
     embed.log_universal(encoder, options)
@@ -87,6 +91,7 @@ def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
     line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
     if live:
         line |= {"picture": frame.picture, "missed": frame.missed}
+    line["reused"] = frame.reused
     if head is not None and head.calibration is not None:
         one = head.assess(frame.values[None])
         line |= {"label": str(one.label[0]), "p": round(float(one.p.max()), 6)}

@@ -1,9 +1,9 @@
 """Live features of a camera or a video, frame by frame, with the latency of each part (`anytouch stream`).
 
 A thread reads and preprocesses frames, and a mailbox of one slot holds the newest clip. A camera is never waited for:
-frames that arrive while the encoder is busy are dropped, and a clip still has consecutive frames. Of a video, which
-can wait, every frame is embedded. The end of a video ends the stream. A camera has no end: a missed read is tried
-again, and the stream fails if no frame comes.
+frames that arrive while the encoder is busy are dropped, and a clip still has consecutive frames. A video can wait, so
+none of its frames is dropped. A clip that shows what the last embedded one showed gets the same features. The end of a
+video ends the stream. A camera has no end: a missed read is tried again, and the stream fails if no frame comes.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ RETRY = 2.0  # seconds in which a missed read of a camera is tried again
 HANG = 20.0  # seconds to wait for a read that does not return; V4L2 itself gives up after 10
 STUCK = 0.3  # seconds of the same bytes, or of black, until they are reported: the noise of a sensor never repeats
 BLACK = 8.0  # mean pixel below which a picture is black; untouched gels have 30 and more
+CELL = 14  # pixels of a side over which a change is averaged
+LEARNED, CHANGES = 30, 1000  # changes from which the noise of a camera is known, at first and later
 _PATIENCE = 2.0  # seconds to wait for the reader after the last frame
 _PAUSE = 0.01  # seconds from a missed read to the next
 
@@ -77,7 +79,7 @@ class Embedded(NamedTuple):
     `at`: seconds from the start of the stream to the frame. `seconds`: those of PARTS. `age`: seconds from the grabbed
     frame to its features, with decoding and waiting. `started`: start of the stream in Unix seconds. `time`: the time
     stamp of a video's frame, or `at` of a camera's. `picture` and `missed` are those of `Frame`. `contact`: 1, 0 or
-    NaN (unknown).
+    NaN (unknown). `reused`: the features are those of the last clip that was embedded (`Reuse`).
     """
 
     number: int
@@ -90,6 +92,7 @@ class Embedded(NamedTuple):
     picture: str = "ok"
     missed: int = 0
     contact: float = float("nan")
+    reused: bool = False
 
 
 class Mailbox:
@@ -156,19 +159,20 @@ def open_source(name: str | Path) -> tuple[Source, bool]:
 def stream(
     encoder: Encoder, source: Source, preprocess: Preprocess | None = None, *, live: bool, sensor: int,
     frames: int = 1, stride: int = 1, pooling: Pooling = "class", join: Join = "mean", log: Log = warn,
-    contact: Callable[[np.ndarray], float] | None = None,
+    contact: Callable[[np.ndarray], float] | None = None, reuse: float = 0.0,
 ) -> Generator[Embedded]:  # fmt: skip
     """Yield features of the frames of `source`; the encoder is compiled before the first frame is read.
 
     A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
     `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy, and `log` gets one
     sentence each about a missed read, a frozen and a black picture. `contact` decides contact of a frame, as
-    `novelty.ContactGate` does. Close the iterator to stop and to release the
-    source. Raises UserError for a wrong length, and CameraError if no frame can be read for RETRY seconds.
+    `novelty.ContactGate` does. `reuse` is the factor of `Reuse`. Close the iterator to stop and to release the
+    source. Raises UserError for a wrong length or factor, and CameraError if no frame can be read for RETRY seconds.
     """
     check_frames(encoder.config.model, frames)
     if stride < 1:
         raise UserError(f"the stride of a clip must be at least 1, not {stride}")
+    is_served = Reuse(reuse)
     embed = compile_for_one(encoder, sensor, frames, pooling, join)
     mailbox = Mailbox(replace=live)
     arrived = _camera_frames(source, mailbox, log) if live else _video_frames(source)
@@ -180,16 +184,17 @@ def stream(
         try:
             reader.start()  # Ctrl-C may come already while the thread starts
             while (clip := mailbox.take(HANG if live else None)) is not None:
-                begin = time.perf_counter()
-                there = jax.device_put(clip.frames[None]).block_until_ready()
-                copied = time.perf_counter()
-                values = check_features(np.asarray(embed(there))[0])
+                begin = copied = time.perf_counter()
+                if not (reused := is_served(clip.frames)):
+                    there = jax.device_put(clip.frames[None]).block_until_ready()
+                    copied = time.perf_counter()
+                    values = check_features(np.asarray(embed(there))[0])
                 end = time.perf_counter()
                 last, at = clip.last, clip.last.read - start
                 seconds = (last.decode, clip.resize, copied - begin, end - copied)
                 stamp = at if last.time is None else last.time
                 age = end - last.read
-                about = (last.picture, last.missed, clip.contact)
+                about = (last.picture, last.missed, clip.contact, reused)
                 yield Embedded(last.number, at, values, seconds, age, started, stamp, *about)
         finally:
             mailbox.close()
@@ -199,6 +204,41 @@ def stream(
                 source.release()
 
     return embedded()
+
+
+class Reuse:
+    """Whether the features of the last embedded clip serve a clip: no place changed by more than noise.
+
+    Clips are arrays (T, H, W, 3) of one shape. A change is the largest of all places, cells of CELL pixels. The noise
+    is what a tenth of the last CHANGES from one clip to the next stay below. It is known after LEARNED of them. A clip
+    is served if it changed by at most `factor` times the noise, and with a factor of 0 if it is equal. Raises UserError
+    for a negative factor.
+    """
+
+    def __init__(self, factor: float) -> None:
+        if not factor >= 0:
+            raise UserError(f"the factor of the noise must be 0 or more, not {factor:g}")
+        self._factor, self._changes = factor, deque[float](maxlen=CHANGES)
+        self._last = self._embedded = np.zeros(0)
+
+    def __call__(self, clip: np.ndarray) -> bool:
+        last, self._last = self._last, clip
+        if self._factor and len(last) and (change := largest_change(clip, last)):
+            self._changes.append(change)
+        served = np.array_equal(clip, self._embedded)
+        if not served and len(self._changes) > LEARNED:
+            noise = np.quantile(self._changes, 0.1)
+            served = bool(largest_change(clip, self._embedded) <= self._factor * noise)  # changes must not add up
+        self._embedded = self._embedded if served else clip
+        return served
+
+
+def largest_change(clip: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest mean absolute difference, over cells of CELL pixels, of two clips (T, H, W, 3)."""
+    rows, width = clip.shape[0] * clip.shape[1], clip.shape[2]
+    change = cv2.absdiff(*(one.reshape(rows, -1) for one in (clip, other))).astype(np.float32)
+    cells = max(width // CELL, 1), max(rows // CELL, 1)
+    return float(cv2.resize(change, cells, interpolation=cv2.INTER_AREA).max())  # of bytes it would round to 0
 
 
 def compile_for_one(
@@ -337,7 +377,7 @@ class _Watch:
 class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 
-    `total` frames were embedded: the arrays may have only the last ones. `frozen` and `black` count such pictures.
+    `total` frames have features: the arrays may have only the last ones. `frozen` and `black` count such pictures.
     `interrupted`: Ctrl-C or SIGTERM ended the stream. `error`: a camera that delivers nothing ended it.
     """
 
@@ -355,6 +395,7 @@ class Result(NamedTuple):
     black: int = 0
     error: CameraError | None = None
     contact: np.ndarray = np.zeros(0)
+    reused: np.ndarray = np.zeros(0, bool)
 
 
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
@@ -378,14 +419,15 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         interrupted = True
     except CameraError as error:
         failure = error
-    columns = (np.asarray([getattr(frame, name) for frame in stored]) for name in ("number", "at", "seconds", "age"))
-    numbers, at, seconds, age = columns
+    numbers, at, seconds, age, times, contact, reused = (
+        np.asarray([getattr(frame, name) for frame in stored])
+        for name in ("number", "at", "seconds", "age", "time", "contact", "reused")
+    )
     return Result(
         np.stack([frame.values for frame in stored]) if stored else np.zeros((0, 0), np.float32),
         numbers.astype(np.int64), at, seconds.reshape(-1, len(PARTS)), age, total, interrupted,
-        stored[-1].started if stored else 0.0, np.asarray([frame.time for frame in stored]),
-        stored[-1].missed if stored else 0, pictures["frozen"], pictures["black"], failure,
-        np.asarray([frame.contact for frame in stored]),
+        stored[-1].started if stored else 0.0, times, stored[-1].missed if stored else 0, pictures["frozen"],
+        pictures["black"], failure, contact, reused.astype(bool),
     )  # fmt: skip
 
 
@@ -414,5 +456,6 @@ def budget(result: Result) -> list[str]:
     dropped = int(np.ptp(result.numbers)) + 1 - count if count else 0
     last = "," if result.total == count else f"; of the last {count}:"
     faults = {"missed reads": result.missed, "frozen pictures": result.frozen, "black pictures": result.black}
+    faults |= {"reused": int(result.reused.sum())}
     known = "".join(f", {count} {name}" for name, count in faults.items() if count)
     return [*lines, f"{result.total} frames embedded{last} {dropped} dropped, {rate:.1f} frames/s{known}"]

@@ -195,7 +195,10 @@ def scene(folder: Path) -> Page:
         for data, time, values in zip(good, times, (lost[:2], lost[2:]), strict=True):
             good[data] += [one["name"]] if time <= 0.5 and min(value.mean for value in values) > -1 else []
     ms = {name: program["ms"] for name, program in programs.items()}
-    half = {one["name"]: Value(*one["fine"]["minus"]).times(100) for one in others if "50 %" in one["name"]}
+    half = {
+        one["name"].replace("50 %", "half"): Value(*one["fine"]["minus"]).times(100)
+        for one in others if "50 %" in one["name"]
+    }  # fmt: skip
     goals = [f"{data} touch: the goal is met by {', '.join(names) or 'no row'}." for data, names in good.items()]
     return Page(
         "scene",
@@ -214,7 +217,7 @@ def scene(folder: Path) -> Page:
          Measure("time, real", ".2f", False), Measure("slip by kNN, %", ".1f", False), Measure("minus whole", "+.1f"),
          Measure("slip, linear, minus whole", "+.1f")),
         rows,
-        [*goals, *(compare(name, "the whole encoder", lost, "fine recall@1") for name, lost in half.items()),
+        [*goals, *(compare(name, "the whole encoder", lost, "fine look-alikes") for name, lost in half.items()),
          *(f"{one['name']}: {100 * one['slip']['reused_free']:.0f} % of real frames of an untouched gel are reused, "
            f"and {100 * one['fine']['reused_free']:.0f} % of simulated ones." for one in others
            if "compare" in one["slip"]["runs"]),

@@ -2,8 +2,9 @@
 
 It reads two packs of real pictures, and Taxim's colour tables of a DIGIT. It writes what `sim/sensing/looks.npz` holds:
 
-* `NAME.bases` u8 (units, 40, 30 or 40, 3): pictures of untouched gels of several units, without marker dots.
-* `digit.normal`, `digit.steepest`: the tables of a DIGIT as a polynomial (`sim.sensing.shading`).
+* `NAME.bases` u8 (units, 30 or 40, 30 or 40, 3): pictures of untouched gels of several units, without marker dots. Of
+  sensors that are lights set by eye, f32 in 0..1.
+* `NAME.normal`, `.halo`, `.steepest`, `.widest`: the `Photometry` of a sensor.
 
 No picture with a non-commercial licence is read.
 """
@@ -18,7 +19,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.sim.sensing import calibration, shading
+from anytouch_jax.sim.sensing.sensors import SENSORS, Photometry
+from experiments.benchmarks import photometry, presses
 
 Array = npt.NDArray[Any]
 SHORT, LONG = 30, 40  # pixels of a stored picture
@@ -67,8 +69,8 @@ def smoothed(image: Array) -> Array:
     return np.clip(fit.reshape(grey.shape), 0, 255).astype(np.uint8)
 
 
-def digit_normal(tables: Path, drift: float = 0.6) -> tuple[Array, float]:
-    """Return the polynomial (20, 6, 3) of a DIGIT and its steepest tilt, fitted to Taxim's tables.
+def digit_model(tables: Path, drift: float = 0.6) -> Photometry:
+    """Return the model of a DIGIT, fitted to Taxim's tables.
 
     Presses near a corner are rare, so that `drift` of the change with the place is believed.
     """
@@ -88,9 +90,16 @@ def digit_normal(tables: Path, drift: float = 0.6) -> tuple[Array, float]:
     nx = np.broadcast_to(sine * np.sin(turn)[None, :, None], shape).ravel()
     ny = np.broadcast_to(sine * np.cos(turn)[None, :, None], shape).ravel()
     across, down = (np.broadcast_to(a[None, None, :], shape).ravel() for a in (u, v))
-    rows = shading.design(nx, ny, across, down)
-    model = shading.assemble(shading.ridge(rows, colour.reshape(-1, 3), 1e-4), 0.85)
-    return np.asarray(model.normal), 0.85
+    rows = photometry.design(nx, ny, across, down)
+    model = photometry.assemble(photometry.ridge(rows, colour.reshape(-1, 3), 1e-4), float(np.float32(0.85)))
+    return model._replace(widest=np.full(3, 9.0, np.float32))
+
+
+def models() -> dict[str, Photometry]:
+    """Return the models of all sensors but the DIGIT, whose tables are in a pack."""
+    fitted = {name: presses.fit_photometry(name)[0] for name in presses.INDENTERS}
+    lit = {name: photometry.lit(lights) for name, lights in photometry.LIGHTS.items()}
+    return fitted | lit | {"9dtact": photometry.darkening()}
 
 
 def build(pack: Path, second: Path) -> dict[str, Array]:
@@ -98,9 +107,9 @@ def build(pack: Path, second: Path) -> dict[str, Array]:
     unical = [read(path) for path in sorted((second / "unical/GelSight").glob("*.jpg"))]
     smooth = [read(path) for path in sorted((second / "unical/9DTact").glob("*.jpg"))]
     bases = {
-        "gelsight": [calibration.read_background("gelsight"), smoothed(np.median(unical, 0))],
+        "gelsight": [presses.read_background("gelsight"), smoothed(np.median(unical, 0))],
         "gelsight_mini": [
-            calibration.read_background("gelsight_mini"),
+            presses.read_background("gelsight_mini"),
             read(pack / "gelslam-gelsight_mini/background.png"),
             read(next((pack / "normalflow-gelsight_mini").glob("*.png"))),
             *(smoothed(without_dots(read(path))) for path in sorted((second / SLIP).glob("*.png"))),
@@ -116,11 +125,15 @@ def build(pack: Path, second: Path) -> dict[str, Array]:
             smoothed(np.median(smooth, 0)),
         ],
     }
-    normal, steepest = digit_normal(pack / "taxim-calibration/digit/polycalib.npz")
-    return {f"{name}.bases": np.stack([small(image) for image in images]) for name, images in bases.items()} | {
-        "digit.normal": normal.astype(np.float32),
-        "digit.steepest": np.float32(steepest),
+    arrays: dict[str, Array] = {
+        f"{name}.bases": np.stack([small(one) for one in several]) for name, several in bases.items()
     }
+    for name, lights in photometry.LIGHTS.items():
+        arrays[f"{name}.bases"] = photometry.untouched(lights, SENSORS[name].field)
+    digit = digit_model(pack / "taxim-calibration/digit/polycalib.npz")
+    for name, model in (models() | {"digit": digit}).items():
+        arrays |= {f"{name}.{part}": np.asarray(value) for part, value in model._asdict().items()}
+    return arrays
 
 
 if __name__ == "__main__":

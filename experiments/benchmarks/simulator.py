@@ -33,10 +33,11 @@ from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult, press
 from anytouch_jax.sim.contact.shear import Shear, shear_step
 from anytouch_jax.sim.recorder import Recorder
 from anytouch_jax.sim.scene import Scenes, draw_recording, draw_touch, objects_and_splits
-from anytouch_jax.sim.sensing import calibration, optics, sensors
-from anytouch_jax.sim.sensing.calibration import COARSE, INDENTERS, PITCH, Presses
+from anytouch_jax.sim.sensing import optics, sensors
 from anytouch_jax.sim.sensing.optics import render
 from anytouch_jax.sim.sensing.sensors import SENSORS, identity_unit
+from experiments.benchmarks import presses as real
+from experiments.benchmarks.presses import COARSE, INDENTERS, PITCH, Presses
 
 Fields = npt.NDArray[Any]
 Surface = Callable[[Fields, Fields], Fields]
@@ -383,8 +384,8 @@ def score_presses(
     """
     rows: list[PressScore] = []
     for name in names:
-        presses = calibration.read_presses(name)
-        which = calibration.halves(len(presses.radius))[1][:limit]
+        presses = real.read_presses(name)
+        which = real.halves(len(presses.radius))[1][:limit]
         renderers = [_constant(presses), _ours(name, presses), _ours(name, presses, shadow=False)]
         if rivals:
             renderers += _taxim(name, presses)
@@ -464,14 +465,15 @@ def _ours(name: str, presses: Presses, *, shadow: bool = True) -> Renderer:
     """Height map -> contact -> picture by the project's renderer, with the real background at full size."""
     sensor, indenter = SENSORS[name], INDENTERS[name]
     unit, size = sensors.identity_unit(sensor), presses.background.shape[:2]
+    model = real.fit_photometry(name)[0 if shadow else 1]
     behind = jnp.asarray(presses.background.transpose(2, 0, 1), jnp.float32) / 255
-    cut = jax.jit(lambda c, r: calibration.ball_cut(c * PITCH, r * PITCH, indenter, size, PITCH))
+    cut = jax.jit(lambda c, r: real.ball_cut(c * PITCH, r * PITCH, indenter, size, PITCH))
 
     @jax.jit
     def draw(height: Any) -> Any:
         coarse = height.reshape(size[0] // COARSE, COARSE, size[1] // COARSE, COARSE).mean((1, 3))
-        dent = calibration.settle(coarse, COARSE * PITCH, indenter.reach)
-        return optics.render(dent, None, COARSE * PITCH, sensor, unit, resolution=size, shadow=shadow, behind=behind)
+        dent = real.settle(coarse, COARSE * PITCH, indenter.reach)
+        return optics.render(dent, None, COARSE * PITCH, sensor, unit, resolution=size, photometry=model, behind=behind)
 
     def height(k: int) -> Any:
         return cut(jnp.asarray(presses.centre[k]), jnp.asarray(presses.radius[k]))

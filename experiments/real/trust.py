@@ -240,7 +240,7 @@ def run(options: TrustOptions) -> int:
     if options.health:
         units = [unit for unit in health.read_units(manifests.read(options.data))
                  if not any(word in unit.unit for word in options.skip_units)]  # fmt: skip
-        real = [sensor for sensor in SENSORS.values() if options.package and isinstance(sensor.look, str)]
+        real = [sensor for sensor in SENSORS.values() if options.package and sensor.real]
         gels = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
         kind, record = "health", health_record(units, gels)
     elif options.features is not None:

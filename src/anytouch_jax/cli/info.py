@@ -65,7 +65,7 @@ def _health(options: InfoOptions) -> int:
     if not units:
         raise UserError("No picture of a sensor can be read. Check the manifest with `anytouch data verify`.")
     # Only these looks are of real units.
-    real = [sensor for sensor in SENSORS.values() if isinstance(sensor.look, str)]
+    real = [sensor for sensor in SENSORS.values() if sensor.real]
     references = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
     results = health.check_units(units, references)
     if options.model is not None:

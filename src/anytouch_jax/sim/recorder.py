@@ -19,7 +19,7 @@ from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
-from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, gel_to_object, look, rotated, unit_gel
+from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, gel_to_object, rotated, unit_gel
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object
 
@@ -219,8 +219,6 @@ class Recorder:
     def _program(self, name: str) -> Any:
         if name not in self._programs:
             scenes = self._scenes
-            if SENSORS[name].kind == "image":
-                look(SENSORS[name])  # is fitted to real presses once, outside of the program
             one = partial(
                 simulate_clip, sensor=SENSORS[name], fidelity=scenes.fidelity, size=scenes.size, fields=scenes.fields
             )

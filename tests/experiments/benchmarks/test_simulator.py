@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.sensing.calibration import PITCH, Presses
 from experiments.benchmarks import simulator
+from experiments.benchmarks.presses import PITCH, Presses
 from experiments.benchmarks.simulator import SCENES, PressSetting, Renderer, SolverVariant, speed_against_error
 
 SETTING = PressSetting(size=8.0)

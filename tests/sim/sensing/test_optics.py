@@ -26,7 +26,8 @@ MARKED = PLAIN._replace(marked=np.float32(1))
 
 @partial(jax.jit, static_argnames=("shadow",))
 def draw(displacement, tangential, unit, key, shadow=True):
-    return optics.render(displacement, tangential, PITCH, SLIM, unit, key, resolution=SIZE, shadow=shadow)
+    model = None if shadow else sensors.look(SLIM)._replace(halo=np.zeros((3, 3, 3)))
+    return optics.render(displacement, tangential, PITCH, SLIM, unit, key, resolution=SIZE, photometry=model)
 
 
 def grid():
@@ -292,3 +293,12 @@ def test_a_bent_lattice_shrinks_outwards():
     middles = (edges[1:-1:2] + edges[2::2]) / 2 * 9.9 / 4000
     gaps = np.diff(np.concatenate([[0.0], middles]))
     assert (np.diff(gaps) < 0).all() and gaps[0] == pytest.approx(1.25 / 0.88, rel=0.01)
+
+
+def test_tilt_is_the_sine_and_is_cut():
+    nx, ny = optics.tilt(jnp.array([0.0, 3.0, 1e6]), jnp.array([0.0, 4.0, 0.0]), 0.99)
+    np.testing.assert_allclose(nx, [0, 3 / np.sqrt(26), 0.99], rtol=1e-6)
+    np.testing.assert_allclose(ny, [0, 4 / np.sqrt(26), 0], rtol=1e-6)
+    np.testing.assert_allclose(optics.tilt(jnp.array([3.0]), jnp.array([4.0]), 0.5), [[0.3], [0.4]], rtol=1e-6)
+    slope = jax.grad(lambda g: optics.tilt(g, jnp.array(0.0), 0.9)[0])(0.0)
+    assert slope == 1.0  # no NaN at rest

@@ -2,8 +2,8 @@
 
 Everything is a product of small matrices along rows and columns, or arithmetic that XLA fuses into one pass. So a batch
 under `vmap` costs little more than its pixels. The steps are: resample and differentiate the displacement at the
-pixels, colour change by normal and place (`shading`), soft shadow and light bleed from the blurred dent, background,
-markers, noise.
+pixels, colour change by normal and place, soft shadow and light bleed from the blurred dent, background, markers,
+noise.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ import numpy as np
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact.mechanics import KPA_MM2, Gel
-from anytouch_jax.sim.sensing import shading
-from anytouch_jax.sim.sensing.sensors import Markers, Sensor, Unit, look, rotated
+from anytouch_jax.sim.sensing.sensors import DEGREE, POWERS, Markers, Photometry, Sensor, Unit, look, rotated
 
 Array = jax.Array
 Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: value, slope
@@ -94,7 +93,7 @@ def render(
     key: Array | None = None,
     *,
     resolution: tuple[int, int] | None = None,
-    shadow: bool = True,
+    photometry: Photometry | None = None,
     behind: Array | None = None,
     drift: Array | None = None,
 ) -> Array:
@@ -102,18 +101,18 @@ def render(
 
     The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
     mm (x, y) moves the markers. `key` draws the noise, and None omits it. `resolution` is (height, width), by default
-    square pixels with a short side of 224. `sensor`, `resolution` and `shadow` are static under jit. `behind` is the
-    `backdrop` of the same unit and resolution. `drift` (3, 3) changes the light (`units.draw_drift`). Raises UserError
-    for a sensor without a camera.
+    square pixels with a short side of 224. `photometry` replaces that of the sensor. `sensor` and `resolution` are
+    static under jit. `behind` is the `backdrop` of the same unit and resolution. `drift` (3, 3) changes the light
+    (`sensors.draw_drift`). Raises UserError for a sensor without a camera.
     """
     resolution = resolution or picture_size(sensor)
-    model, place = look(sensor), picture_view(sensor, unit, resolution)
-    photometry = model.photometry if shadow else model.plain
+    place = picture_view(sensor, unit, resolution)
+    photometry = look(sensor) if photometry is None else photometry
     matrices = _resample(displacement.shape, pitch, place)
     skin = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
-    nx, ny = shading.tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
+    nx, ny = tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
     glow: tuple[Array, ...] | None = None
-    if shadow and np.any(np.asarray(photometry.halo)):
+    if np.any(np.asarray(photometry.halo)):
         soft = _blurred(displacement, sensor.halo / pitch)
         depth = matrices[0] @ soft @ matrices[2].T
         lit = (*rotated(*_slopes(soft, matrices, pitch), unit.light_angle), depth)
@@ -124,9 +123,9 @@ def render(
     bits = None if key is None else jax.random.bits(key, resolution, jnp.uint32)
 
     def channel(c: dict[str, Array]) -> Array:
-        change = shading.colour_change(c["normal"], nx, ny, place.u, place.v)
+        change = colour_change(c["normal"], nx, ny, place.u, place.v)
         if glow is not None:
-            change = change + shading.halo_change(c["halo"], glow, place.u, place.v)
+            change = change + halo_change(c["halo"], glow, place.u, place.v)
         light = _light(c["uneven"], c["tint"], place, sensor)
         image = c["behind"] + c["gain"] * change * light
         if ink is not None:
@@ -144,8 +143,47 @@ def render(
     return planes.transpose(1, 2, 0)
 
 
+def tilt(slope_x: Array, slope_y: Array, steepest: float | Array) -> tuple[Array, Array]:
+    """Return slopes (mm/mm) over the length of their normal, which are sines of the tilt, cut to length `steepest`."""
+    square = slope_x**2 + slope_y**2
+    scale = jnp.minimum(jax.lax.rsqrt(1.0 + square), steepest * jax.lax.rsqrt(jnp.maximum(square, 1e-12)))
+    return slope_x * scale, slope_y * scale
+
+
+def colour_change(normal: Array, nx: Array, ny: Array, u: Array, v: Array) -> Array:
+    """Return the change (H, W) of one colour channel, 0..1, of a surface with `tilt` (nx, ny) (H, W).
+
+    `normal` (20, 6) is that channel of `Photometry.normal`, and `u` (W,) and `v` (H,) are places in -1..1. It is
+    Horner's scheme in nx over Horner's scheme in ny. Every coefficient is a quadric of the place.
+    """
+    index, u, v = {power: k for k, power in enumerate(POWERS)}, u[None, :], v[:, None]
+
+    def coefficient(i: int, j: int) -> Array:
+        c0, cu, cv, cuu, cuv, cvv = normal[index[i, j]]
+        return (c0 + v * (cv + v * cvv)) + u * ((cu + v * cuv) + u * cuu)
+
+    total = coefficient(DEGREE, 0)
+    for i in range(DEGREE - 1, -1, -1):
+        inner = coefficient(i, DEGREE - i)
+        for j in range(DEGREE - i - 1, -1, -1):
+            inner = inner * ny + (coefficient(i, j) if (i, j) != (0, 0) else 0.0)
+        total = total * nx + inner
+    return total
+
+
+def halo_change(halo: Array, features: tuple[Array, ...], u: Array, v: Array) -> Array:
+    """Return the change (H, W) of one channel from slope x, slope y and depth (each (H, W)) of the blurred dent.
+
+    `halo` (3, 3) is that channel of `Photometry.halo`.
+    """
+    terms = [
+        feature * (halo[k, 0] + u[None, :] * halo[k, 1] + v[:, None] * halo[k, 2]) for k, feature in enumerate(features)
+    ]
+    return terms[0] + terms[1] + terms[2]
+
+
 def _channels(
-    photometry: shading.Photometry, sensor: Sensor, unit: Unit, behind: Array, drift: Array | None
+    photometry: Photometry, sensor: Sensor, unit: Unit, behind: Array, drift: Array | None
 ) -> dict[str, Array]:
     """Return the inputs that differ between colour channels, each with a leading axis of three."""
     ink = sensor.markers.ink if sensor.markers else (0.0, 0.0, 0.0)

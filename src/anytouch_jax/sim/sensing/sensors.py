@@ -1,16 +1,15 @@
 """Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`.
 
-GelSight, GelSight Mini, DIGIT and 9DTact look like real units: `looks.npz` has their untouched gels, and the colours of
-dents are fitted to real presses (package `taxim`) or to Taxim's tables (DIGIT). `experiments/benchmarks/looks.py` makes
-the file. GelSlim and DuraGel are a few lights each, set by eye. Sizes, gels and moduli are round numbers near published
-ones. Tac3D measures a field and has no image.
+`looks.npz` has the untouched gels of camera sensors and the colours of their dents. `experiments/benchmarks/looks.py`
+makes it. GelSight, GelSight Mini, DIGIT and 9DTact look like real units. GelSlim and DuraGel are a few lights each, set
+by eye. Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field and has no image.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.resources import files
 from typing import Any, Literal, NamedTuple
 
@@ -21,31 +20,9 @@ import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.mechanics import Gel
-from anytouch_jax.sim.sensing import calibration, shading
 
 Array = npt.NDArray[Any]
 RGB = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Light:
-    """One light of a camera sensor."""
-
-    place: tuple[float, float]  # in the image (columns, rows); -1..1 is the field
-    colour: RGB
-    reach: float = 1.0  # of its glow, in half fields
-    height: float = 0.6  # over the surface, relative to its distance; low lights shade strongly
-    contrast: float = 1.0  # brightness of tilted paint
-    flat: float = 1.0  # brightness of flat paint
-
-
-@dataclass(frozen=True)
-class Lights:
-    """The look of a camera sensor made of lights."""
-
-    ambient: RGB  # colour of the untouched skin where no light reaches
-    lights: tuple[Light, ...]
-    shadow: float = 0.3  # how strongly the far side of a whole dent darkens, relative to surface shading
 
 
 @dataclass(frozen=True)
@@ -68,7 +45,6 @@ class Sensor:
     field: tuple[float, float]  # mm (height, width)
     resolution: tuple[int, int]  # pixels (height, width), or points for kind "field"
     gel: Gel
-    look: str | Lights | None  # name of real units in `looks.npz`, or lights; None for kind "field"
     markers: Markers | None = None
     kind: Literal["image", "field"] = "image"
     skin: float = 0.0  # mm, smallest detail that the coating passes
@@ -78,52 +54,50 @@ class Sensor:
     # Standard deviation of a pixel (0 to 255), or of a field's displacement in mm. 0.01 mm is a third of a pixel of
     # Tac3D's camera with 640 columns.
     noise: float = 1.0
+    real: bool = True  # whether its look is that of real units
 
 
-class Look(NamedTuple):
-    """Photometric models with and without the soft shadow."""
+class Photometry(NamedTuple):
+    """The change of one sensor's image with the tilt of its surface. Colours are RGB in 0..1.
 
-    photometry: shading.Photometry
-    plain: shading.Photometry
+    The colour of diffuse paint under a few fixed lights is a low-order polynomial of its normal (spherical harmonics,
+    Basri and Jacobs 2003). Its coefficients drift slowly over the image. So a few hundred numbers for a sensor replace
+    a table over gradient bins (Taxim, Si and Yuan 2022). They are smooth, bounded, and exactly zero without contact.
+    """
+
+    normal: Array | jax.Array  # (20, 6, 3), a colour for every power of the normal (`POWERS`) and of the position
+    halo: Array | jax.Array  # (3, 3, 3), soft shadow and light bleed, on slope and depth (1/mm) of the blurred dent
+    steepest: float | jax.Array  # largest sine of the tilt in the fit; steeper surfaces look like this one
+    widest: Array | jax.Array  # (3,), the same for the halo: a deep press all over is dark, but not black
 
 
-DARKER = (-0.36, -0.36, -0.34)  # change of a 9DTact's image for each mm of depth
+DEGREE = 5  # of the polynomial in the normal, without its constant
+POWERS = tuple((total - j, j) for total in range(1, DEGREE + 1) for j in range(total + 1))
 
 
 SENSORS: dict[str, Sensor] = {
     sensor.name: sensor
     for sensor in (
-        Sensor("gelsight", (14.16, 18.88), (480, 640), Gel(modulus=150.0, poisson=0.48, thickness=4.0), "gelsight",
-               Markers(pitch=1.6, radius=0.22, share=0.4), halo=calibration.INDENTERS["gelsight"].halo),
+        Sensor("gelsight", (14.16, 18.88), (480, 640), Gel(modulus=150.0, poisson=0.48, thickness=4.0),
+               Markers(pitch=1.6, radius=0.22, share=0.4), halo=1.5),
         Sensor("gelsight_mini", (14.16, 18.88), (480, 640), Gel(modulus=180.0, poisson=0.48, thickness=4.25),
-               "gelsight_mini", Markers(pitch=1.85, radius=0.36, share=0.5, ink=(0.10, 0.15, 0.14)),
-               contrast=0.75, halo=calibration.INDENTERS["gelsight_mini"].halo, noise=0.6),
+               Markers(pitch=1.85, radius=0.36, share=0.5, ink=(0.10, 0.15, 0.14)), contrast=0.75, noise=0.6),
         Sensor("gelslim", (15.0, 20.0), (320, 427), Gel(modulus=220.0, poisson=0.48, thickness=2.0),
-               Lights((0.20, 0.32, 0.38), (
-                   Light((-0.70, 0.35), (0.08, 0.48, 0.24), reach=0.6, height=0.3, contrast=2.6),
-                   Light((0.25, -0.85), (0.02, 0.16, 0.54), reach=0.7, height=0.3, contrast=2.6),
-                   Light((0.35, 0.95), (0.66, 0.10, 0.22), reach=0.6, height=0.3, contrast=2.8),
-                   Light((1.10, 0.20), (0.16, 0.10, 0.20), reach=0.8, height=0.3, contrast=2.6, flat=0.0),
-               )),
                Markers(pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12),
-               vignette=0.35, halo=0.8, noise=1.5),
-        Sensor("digit", (19.0, 14.25), (320, 240), Gel(modulus=120.0, poisson=0.48, thickness=2.5), "digit",
+               vignette=0.35, halo=0.8, noise=1.5, real=False),
+        Sensor("digit", (19.0, 14.25), (320, 240), Gel(modulus=120.0, poisson=0.48, thickness=2.5),
                contrast=1.4, skin=0.1, noise=0.8),
-        Sensor("9dtact", (18.0, 24.0), (480, 640), Gel(modulus=120.0, poisson=0.48, thickness=3.0), "9dtact",
+        Sensor("9dtact", (18.0, 24.0), (480, 640), Gel(modulus=120.0, poisson=0.48, thickness=3.0),
                skin=0.15, halo=0.35, noise=0.6),
         Sensor("duragel", (14.0, 18.7), (480, 640), Gel(modulus=350.0, poisson=0.48, thickness=3.0),
-               Lights((0.20, 0.17, 0.24), (
-                   Light((-1.05, 0.0), (0.40, 0.12, 0.30), reach=1.0, height=0.5, contrast=1.8),
-                   Light((1.05, -0.1), (0.06, 0.32, 0.36), reach=1.0, height=0.5, contrast=1.8),
-                   Light((0.0, 1.05), (0.36, 0.30, 0.06), reach=0.9, height=0.5, contrast=1.8),
-               )),
-               Markers(pitch=2.2, radius=0.3, share=0.3), vignette=0.2, skin=0.14, noise=1.2),
-        Sensor("tac3d", (17.0, 17.0), (20, 20), Gel(modulus=200.0, poisson=0.48, thickness=3.0), None, kind="field",
-               noise=0.01),
+               Markers(pitch=2.2, radius=0.3, share=0.3), vignette=0.2, skin=0.14, noise=1.2, real=False),
+        Sensor("tac3d", (17.0, 17.0), (20, 20), Gel(modulus=200.0, poisson=0.48, thickness=3.0), kind="field",
+               noise=0.01, real=False),
     )
 }  # fmt: skip
 
 
+@lru_cache(maxsize=1)
 def _stored() -> dict[str, Array]:
     with (files("anytouch_jax.sim.sensing") / "looks.npz").open("rb") as file, np.load(file) as pack:
         return {name: np.asarray(pack[name]) for name in pack.files}
@@ -132,67 +106,18 @@ def _stored() -> dict[str, Array]:
 @lru_cache(maxsize=16)
 def bases(sensor: Sensor) -> Array:
     """Return untouched images (units, h, w, 3) f32 in 0..1 of the whole field. They are black for a field sensor."""
-    if isinstance(sensor.look, str):
-        return _stored()[f"{sensor.look}.bases"].astype(np.float32) / 255
-    height, width = (round(30 * side / min(sensor.field)) for side in sensor.field)
-    if sensor.look is None:
-        return np.zeros((1, height, width, 3), np.float32)
-    u, v = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
-    flat = np.zeros_like(u).ravel()
-    base = np.asarray(sensor.look.ambient) + shade(sensor.look, flat, flat, u.ravel(), v.ravel(), flat_only=True)
-    return np.clip(base, 0, 1).reshape(1, height, width, 3).astype(np.float32)
+    if sensor.kind == "field":
+        return np.zeros((1, 30, 30, 3), np.float32)
+    stored = _stored()[f"{sensor.name}.bases"]
+    return stored.astype(np.float32) / 255 if stored.dtype == np.uint8 else stored
 
 
-@lru_cache(maxsize=16)
-def look(sensor: Sensor) -> Look:
-    """Return the photometry of a camera sensor. The first use may fit real data, which takes a few seconds.
-
-    Raises UserError for a field sensor, or if the package with the real frames is missing.
-    """
-    if sensor.kind != "image" or sensor.look is None:
+def look(sensor: Sensor) -> Photometry:
+    """Return the photometry of a camera sensor. Raises UserError for a field sensor."""
+    if sensor.kind != "image":
         raise UserError(f"{sensor.name} has no camera: use optics.measure_field")
-    if sensor.look in calibration.INDENTERS:
-        return Look(*calibration.fit_photometry(sensor.look))
-    if isinstance(sensor.look, Lights):
-        plain, halo = shading.fit_shading(partial(shade, sensor.look)), _soft_shadow(sensor.look)
-        return Look(plain._replace(halo=halo), plain)
-    plain, halo, widest = shading.assemble(np.zeros((120, 3)), 0.95), np.zeros((3, 3, 3), np.float32), np.full(3, 9.0)
-    if sensor.look == "9dtact":  # black paint comes nearer under clear gel, and light is lost on its way
-        halo[2, 0], widest[2] = DARKER, 1.2
-    else:
-        pack = _stored()
-        plain = plain._replace(normal=pack["digit.normal"], steepest=float(pack["digit.steepest"]))
-    return Look(plain._replace(halo=halo, widest=widest.astype(np.float32)), plain)
-
-
-def _soft_shadow(lights: Lights) -> Array:
-    """Return halo coefficients (3, 3, 3): a slope of the whole dent that faces away from a light loses its colour."""
-    halo = np.zeros((shading.HALO, len(shading.HALO_PLACES), 3), np.float32)
-    for light in lights.lights:
-        toward = np.asarray(light.place) / np.hypot(*light.place)
-        halo[:2, 0] -= lights.shadow * light.contrast * toward[:, None] * np.asarray(light.colour)
-    return halo
-
-
-def shade(lights: Lights, nx: Array, ny: Array, u: Array, v: Array, *, flat_only: bool = False) -> Array:
-    """Return the light (N, 3) from paint with tilt (nx, ny) (slope over length of the normal) at places (u, v).
-
-    Each light follows Lambert's law. A light is a bar of lamps along an edge, so its direction turns over the image by
-    a third of that of a point light. Its glow is a Gaussian of the distance to its middle, wider on flanks than on flat
-    skin. `flat_only` weights the lights as in the untouched image.
-    """
-    nz = np.sqrt(np.maximum(1 - nx**2 - ny**2, 0))
-    total = np.zeros((len(nx), 3))
-    for light in lights.lights:
-        distance = np.hypot(light.place[0] - u, light.place[1] - v)
-        reach = light.reach * (1.0 if flat_only else 1.6)
-        glow = np.exp(-(distance**2) / (2 * reach**2))
-        x, y, z = light.place[0] - u / 3, light.place[1] - v / 3, 1.2 * light.height
-        # The dent bulges toward the camera: its normal is (-slope, 1), and the side facing a light is bright.
-        facing = (nz * z - nx * x - ny * y) / np.sqrt(x**2 + y**2 + z**2)
-        weight = light.flat if flat_only else light.contrast * np.maximum(facing, 0)
-        total += (glow * weight)[:, None] * np.asarray(light.colour)
-    return total
+    normal, halo, steepest, widest = (_stored()[f"{sensor.name}.{part}"] for part in Photometry._fields)
+    return Photometry(normal, halo, float(steepest), widest)
 
 
 Leaf = Any  # numpy, or jax under vmap and jit

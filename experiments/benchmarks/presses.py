@@ -25,7 +25,9 @@ import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import interpolation
-from anytouch_jax.sim.sensing import shading
+from anytouch_jax.sim.sensing import optics
+from anytouch_jax.sim.sensing.sensors import POWERS, Photometry
+from experiments.benchmarks import photometry
 
 Array = npt.NDArray[Any]
 
@@ -178,12 +180,12 @@ def _features(
     ax, dx = interpolation.spline(jnp.asarray((columns + 0.5) / COARSE - 0.5), dent.shape[1])
     by, bx = (interpolation.blur(n, indenter.halo / pitch) for n in dent.shape)
     soft = by @ dent @ bx.T
-    nx, ny = shading.tilt(ay @ dent @ dx.T / pitch, dy @ dent @ ax.T / pitch, 0.95)
+    nx, ny = optics.tilt(ay @ dent @ dx.T / pitch, dy @ dent @ ax.T / pitch, 0.95)
     return nx, ny, jnp.stack([ay @ soft @ dx.T / pitch, dy @ soft @ ax.T / pitch, ay @ soft @ ax.T], -1)
 
 
 @lru_cache(maxsize=4)
-def fit_photometry(sensor: str, stride: int = 4) -> tuple[shading.Photometry, shading.Photometry]:
+def fit_photometry(sensor: str, stride: int = 4) -> tuple[Photometry, Photometry]:
     """Return photometric models of a real sensor with and without halo, by ridge regression on the even presses.
 
     It uses every `stride`-th pixel within two radii of each press. Raises UserError as `read_background`.
@@ -195,23 +197,23 @@ def fit_photometry(sensor: str, stride: int = 4) -> tuple[shading.Photometry, sh
     features = jax.jit(lambda c, r: _features(c, r, rows, columns, (height, width), indenter))
     u, v = np.meshgrid((columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1)
     grid, base = np.ix_(rows, columns), presses.background.astype(np.float64)
-    problem, colours, steepest, widest = [], [], 0.0, np.zeros(shading.HALO)
+    problem, colours, steepest, widest = [], [], 0.0, np.zeros(photometry.HALO)
     for k in train:
         near = np.hypot(columns - presses.centre[k, 0], rows[:, None] - presses.centre[k, 1]) < 2 * presses.radius[k]
         with jax.ensure_compile_time_eval():  # the first use may be inside a traced function
             outputs = features(presses.centre[k], presses.radius[k])
         nx, ny, soft = (np.asarray(a, np.float64)[near] for a in outputs)
         fits_drift = float(indenter.fading is None)
-        problem.append(shading.design(nx, ny, fits_drift * u[near], fits_drift * v[near], soft))
+        problem.append(photometry.design(nx, ny, fits_drift * u[near], fits_drift * v[near], soft))
         colours.append((presses.frames[k][grid] - base[grid])[near] / 255)
         steepest = max(steepest, float(np.hypot(nx, ny).max()))
         widest = np.maximum(widest, np.abs(soft).max(0))
     rows_of, changes = np.concatenate(problem), np.concatenate(colours)
     models = []
-    for columns_used in (rows_of.shape[1], len(shading.POWERS) * len(shading.PLACES)):
-        model = shading.assemble(shading.ridge(rows_of[:, :columns_used], changes), round(steepest, 3), widest)
+    for columns_used in (rows_of.shape[1], len(POWERS) * len(photometry.PLACES)):
+        model = photometry.assemble(photometry.ridge(rows_of[:, :columns_used], changes), round(steepest, 3), widest)
         if indenter.fading is not None:
-            for place in (shading.PLACES.index((2, 0)), shading.PLACES.index((0, 2))):
+            for place in (photometry.PLACES.index((2, 0)), photometry.PLACES.index((0, 2))):
                 model.normal[:, place] = -indenter.fading * model.normal[:, 0]
         models.append(model)
     return models[0], models[1]

@@ -18,9 +18,9 @@ from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError, SampleReader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background
+from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
-from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 from anytouch_jax.pretrain import pretrain
 from experiments.pouring import policy

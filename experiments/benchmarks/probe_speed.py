@@ -15,7 +15,7 @@ import time
 import numpy as np
 from sklearn.linear_model import LogisticRegression
 
-from anytouch_jax.evaluate import logistic
+from anytouch_jax.evaluate import heads
 from anytouch_jax.evaluate.probing import probe_features
 from experiments.tables import env
 
@@ -39,7 +39,7 @@ def main() -> None:
     print(f"{wall:.1f} s ({spent:.1f} s of processor), penalty {penalty:g}, accuracy {result.accuracy:.3f}")
     if env.switch("SKLEARN"):
         x = (features[:ROWS] - features[:ROWS].mean(0)) / features[:ROWS].std(0)
-        ours = next(logistic.path(x, labels[:ROWS], CLASSES, [penalty])).loss
+        ours = next(heads.logistic_path(x, labels[:ROWS], CLASSES, [penalty])).loss
         start, spent = time.perf_counter(), time.process_time()
         model = LogisticRegression(C=1 / (penalty * ROWS), tol=1e-4, max_iter=1000).fit(x, labels[:ROWS])
         wall, spent = time.perf_counter() - start, time.process_time() - spent

@@ -23,7 +23,7 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import run_in_batches
 from anytouch_jax.encoder.encoder import Encoder
-from anytouch_jax.evaluate import logistic
+from anytouch_jax.evaluate import heads
 from anytouch_jax.evaluate.statistics import mean_interval
 from anytouch_jax.objectives import normalise_touch
 from experiments.benchmarks import machine
@@ -164,7 +164,7 @@ def pooled_score(clips: Clips, splits: dict[str, Array]) -> float:
     rows = {split: one[clips.turn[one] != "none"] for split, one in splits.items()}
     y = (clips.turn == TURNS[0]).astype(int)
     scale = change[rows["train"]].std(0) + 1e-6
-    models = logistic.path(change[rows["train"]] / scale, y[rows["train"]], 2, (1.0, 0.1, 0.01), None, None)
+    models = heads.logistic_path(change[rows["train"]] / scale, y[rows["train"]], 2, (1.0, 0.1, 0.01), None, None)
 
     def share(model: Any, split: str) -> float:
         logit = change[rows[split]] / scale @ model.weights + model.bias

@@ -10,12 +10,11 @@ import numpy as np
 
 import anytouch_jax as at
 from anytouch_jax.data.images import decode
-from anytouch_jax.encoder.embed import text_column
 from experiments.notebooks.scenes import deepest, embed, scenes, show
 
 table = scenes()
 rows = np.concatenate([deepest(table, split, 400) for split in ("train", "val", "test")])
-rows = rows[text_column(table, "sensor")[rows] == "gelsight_mini"]
+rows = rows[table.text_column("sensor")[rows] == "gelsight_mini"]
 things = np.array([str(table.value(int(row), "label.indenter")) for row in rows])
 names, counts = np.unique(things, return_counts=True)
 first, second, unknown = names[np.argsort(-counts, kind="stable")][:3]

@@ -8,12 +8,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import anytouch_jax as at
-from anytouch_jax.encoder.embed import text_column
 from experiments.notebooks.scenes import deepest, embed, scenes, small_pictures
 
 table = scenes()
 rows = np.concatenate([deepest(table, split, most) for split, most in (("train", 90), ("val", 30), ("test", 40))])
-split, objects = text_column(table, "split")[rows], text_column(table, "object")[rows]
+split, objects = table.text_column("split")[rows], table.text_column("object")[rows]
 encoder = at.load_encoder("anytouch-tiny")
 features = {
     "anytouch-tiny": embed(encoder, table, rows),

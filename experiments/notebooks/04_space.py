@@ -8,14 +8,13 @@ import tempfile
 from pathlib import Path
 
 import anytouch_jax as at
-from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.evaluate import geometry, plots
 from experiments.notebooks.scenes import deepest, embed, scenes, show_file, small_pictures
 
 table = scenes()
 rows = deepest(table, "test", 30)
-sensors, objects = text_column(table, "sensor")[rows], text_column(table, "object")[rows]
-touches = text_column(table, "touch")[rows]
+sensors, objects = table.text_column("sensor")[rows], table.text_column("object")[rows]
+touches = table.text_column("touch")[rows]
 encoder = at.load_encoder("anytouch-tiny")
 spaces = {
     "pixels": small_pictures(table, rows),

@@ -17,14 +17,13 @@ import anytouch_jax as at
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest.manifest import replace_column
 from anytouch_jax.encoder.adapt import adapt, save
-from anytouch_jax.encoder.embed import text_column
 from experiments.notebooks.scenes import deepest, embed, scenes, show, small
 
 files = scenes()
 renamed = pc.replace_substring(files.table["sensor"].cast("string"), "duragel", "my_gel")
 table = replace_column(files, "sensor", renamed)
 rows = np.concatenate([deepest(table, split, most) for split, most in (("train", 50), ("test", 40))])
-mine = rows[text_column(table, "sensor")[rows] == "my_gel"]
+mine = rows[table.text_column("sensor")[rows] == "my_gel"]
 show([decode(table.file(int(row))) for row in mine[:5]], ["my_gel"] * 5, across=5)
 
 # %% [markdown]
@@ -63,11 +62,11 @@ plt.show()
 
 # %%
 universal, adapted = at.load_encoder(work / "stage1"), at.load_encoder(work / "my_gel")
-known = text_column(table, "sensor")[rows] != "my_gel"
-split = np.where(known, "train", "test")[known | (text_column(table, "split")[rows] == "test")]
-rows = rows[known | (text_column(table, "split")[rows] == "test")]
+known = table.text_column("sensor")[rows] != "my_gel"
+split = np.where(known, "train", "test")[known | (table.text_column("split")[rows] == "test")]
+rows = rows[known | (table.text_column("split")[rows] == "test")]
 labels = [table.value(int(row), "label.indenter") for row in rows]
-groups = np.char.add(text_column(table, "object")[rows].astype(str), np.where(split == "test", " new", ""))
+groups = np.char.add(table.text_column("object")[rows].astype(str), np.where(split == "test", " new", ""))
 scores = {
     name: at.probe_features(embed(encoder, table, rows), labels, groups, split, seeds=0)
     for name, encoder in (("universal tokens", universal), ("fitted tokens", adapted))

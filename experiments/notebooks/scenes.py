@@ -13,7 +13,7 @@ import numpy as np
 
 import anytouch_jax as at
 from anytouch_jax.data.images import decode
-from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.evaluate.retrieval import deepest_rows
 from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
@@ -51,7 +51,7 @@ def small(config: at.Config, steps: int, batch: int) -> at.Config:
 def deepest(table: at.Manifest, split: str, most: int) -> np.ndarray:
     """Return the rows (n,) of the deepest frame of up to `most` touches of a split, by every sensor."""
     rows = deepest_rows(table, table.rows_of(split))
-    touches = text_column(table, "touch")[rows]
+    touches = table.text_column("touch")[rows]
     return rows[np.isin(touches, np.unique(touches)[:most])]
 
 

@@ -22,7 +22,6 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import touch_evaluation
-from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, read_arrays
@@ -88,11 +87,11 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
 def read(path: Path, side: int) -> Recordings:
     """The runs of a manifest, frames resized to `side` pixels. Raises UserError: no labels, gaps, too short a run."""
     table = manifests.read(path)
-    split = text_column(table, "split")
+    split = table.text_column("split")
     part = np.isin(split, LEARNING)
     if not table.present("label.action")[part].all():
         raise UserError(f"{path}: label.action must be {', '.join(ACTIONS)} on every row of {', '.join(LEARNING)}")
-    sensors = np.unique(text_column(table, "sensor")[part])
+    sensors = np.unique(table.text_column("sensor")[part])
     if len(sensors) > 1:
         raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
     runs = sorted(_runs(table, path), key=lambda rows: split[rows[0]] == "test")
@@ -115,8 +114,8 @@ def read(path: Path, side: int) -> Recordings:
 
 def _runs(table: Manifest, path: Path) -> list[Array]:
     """The rows of each run in time. Raises UserError for a run on both sides of a split, or without a run."""
-    split = text_column(table, "split")
-    sequences = np.where(np.isin(split, LEARNING), text_column(table, "sequence"), "")
+    split = table.text_column("split")
+    sequences = np.where(np.isin(split, LEARNING), table.text_column("sequence"), "")
     names = np.unique(sequences[sequences != ""])
     if not names.size:
         raise UserError(f"{path}: no row is of split {', '.join(LEARNING)}")
@@ -141,7 +140,7 @@ def _ordered(table: Manifest, rows: Array, name: str) -> Array:
 
 
 def _numbers(table: Manifest, column: str) -> Array:
-    names = np.where(table.present(column), text_column(table, column), ACTIONS[0])
+    names = np.where(table.present(column), table.text_column(column), ACTIONS[0])
     unknown = sorted(set(names) - set(ACTIONS))
     if unknown:
         raise UserError(f"{column} {str(unknown[0])!r} is no action; use {', '.join(ACTIONS)}")

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import softmax
 
 from anytouch_jax.encoder.search import nearest
-from anytouch_jax.evaluate import logistic, statistics
+from anytouch_jax.evaluate import heads, statistics
 from experiments.real.recordings import Recordings
 
 Array = np.ndarray
@@ -56,7 +56,7 @@ def _fitted(
     """
     mean, scale = x[fit].mean(0), np.sqrt(x[fit].var(0).mean())
     scaled = ((x - mean) / scale).astype(np.float32)
-    path, results = logistic.path(scaled[fit], y[fit], classes, penalties, None, weights), []
+    path, results = heads.logistic_path(scaled[fit], y[fit], classes, penalties, None, weights), []
     for penalty, model in zip(penalties, path, strict=True):
         logits = scaled @ model.weights + model.bias
         if logits.shape[1] == 1:

@@ -26,7 +26,7 @@ from flax import nnx
 
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
 from anytouch_jax.objectives import normalise_touch
@@ -67,13 +67,13 @@ def frames(file: Path, splits: tuple[str, ...], encoder: Encoder) -> dict[str, n
         for ids, batch in evaluation(table, rows, encoder.config, "still", frames=1, unknown="universal")
     ]
     image, sensor = (np.concatenate(parts) for parts in zip(*batches, strict=True))
-    labels = {label: text_column(table, f"label.{label}")[rows] for label in LABELS}
-    return {"image": image, "sensor": sensor, "split": text_column(table, "split")[rows], **labels}
+    labels = {label: table.text_column(f"label.{label}")[rows] for label in LABELS}
+    return {"image": image, "sensor": sensor, "split": table.text_column("split")[rows], **labels}
 
 
 def contact_rows(table: manifests.Manifest, splits: tuple[str, ...]) -> np.ndarray:
-    known = np.isin(text_column(table, "split"), splits)
-    return np.flatnonzero(known & (text_column(table, "label.contact") == "1"))
+    known = np.isin(table.text_column("split"), splits)
+    return np.flatnonzero(known & (table.text_column("label.contact") == "1"))
 
 
 def touches(work: Work, encoder: Encoder) -> dict[str, np.ndarray]:
@@ -196,7 +196,7 @@ def batched(data: dict[str, np.ndarray], rows: np.ndarray) -> list[tuple[np.ndar
 
 def probes(features: dict[str, np.ndarray], table: manifests.Manifest, rows: np.ndarray) -> dict[str, Any]:
     """What linear probes of contact frames get right of each object never seen, by label."""
-    split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
+    split, groups = table.text_column("split")[rows], table.text_column("object")[rows]
     labels = {label: [table.value(int(row), f"label.{label}") for row in rows] for label in LABELS}
     return probed(features, labels, groups, split)
 
@@ -211,7 +211,7 @@ def by_encoders(seed: int, fresh: Encoder, data: dict[str, np.ndarray], work: Wo
     result = [embed_rows(one, table, rows, pooling="both", log=silent)[1] for one in named]
     pixels = background_difference(table, rows)
     features = dict(zip(NAMES, result, strict=True))
-    features["pixels"] = principal_components(pixels, text_column(table, "split")[rows] == "train")
+    features["pixels"] = principal_components(pixels, table.text_column("split")[rows] == "train")
     return {
         "settings": SETTINGS,
         "anytouch": f"{last.key} (weights {anytouch.fingerprint})",

@@ -12,7 +12,6 @@ import pyarrow as pa
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import contact_scores, mark_contact
-from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.evaluate.retrieval import deepest_rows, numbers
 
 MADE, WHOLE, STATIC, GRASP = "manifest.parquet", "contact.parquet", "static.parquet", "grasp.parquet"
@@ -36,7 +35,7 @@ def mark(folder: Path, share: float) -> None:
 def cut_all(folder: Path) -> None:
     """The cuts of a data set: <sensor>.parquet to train on, static.parquet, grasp.parquet."""
     table = manifests.read(folder / WHOLE)
-    sensors, splits = text_column(table, "sensor"), text_column(table, "split")
+    sensors, splits = table.text_column("sensor"), table.text_column("split")
     for sensor in np.unique(sensors):
         rows = np.flatnonzero((sensors == sensor) & np.isin(splits, SPLITS))
         cut(table, rows, folder / f"{sensor}.parquet", lock)
@@ -67,11 +66,11 @@ def held(table: Manifest, path: Path) -> tuple[np.ndarray, Path, Callable[[pa.Ta
     What a simulated recording has of a grasp: the press is the closing of the gripper (`label.moment` during), the end
     of the motion is after the lift (after). It slipped when more than half of its contact slid half-way through.
     """
-    splits, motion = text_column(table, "split"), text_column(table, "label.motion")
+    splits, motion = table.text_column("split"), table.text_column("label.motion")
     frame = np.asarray(table.column("frame_index"))
     slip = numbers(table, ("label.slip",), np.arange(len(table)))[:, 0]
     moving = np.isin(splits, SPLITS) & np.isin(motion, ("slide", "twist"))
-    names, codes = np.unique(text_column(table, "sequence"), return_inverse=True)
+    names, codes = np.unique(table.text_column("sequence"), return_inverse=True)
     last = np.zeros(len(names), np.int64)
     np.maximum.at(last, codes, frame)
     during, midway, after = (frame == np.round(part * last[codes]).astype(np.int64) for part in (0.35, 0.6, 0.8))

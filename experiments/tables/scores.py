@@ -17,7 +17,7 @@ import numpy as np
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
@@ -181,7 +181,7 @@ def _dynamics(leaf: Leaf, work: Places) -> dict[str, Any]:
 def _q2(leaf: Leaf, work: Places) -> dict[str, Any]:
     """The space of the test touches by the sensors trained on: numbers, and the t-SNE of some touches."""
     table = manifests.read(work.folder / "own" / cuts.STATIC)
-    sensors = text_column(table, "sensor")
+    sensors = table.text_column("sensor")
     rows = table.rows_of("test")
     rows = rows[np.isin(sensors[rows], plan.SENSORS)]
     if leaf.name == PIXELS:
@@ -199,8 +199,8 @@ def _q2(leaf: Leaf, work: Places) -> dict[str, Any]:
 
 
 def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: retrieval.Metric) -> list[Row]:
-    sensors, touch = text_column(table, "sensor")[rows], table.codes("touch", own=True)[rows]
-    about = geometry.describe(values, sensors, text_column(table, "object")[rows], touch)
+    sensors, touch = table.text_column("sensor")[rows], table.codes("touch", own=True)[rows]
+    about = geometry.describe(values, sensors, table.text_column("object")[rows], touch)
     fewest = min(len(np.unique(touch[sensors == one])) for one in np.unique(sensors))
     pooled = retrieval.cross_sensor_retrieval(
         table,
@@ -227,7 +227,7 @@ def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: 
 
 def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list[Row]:
     """The t-SNE of some touches by three sensors: {x, y, sensor, touch} of each."""
-    sensors, touch = text_column(table, "sensor")[rows], table.codes("touch", own=True)[rows]
+    sensors, touch = table.text_column("sensor")[rows], table.codes("touch", own=True)[rows]
     names = np.unique(touch)
     some = np.random.default_rng(0).permutation(names)[:TOUCHES]  # the same touches for all
     keep = np.isin(sensors, SHOWN) & np.isin(touch, some)
@@ -285,7 +285,7 @@ def adapted(work: Places, run: Path, data: Path, frames: int) -> Path:
     if not (note.exists() and json.loads(note.read_text(encoding="utf-8")) == of):
         shutil.rmtree(out, ignore_errors=True)  # begun and not finished
         table = manifests.read(data)
-        mine = (text_column(table, "sensor") == plan.UNSEEN) & (text_column(table, "split") == "train")
+        mine = (table.text_column("sensor") == plan.UNSEEN) & (table.text_column("split") == "train")
         count = min(frames, int(mine.sum()))  # toy sizes have fewer
         words = ["--model", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", count, "--labels", NEW_SENSOR]
         if main([str(word) for word in ("adapt", *words, "--out", out)]):
@@ -302,7 +302,7 @@ def labelled(folder: Path, frames: int) -> str:
     path = folder / f"new{frames}.parquet"
     if not path.exists():
         table = manifests.read(folder / cuts.STATIC)
-        new, split = text_column(table, "sensor") == plan.UNSEEN, text_column(table, "split")
+        new, split = table.text_column("sensor") == plan.UNSEEN, table.text_column("split")
         mine = np.flatnonzero(new & (split == "train"))
         keep = ~new | (split == "test")
         keep[np.random.default_rng(0).permutation(mine)[:frames]] = True

@@ -28,7 +28,7 @@ import numpy as np
 
 from anytouch_jax.cli import app
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.feature_cache import background_difference, principal_components
@@ -141,7 +141,7 @@ def probes(encoders: dict[str, Encoder], grade: str, seed: int) -> dict[str, Any
     """Linear probes on the sensor left out, universal tokens, objects never seen in the test split."""
     table = manifests.read(WORK / f"{LEFT_OUT}-{grade}" / "manifest.parquet")
     rows = np.concatenate([deepest_rows(table, table.rows_of(split)) for split in ("train", "val", "test")])
-    split, groups = text_column(table, "split")[rows], text_column(table, "object")[rows]
+    split, groups = table.text_column("split")[rows], table.text_column("object")[rows]
     found = features(encoders, seed, table, rows, "both")
     found["pixels"] = principal_components(background_difference(table, rows), split == "train")
     labels = {label: [table.value(int(row), f"label.{label}") for row in rows] for label in (*NAMED, *UNNAMED)}

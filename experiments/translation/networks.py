@@ -13,8 +13,7 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig, Stack
-from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, run_blocks, stacked_blocks, table
-from anytouch_jax.nn.matmul import stored
+from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, run_blocks, stacked_blocks, stored, table
 from anytouch_jax.ops import tokens
 
 DECODER = Stack(128, 2, 4, 512)

@@ -13,8 +13,7 @@ _HOMES = {
     "errors": "UserError",
     "batch": "AlignBatch MatchBatch Stage2Batch TouchBatch",
     "nn.functional": "Net build",
-    "ops.tokens": "patchify unpatchify",
-    "ops.masking": "random_mask",
+    "ops.tokens": "patchify random_mask unpatchify",
     "ops.losses": "alignment_loss info_nce matching_loss reconstruction_loss",
     "objectives": "stage1_loss stage1_terms stage2_loss stage2_terms trained_by",
     "train.step": "TrainState init_state make_step",
@@ -27,10 +26,10 @@ _HOMES = {
     "data.manifest.manifest": "Manifest",
     "weights.registry": "list_encoders",
     "weights.tree": "interpolate",
+    "encoder.base": "Preprocess",
     "encoder.encoder": "Encoder example_touches load_encoder random_encoder",
     "encoder.family": "FamilyEncoder",
     "encoder.linear_head": "load_head",
-    "encoder.preprocess": "Preprocess",
 }
 _ALIASES = {  # public names that say more outside their module
     "load_exported": ("encoder.export", "load"),

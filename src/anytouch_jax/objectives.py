@@ -16,7 +16,7 @@ from jax import Array
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.nn.functional import Net
-from anytouch_jax.ops import losses, masking, tokens
+from anytouch_jax.ops import losses, tokens
 
 Params = dict[str, Any]
 Metrics = dict[str, Array]
@@ -64,8 +64,8 @@ def reconstruct(
 
     See `stage1_terms`. The encoder sees the first three frames only, whatever T is.
     """
-    visible = masking.count_visible(net.model.patches, config.objective.keep_ratio)
-    keep_ids, restore_ids, hidden = masking.random_mask(noise, visible)
+    visible = tokens.count_visible(net.model.patches, config.objective.keep_ratio)
+    keep_ids, restore_ids, hidden = tokens.random_mask(noise, visible)
     past = clip[:, : net.model.frames]
     pixels = net.reconstruct(params, past, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor)
     return pixels, hidden
@@ -190,8 +190,8 @@ def stage2_terms(
     if match_noise is None:
         z_touch = touch_embeddings(params, aligned + matched, net=net)
     else:
-        visible = max(1, masking.count_visible(net.model.patches, objective.match_keep))
-        ids = jax.vmap(lambda noise: masking.random_mask(noise, visible)[0])(match_noise)
+        visible = max(1, tokens.count_visible(net.model.patches, objective.match_keep))
+        ids = jax.vmap(lambda noise: tokens.random_mask(noise, visible)[0])(match_noise)
         z_touch = touch_embeddings(params, aligned, net=net) + touch_embeddings(params, matched, net=net, keep_ids=ids)
     if align is not None:
         z, scale = align_embeddings(params, align, z_touch.pop(0), net=net), net.scale(params)

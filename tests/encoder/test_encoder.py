@@ -15,9 +15,9 @@ from anytouch_jax.config import Config, DataConfig, from_json, to_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import touch_evaluation
-from anytouch_jax.encoder.embed import Features, embed_rows, plain_column, save_npz, text_column
+from anytouch_jax.encoder.base import Preprocess
+from anytouch_jax.encoder.embed import Features, embed_rows, plain_column, save_npz
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint, convert, load, safetensors
@@ -261,7 +261,7 @@ def test_an_unknown_sensor_of_a_manifest_is_logged_once(encoder, world):
 
 def test_a_text_column_has_no_nulls(world):
     manifest = manifests.read(world)
-    column = text_column(manifest, "text")
+    column = manifest.text_column("text")
     assert column.shape == (12,) and column[0] == "a round thing, a" and column[1] == ""
 
 

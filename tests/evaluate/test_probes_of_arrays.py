@@ -366,7 +366,7 @@ def test_one_group_without_a_choice_has_no_interval() -> None:
 
 def test_an_unfinished_fit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     features, labels, groups, split = table(apart=1.0)
-    monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 2)
+    monkeypatch.setattr("anytouch_jax.evaluate.heads.STEPS", 2)
     assert any("limit of iterations" in note for note in linear_probe(features, labels, groups, split).notes)
 
 

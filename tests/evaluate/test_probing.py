@@ -433,7 +433,7 @@ def test_a_fit_that_does_not_converge_is_reported(monkeypatch):
     store = planted(labelled_features(MANY, "material", noise=1.0))
     (one,) = score_tasks(store, MANY, ["material"], seeds=2)
     assert not any("converge" in note for note in one["notes"])
-    monkeypatch.setattr("anytouch_jax.evaluate.logistic.STEPS", 1)
+    monkeypatch.setattr("anytouch_jax.evaluate.heads.STEPS", 1)
     (one,) = score_tasks(store, MANY, ["material"], seeds=2)
     assert one["notes"][-1].endswith("fits did not converge")
 

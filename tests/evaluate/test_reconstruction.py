@@ -22,8 +22,7 @@ from anytouch_jax.evaluate.reconstruction import (
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch, stage1_terms
 from anytouch_jax.ops.losses import normalise_patches, reconstruction_loss
-from anytouch_jax.ops.masking import random_mask
-from anytouch_jax.ops.tokens import patchify
+from anytouch_jax.ops.tokens import patchify, random_mask
 
 CLIP = np.random.default_rng(0).integers(0, 256, (2, 4, 28, 28, 3), np.uint8)
 

@@ -209,7 +209,7 @@ def test_the_table_catches(module: str, source: str) -> None:
         ("objectives", "from .nn.functional import Net"),
         ("objectives", "from .ops import losses\nfrom .batch import TouchBatch"),
         ("nn.touch", "from ..ops.tokens import patchify\nfrom flax import nnx\nfrom .layers import Block"),
-        ("ops.masking", "import math\nimport jax.numpy as jnp\nfrom . import tokens"),
+        ("ops.losses", "import math\nimport jax.numpy as jnp\nfrom . import tokens"),
         ("evaluate.probing", "from ..encoder.encoder import Encoder"),
         ("evaluate.probing", "if TYPE_CHECKING:\n    from .. import cli"),
         ("io.release", "from importlib import resources"),

@@ -11,8 +11,7 @@ from flax import nnx
 from tiny_models import STACK, full_model, touch_model
 
 from anytouch_jax.nn.functional import build
-from anytouch_jax.nn.layers import gelu, quick_gelu, read_blocks, run_blocks, stacked_blocks
-from anytouch_jax.nn.matmul import stored
+from anytouch_jax.nn.layers import gelu, quick_gelu, read_blocks, run_blocks, stacked_blocks, stored
 
 X = jnp.linspace(-6, 6, 241)
 

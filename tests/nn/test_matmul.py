@@ -9,8 +9,7 @@ from flax import nnx
 from tiny_models import touch_model
 
 from anytouch_jax.config import Stack
-from anytouch_jax.nn.layers import Block, gelu
-from anytouch_jax.nn.matmul import product, stored
+from anytouch_jax.nn.layers import Block, gelu, product, stored
 
 SHAPES = [(24, 12, 20), (24, 20, 12), (9, 8, 8)]  # rows, inputs, outputs: wider, narrower, as wide
 NOTHING = (0, 12, 20)

@@ -10,7 +10,7 @@ from tiny_models import touch_model
 
 from anytouch_jax.config import Stack
 from anytouch_jax.nn.functional import build
-from anytouch_jax.ops.masking import random_mask
+from anytouch_jax.ops.tokens import random_mask
 
 MODEL = touch_model()
 NET = build(MODEL)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from anytouch_jax.ops.masking import count_visible, keep, random_mask, restore
+from anytouch_jax.ops.tokens import count_visible, keep, random_mask, restore
 
 
 def test_masks_are_drawn_per_row():

@@ -14,7 +14,7 @@ from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
 from anytouch_jax.config import Config
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.functional import Net, build
-from anytouch_jax.ops import losses, masking
+from anytouch_jax.ops import losses, tokens
 from anytouch_jax.train.step import merge, split
 from anytouch_jax.weights import convert
 from tests.parity.golden_files import GRADIENT, KEY_BIAS, Case, channel_last, golden_config, golden_params, read_arrays
@@ -118,8 +118,8 @@ def _compare_norms(case: Case, label: str, grads: dict[str, Any], norms: dict[st
 def _stage1_outputs(params: Params, inputs: Any, *, net: Net, config: Config) -> dict[str, Any]:
     """Everything that the cases record of a stage-1 pass, in one program."""
     clip, sensor, noise, target = inputs
-    keep_ids, restore_ids, hidden = masking.random_mask(
-        noise, masking.count_visible(net.model.patches, config.objective.keep_ratio)
+    keep_ids, restore_ids, hidden = tokens.random_mask(
+        noise, tokens.count_visible(net.model.patches, config.objective.keep_ratio)
     )
     seen = clip[:, : net.model.frames]
     pred, _ = objectives.reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)
@@ -187,7 +187,7 @@ def _align_all(params: Params, inputs: Any, *, net: Net, config: Config) -> tupl
     total, metrics = objectives.stage2_terms(
         params, Stage2Batch(batch, None), noise, net=net, config=config, decoder_sensor=target
     )
-    hidden = masking.random_mask(noise, masking.count_visible(net.model.patches, config.objective.keep_ratio))[2]
+    hidden = tokens.random_mask(noise, tokens.count_visible(net.model.patches, config.objective.keep_ratio))[2]
     touch = losses.normalise(net.encode_touch(params, batch.clip[:, : net.model.frames], batch.sensor))
     return total, metrics, objectives.align_embeddings(params, batch, touch, net=net), hidden
 

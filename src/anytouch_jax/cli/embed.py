@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     import numpy as np
 
     from anytouch_jax.data.manifest.manifest import Manifest
+    from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.embed import Features
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.linear_head import LinearHead
     from anytouch_jax.encoder.novelty import ContactGate
-    from anytouch_jax.encoder.preprocess import Preprocess
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,8 +158,8 @@ def frames_input(
     subtracted is logged.
     """
     from anytouch_jax.data.images import BACKGROUND, decode, list_images
+    from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.novelty import ContactGate
-    from anytouch_jax.encoder.preprocess import Preprocess
 
     row, gel = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.background
     if gel is None and data.is_dir():
@@ -205,7 +205,7 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Fe
         encoder, manifest, usable, options.frames, pooling, options.join, batch=options.batch,
         on_bad_sample=options.on_bad_sample, log=log,
     )  # fmt: skip
-    keys = {name: embedding.text_column(manifest, name)[rows] for name in ("path", "sensor", "sequence", "split")}
+    keys = {name: manifest.text_column(name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
     others = ("object", "unit", "index", "timestamp")
     more = [name for name in manifest.table.column_names if name in others or name.startswith("label.")]

@@ -91,12 +91,12 @@ def _seen_by(model: Path, table: Manifest, unit: UnitHealth) -> UnitHealth:
     import numpy as np
 
     from anytouch_jax.cli.embed import contact_of_rows
-    from anytouch_jax.encoder.embed import embed_rows, text_column
+    from anytouch_jax.encoder.embed import embed_rows
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.health import contact_visible
 
-    here = (text_column(table, "sensor") == unit.sensor) & (text_column(table, "unit") == unit.unit)
-    rows = np.flatnonzero(here & (text_column(table, "split") != "background"))
+    here = (table.text_column("sensor") == unit.sensor) & (table.text_column("unit") == unit.unit)
+    rows = np.flatnonzero(here & (table.text_column("split") != "background"))
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, 96).astype(int))] if len(rows) else rows
     touched = contact_of_rows(table, rows)
     rows, touched = rows[~np.isnan(touched)], touched[~np.isnan(touched)] > 0

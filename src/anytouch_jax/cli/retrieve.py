@@ -84,7 +84,7 @@ def run(options: RetrieveOptions) -> int:
         features.check_frames(encoder.config.model, options.frames)
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
-    rows = rows[~np.isin(embedding.text_column(table, "sensor")[rows], FIELD_SENSORS)]
+    rows = rows[~np.isin(table.text_column("sensor")[rows], FIELD_SENSORS)]
     rows = retrieval.deepest_rows(table, rows, frames=options.frames)
     settings: dict[str, Any] = {
         "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
@@ -149,7 +149,7 @@ def _query(options: RetrieveOptions, encoder: Encoder, about: dict[str, str]) ->
     import numpy as np
 
     from anytouch_jax.data import images
-    from anytouch_jax.encoder.preprocess import Preprocess
+    from anytouch_jax.encoder.base import Preprocess
 
     path, pooling = Path(str(options.query)), about.get("pooling", "class")
     length = int(about.get("frames", "1")) if about.get("frames", "1").isdecimal() else 1

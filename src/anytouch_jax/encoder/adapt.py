@@ -23,7 +23,7 @@ from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.base import precision
-from anytouch_jax.encoder.embed import Log, embed_rows, text_column
+from anytouch_jax.encoder.embed import Log, embed_rows
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder, atomic_write
@@ -83,9 +83,7 @@ def adapt(
     with precision(config):
         classes, prototypes = _classes(run, manifest, sensor, labels, log)
         fitted = choose_frames(manifest, sensor, "train", frames, classes, seed)
-        in_val = (
-            (text_column(manifest, "sensor") == sensor) & (text_column(manifest, "split") == "val") & (classes >= 0)
-        )
+        in_val = (manifest.text_column("sensor") == sensor) & (manifest.text_column("split") == "val") & (classes >= 0)
         rows, measured = fitted[:MEASURED], "fitted"
         if count := min(int(in_val.sum()), MEASURED):
             rows, measured = choose_frames(manifest, sensor, "val", count, classes, seed), "val"
@@ -135,8 +133,8 @@ def choose_frames(
 
     With `classes` i32 (rows of the manifest,) only rows that have a class (not -1). Raises UserError for too few rows.
     """
-    sensors = text_column(manifest, "sensor")
-    usable_rows = (sensors == sensor) & (text_column(manifest, "split") == split)
+    sensors = manifest.text_column("sensor")
+    usable_rows = (sensors == sensor) & (manifest.text_column("split") == split)
     rows = np.flatnonzero(usable_rows if classes is None else usable_rows & (classes >= 0))
     if len(rows) < count:
         raise UserError(
@@ -192,10 +190,10 @@ def _classes(run: str | Path, manifest: Manifest, sensor: str, labels: str, log:
         raise UserError(f"the manifest has no column {labels!r} or 'label.{labels}' for --labels; name another")
     if pa.types.is_floating(manifest.table[column].type):
         raise UserError(f"--labels {labels} is a column of measurements; name a column of classes")
-    value, sensors = text_column(manifest, column), text_column(manifest, "sensor")
+    value, sensors = manifest.text_column(column), manifest.text_column("sensor")
     encoder = load_encoder(run)
     known = np.isin(sensors, encoder.config.model.sensors) & (sensors != sensor)
-    labelled = known & (value != "") & (text_column(manifest, "split") == "train")
+    labelled = known & (value != "") & (manifest.text_column("split") == "train")
     rows = np.random.default_rng(0).permutation(np.flatnonzero(labelled))[:PROTOTYPE_ROWS]
     if not rows.size:
         raise UserError(f"--labels needs frames of sensors that {run} knows, with a {labels}, in split 'train'")

@@ -19,10 +19,9 @@ import numpy.typing as npt
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
-from anytouch_jax.data.transforms import subtract_background, touch_evaluation, vision_evaluation
+from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
 from anytouch_jax.encoder.arrays import rows_of_sensors
 from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
-from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
@@ -284,6 +283,39 @@ class Encoder:
         if name not in self.others:
             raise UserError(f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has one")
         return dict(self.others)[name]
+
+
+class Preprocess:
+    """Frames of one sensor in the form that an encoder was trained on.
+
+    They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and resized. For an encoder
+    that `subtracts`, the `background` (a frame of the untouched gel) is subtracted first. Without a background an
+    encoder that needs one takes the first frame, and another takes frames without subtraction.
+
+    >>> preprocess = Preprocess(encoder, background=camera.read())
+    >>> features = encoder.encode_touch(preprocess(camera.read()), "digit")
+    """
+
+    def __init__(
+        self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
+    ) -> None:
+        self._prepare = encoder.prepare
+        self._subtracts = encoder.needs_background or (encoder.subtracts and background is not None)
+        self._orient = partial(orient_frame, rotate=rotate, flip=flip)
+        self._background = None
+        if background is not None:
+            self._background = self._orient(to_rgb(np.asarray(background), "the background"))
+
+    def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
+        """Return a frame as RGB u8 (size, size, 3), or as an encoder of another family reads it.
+
+        `frame` is RGB u8 (h, w, 3), or grey, RGBA, u16 or floats in 0..1. Raises ImageError for any other.
+        """
+        frame = np.ascontiguousarray(self._orient(to_rgb(np.asarray(frame), "the frame")))
+        if self._subtracts:
+            self._background = frame if self._background is None else self._background
+            return self._prepare(frame, self._background)
+        return self._prepare(frame)
 
 
 def _unit(values: npt.ArrayLike) -> np.ndarray:

@@ -88,7 +88,7 @@ def embed_rows(
     """
     if not len(rows):
         raise UserError("there are no rows to embed; check the split and the filters")
-    for name in sorted(set(text_column(manifest, "sensor")[rows])) if sensor_row is None else ():
+    for name in sorted(set(manifest.text_column("sensor")[rows])) if sensor_row is None else ():
         encoder.sensor_row(name, log)
     if on_bad_sample == "error":
         manifest = with_backgrounds(encoder, manifest, rows, log)
@@ -182,16 +182,11 @@ def with_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray, log
     return replace_column(manifest, "background_path", cells)
 
 
-def text_column(manifest: Manifest, name: str) -> np.ndarray:
-    """Return a column of a manifest as strings, "" for null."""
-    return np.array(["" if value is None else str(value) for value in manifest.column(name).to_pylist()])
-
-
 def plain_column(manifest: Manifest, name: str) -> np.ndarray:
     """Return a column of a manifest as an array without objects: numbers with NaN for null, all others as text."""
     kind = manifest.column(name).type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return text_column(manifest, name)
+        return manifest.text_column(name)
     return np.asarray([np.nan if value is None else value for value in manifest.column(name).to_pylist()])
 
 

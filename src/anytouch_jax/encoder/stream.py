@@ -23,10 +23,9 @@ import jax
 import numpy as np
 
 from anytouch_jax.data.images import QUIET, frame_time, open_video, to_rgb
-from anytouch_jax.encoder.base import precision
+from anytouch_jax.encoder.base import Preprocess, precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
-from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.errors import UserError
 
 PARTS = ("decode", "resize", "copy", "encoder")

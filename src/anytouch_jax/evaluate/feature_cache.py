@@ -20,7 +20,7 @@ from anytouch_jax.config import preset
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, read_npz, save_npz, text_column
+from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, read_npz, save_npz
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import Scaling
@@ -132,7 +132,7 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
     if len(np.unique(rows)) < len(rows) or rows.min() < 0 or rows.max() >= len(table):
         raise UserError(f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}.")
     paths = features.keys.get("path")
-    if paths is not None and (paths != text_column(table, "path")[rows]).any() and len(table.files) == 1:
+    if paths is not None and (paths != table.text_column("path")[rows]).any() and len(table.files) == 1:
         raise UserError(f"{path} holds features of another manifest. Its paths differ from those of these rows.")
     order = np.argsort(rows)
     rows, values = rows[order], values[order].astype(np.float32)

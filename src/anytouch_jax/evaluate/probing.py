@@ -27,7 +27,7 @@ from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.encoder.linear_head import LinearHead, save_head
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import feature_cache, logistic, splits, statistics, tasks
+from anytouch_jax.evaluate import feature_cache, splits, statistics, tasks
 from anytouch_jax.evaluate import heads as probe_heads
 from anytouch_jax.evaluate.feature_cache import RANDOM, RAW, FeatureSource, Order
 from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearModel, ProbeHead, Scaling
@@ -539,7 +539,7 @@ def _labelled(source: FeatureSource, plan: _Plan) -> LabelledFeatures:
         raise UserError(f"Task {plan.task.name}: features are NaN or infinite. Did the training diverge?")
     if source.scaling == "common":  # components are fitted on rows that are never tested, if there are any
         fitted = ~plan.roles.test if splits.split_scheme(plan.roles)[0] == "split" else np.ones(len(x), bool)
-        with logistic.threads(x.size * feature_cache.COMPONENTS):
+        with probe_heads.threads(x.size * feature_cache.COMPONENTS):
             x = feature_cache.principal_components(x, fitted, solver="randomized")
     return LabelledFeatures(x, plan.roles.y, plan.names, plan.roles.groups)
 

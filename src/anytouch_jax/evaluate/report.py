@@ -23,7 +23,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import known_contact
-from anytouch_jax.encoder.embed import embed_rows, text_column
+from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, plots, probing, retrieval, statistics
@@ -164,8 +164,8 @@ def _lineage(stage1: Path, second: Encoder) -> str:
 
 
 def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Section:
-    split, objects = text_column(table, "split"), text_column(table, "object")
-    touch, sensors = table.codes("touch", own=True), text_column(table, "sensor")
+    split, objects = table.text_column("split"), table.text_column("object")
+    touch, sensors = table.codes("touch", own=True), table.text_column("sensor")
     rows = []
     for name in manifests.SPLITS:
         part = split == name
@@ -193,8 +193,8 @@ def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[
     grades = _grades(manifest, rows, "")
     for grade in np.unique(grades):
         part = rows[grades == grade]
-        sensor, touch = text_column(manifest, "sensor")[part], manifest.codes("touch", own=True)[part]
-        objects, names = text_column(manifest, "object")[part], np.unique(sensor).tolist()
+        sensor, touch = manifest.text_column("sensor")[part], manifest.codes("touch", own=True)[part]
+        objects, names = manifest.text_column("object")[part], np.unique(sensor).tolist()
         images, titles, captions = [], [], []
         for code in _varied_touches(touch, sensor, objects, seed):
             row_of = {str(sensor[i]): int(part[i]) for i in np.flatnonzero(touch == code)[::-1]}
@@ -215,7 +215,7 @@ def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[
 
 def _grades(table: Manifest, rows: Array, default: str) -> Array:
     known = "grade" in table.table.column_names
-    return text_column(table, "grade")[rows] if known else np.full(len(rows), default)
+    return table.text_column("grade")[rows] if known else np.full(len(rows), default)
 
 
 def _varied_touches(touch: Array, sensor: Array, objects: Array, seed: int) -> list[int]:
@@ -276,7 +276,7 @@ def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) 
     image = reconstruction_panels(params, batch.clip, batch.sensor, net=encoder.net, config=config)
     path = folder / "figures" / "reconstructions.png"
     write_png(path, image)
-    names = ", ".join(text_column(manifest, "sensor")[rows])
+    names = ", ".join(manifest.text_column("sensor")[rows])
     share = f"{config.objective.keep_ratio:.0%}".replace("%", " %")
     text = f"Stage 1 reads {share} of the patches of a held-out object. From above: {names}."
     title, table = "Reconstructions", ""
@@ -325,7 +325,7 @@ def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed:
         values = embed_rows(encoder, table, rows, pooling="both", log=log)[1]
         classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)
     pixels, notes = _baseline(PIXELS, lambda: background_difference(table, rows))
-    return _Study(table, rows, text_column(table, "split")[rows], classes, patches, pixels, tuple(notes))
+    return _Study(table, rows, table.text_column("split")[rows], classes, patches, pixels, tuple(notes))
 
 
 def _baseline(name: str, make: Callable[[], Array]) -> tuple[Array | None, list[str]]:
@@ -336,12 +336,12 @@ def _baseline(name: str, make: Callable[[], Array]) -> tuple[Array | None, list[
 
 
 def _with_images(table: Manifest, rows: Array) -> Array:
-    return rows[~np.isin(text_column(table, "sensor")[rows], FIELD_SENSORS)]
+    return rows[~np.isin(table.text_column("sensor")[rows], FIELD_SENSORS)]
 
 
 def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
     """Return the deepest rows of at most `touches` whole touches of a split; none of an empty train or val."""
-    if split != "test" and split not in set(text_column(table, "split")):
+    if split != "test" and split not in set(table.text_column("split")):
         return np.zeros(0, np.int64)
     rows = deepest_rows(table, _with_images(table, table.rows_of(split)))
     codes = table.codes("touch", own=True)[rows]
@@ -354,7 +354,7 @@ def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
 def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[geometry.Space]]:
     """Return the section and the numbers of the feature spaces: alignment, uniformity, silhouettes, t-SNE."""
     rows = study.test(study.rows)
-    sensors, objects = text_column(study.manifest, "sensor")[rows], text_column(study.manifest, "object")[rows]
+    sensors, objects = study.manifest.text_column("sensor")[rows], study.manifest.text_column("object")[rows]
     touch = study.manifest.codes("touch", own=True)[rows]
     drawn = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_T_SNE_ROWS])
     features = {name: study.test(values) for name, values in study.classes.items()}
@@ -384,7 +384,7 @@ def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, 
     vector, missing = _baseline(VECTOR, lambda: contact_vector(table, rows))
     features |= {} if vector is None else {VECTOR: vector}
     notes += missing
-    grades, sensors = _grades(table, rows, "test"), text_column(table, "sensor")[rows]
+    grades, sensors = _grades(table, rows, "test"), table.text_column("sensor")[rows]
     touch = table.codes("touch", own=True)[rows]
     results: dict[str, dict[str, list[retrieval.Retrieval]]] = {}
     for grade in map(str, np.unique(grades)):
@@ -481,7 +481,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
     features = {name: np.concatenate([study.classes[name], study.patches[name]], 1) for name in study.classes}
     if study.pixels is not None:
         features[PIXELS] = principal_components(study.pixels, study.split == "train")
-    objects, sequences = text_column(table, "object")[rows], text_column(table, "sequence")[rows]
+    objects, sequences = table.text_column("object")[rows], table.text_column("sequence")[rows]
     groups = np.where(objects == "", sequences, objects)
     results: dict[str, list[ProbeResult]] = {}
     for label in LABELS:

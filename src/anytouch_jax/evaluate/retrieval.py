@@ -20,7 +20,6 @@ from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.loading.matching import Matches, MatchKeys
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
-from anytouch_jax.encoder.embed import text_column
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import Array, mean_interval
@@ -100,7 +99,7 @@ def cross_sensor_retrieval(
             raise UserError(f"Features {name!r} have {len(values)} rows. They must have one for each of {len(rows)}.")
     used, place, covariates, notes = _usable(manifest, rows, match)
     sensors, units, objects, touch = (
-        text_column(manifest, name)[used] for name in ("sensor", "unit", "object", "touch")
+        manifest.text_column(name)[used] for name in ("sensor", "unit", "object", "touch")
     )
     if len(manifest.files) > 1:
         touch = _joined(touch, manifest.source[used])  # equal names of joined manifests are not one touch
@@ -172,7 +171,7 @@ def _usable(
 ) -> tuple[Array, Array, tuple[str, ...], tuple[str, ...]]:
     """Return the rows to use, their places in `rows`, the covariates of the manifest, and notes."""
     used, notes = deepest_rows(manifest, rows), []
-    is_field = np.isin(text_column(manifest, "sensor")[used], FIELD_SENSORS)
+    is_field = np.isin(manifest.text_column("sensor")[used], FIELD_SENSORS)
     used = used[~is_field]
     if is_field.any():
         notes.append(f"{int(is_field.sum())} touches by force-field sensors, which have no images, left out")
@@ -353,7 +352,7 @@ def score_matching(encoder: Encoder, manifest: Manifest, rows: Array, features: 
     part of the answer, since a positive never has the anchor's sensor. `features` (n, E) are those of manifest `rows`
     (n,), pooling class. Raises UserError without a matching head, and if two sensors share no touch.
     """
-    objects, scores = text_column(manifest, "object")[rows], []
+    objects, scores = manifest.text_column("object")[rows], []
     encoder.match(features[:1], features[:1])  # raises without a head
     for negatives in NEGATIVES:
         anchor, positive, negative = draw_triples(manifest, rows, negatives)
@@ -459,7 +458,7 @@ def contact_vector(manifest: Manifest, rows: Array) -> Array:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise UserError(f"{manifest.where(int(rows[bad[0]]))} has no value in one of {', '.join(names)}; add it")
-    sensors = text_column(manifest, "sensor")[rows]
+    sensors = manifest.text_column("sensor")[rows]
     for sensor in np.unique(sensors):
         part = values[sensors == sensor]
         spread = part.std(axis=0, keepdims=True)

@@ -17,7 +17,7 @@ from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.manifest.manifest import KEYS, Manifest
 from anytouch_jax.data.manifest.schema import EMPTY, spellings
 from anytouch_jax.data.prepare.contact import known_contact
-from anytouch_jax.encoder.embed import Pooling, text_column
+from anytouch_jax.encoder.embed import Pooling
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import GradientRecipe
 from anytouch_jax.evaluate.statistics import Array
@@ -161,7 +161,7 @@ def label_task(
     """
     conditions: list[tuple[str, str | float]] = [(find_column(table, where[0]), where[1])] if where else []
     if sensor is not None:
-        if sensor not in (known := sorted(set(text_column(table, "sensor")))):
+        if sensor not in (known := sorted(set(table.text_column("sensor")))):
             raise UserError(f"No row is of sensor {sensor!r}. The manifest has {', '.join(known)}.")
         conditions.append(("sensor", sensor))
     name = label.removeprefix("label.")
@@ -186,8 +186,8 @@ def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> d
 
     Alignment may have named the first. Empty if all or none have.
     """
-    values = text_column(table, column)
-    described = (table.present("image_path") | table.present("text")) & (text_column(table, "split") == "train")
+    values = table.text_column(column)
+    described = (table.present("image_path") | table.present("text")) & (table.text_column("split") == "train")
     mask = np.isin(values[rows], np.setdiff1d(values[described], [""]))
     if mask.all() or not mask.any():
         return {}
@@ -203,16 +203,16 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     if not _has_values(table, task.label):
         known = ", ".join(name for name in table.table.column_names if name.startswith("label.")) or "none"
         raise UserError(f"Task {task.name}: no row has a value in column {task.label!r}. The labels are {known}.")
-    labels, split = _labels(table, task), text_column(table, "split")
+    labels, split = _labels(table, task), table.text_column("split")
     if task.test_list is not None:  # whichever list decided the split of this manifest
         if "downstream_test" not in table.table.column_names:
             raise UserError(f"Task {task.name} needs the column downstream_test. Index the data set again.")
-        listed = [task.test_list in name.split("+") for name in text_column(table, "downstream_test")]
+        listed = [task.test_list in name.split("+") for name in table.text_column("downstream_test")]
         split = np.where(listed, "test", "train")
     used = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
-    used &= np.isin(split, ("train", "val", "test")) & ~np.isin(text_column(table, "sensor"), FIELD_SENSORS)
+    used &= np.isin(split, ("train", "val", "test")) & ~np.isin(table.text_column("sensor"), FIELD_SENSORS)
     for column, value in task.where:
-        used &= text_column(table, column) == value if isinstance(value, str) else number_column(table, column) > value
+        used &= table.text_column(column) == value if isinstance(value, str) else number_column(table, column) > value
     length = max(task.frames, frames or 1)
     if length > 1:
         used &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
@@ -229,7 +229,7 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
             f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or Unicode form. They are "
             "probed as different classes." for alike in spellings(labels[first].tolist())
         )  # fmt: skip
-    sensors, units = (text_column(table, name)[first] for name in ("sensor", "unit"))
+    sensors, units = (table.text_column(name)[first] for name in ("sensor", "unit"))
     return TaskRows(rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes)
 
 
@@ -319,7 +319,7 @@ def _touching(table: Manifest) -> Array:
 
 def _groups(table: Manifest, columns: Sequence[str]) -> Array:
     """Return the group of each row: the first column with a value, else the sequence; keys differ between manifests."""
-    sequence = text_column(table, "sequence")
+    sequence = table.text_column("sequence")
     file = np.array([f" of file {number}" if len(table.files) > 1 else "" for number in table.source], dtype=str)
     groups = np.char.add(np.char.add("sequence ", sequence), file)
     for name in reversed(columns):
@@ -327,7 +327,7 @@ def _groups(table: Manifest, columns: Sequence[str]) -> Array:
             recordings = np.array([f"recording {key.rpartition('/')[0] or key}" for key in sequence])
             groups = np.char.add(recordings, file) if len(set(recordings)) > 1 else groups
         elif name in table.table.column_names:
-            values = text_column(table, name)
+            values = table.text_column(name)
             keys = np.char.add(values, file) if name in KEYS else values
             groups = np.where(values != "", np.char.add(f"{name} ", keys), groups)
     return groups
@@ -342,7 +342,7 @@ def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Arra
     """Return rows (n, 2) of the two units of each grasp, by the units' names; the labelled row of each; and notes."""
     name = _grasp_column(table)
     rows = rows[table.present(name)[rows] & table.present("unit")[rows]]
-    grasp, unit = table.codes(name, own=True)[rows], text_column(table, "unit")[rows]
+    grasp, unit = table.codes(name, own=True)[rows], table.text_column("unit")[rows]
     order = np.lexsort((unit, grasp))
     rows, grasp, unit = rows[order], grasp[order], unit[order]
     starts, counts = np.unique(grasp, return_index=True, return_counts=True)[1:]
@@ -352,7 +352,7 @@ def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Arra
     notes = [f"{len(starts) - len(whole)} grasps without two fingers left out"] if len(starts) > len(whole) else []
     labelled = pairs[:, 0]
     if task.phase == "after":
-        sequence, source = text_column(table, "sequence"), table.source  # of the form <grasp>/after/<finger>
+        sequence, source = table.text_column("sequence"), table.source  # of the form <grasp>/after/<finger>
         after = {(source[row], sequence[row]): row for row in range(len(table)) if "/after/" in sequence[row]}
         keys = [(source[row], sequence[row].replace("/during/", "/after/")) for row in pairs.ravel()]
         pairs = np.array([after.get(key, -1) for key in keys], np.int64).reshape(pairs.shape)

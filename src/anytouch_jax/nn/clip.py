@@ -9,8 +9,16 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig, Stack, TextTower
-from anytouch_jax.nn.layers import ACTIVATIONS, Dense, LayerNorm, rows_of, run_blocks, stacked_blocks, table
-from anytouch_jax.nn.matmul import stored
+from anytouch_jax.nn.layers import (
+    ACTIVATIONS,
+    Dense,
+    LayerNorm,
+    rows_of,
+    run_blocks,
+    stacked_blocks,
+    stored,
+    table,
+)
 from anytouch_jax.ops import tokens
 
 Params = dict[str, Any]

@@ -15,14 +15,15 @@ from anytouch_jax.nn.layers import (
     LayerNorm,
     blocks_between,
     gelu,
+    product,
     read_blocks,
     rows_of,
     run_blocks,
     stacked_blocks,
+    stored,
     table,
 )
-from anytouch_jax.nn.matmul import product, stored
-from anytouch_jax.ops import masking, tokens
+from anytouch_jax.ops import tokens
 
 
 class TouchPatch(nnx.Module):
@@ -109,7 +110,7 @@ class TouchEncoder(nnx.Module):
         patches = tokens.patchify(clip, self.patch_size)
         position = jnp.broadcast_to(self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape))
         if keep_ids is not None:
-            patches, position = masking.keep(patches, keep_ids), masking.keep(position, keep_ids)
+            patches, position = tokens.keep(patches, keep_ids), tokens.keep(position, keep_ids)
         x = self.patch(patches, sensor)
         start = jnp.broadcast_to(
             (self.class_token[...] + self.position[...][0])[None, None], (clip.shape[0], 1, x.shape[-1])
@@ -172,7 +173,7 @@ class TouchDecoder(nnx.Module):
         position = self.position[...].astype(x.dtype)
         start = x[:, :1] + position[None, :1]
         own = x[:, 1 : self.special] if sensor_tokens is None else self.sensor_projection(sensor_tokens)
-        grid = masking.restore(x[:, self.special :], self.mask_token[...], restore_ids) + position[None, 1:]
+        grid = tokens.restore(x[:, self.special :], self.mask_token[...], restore_ids) + position[None, 1:]
         x = jnp.concatenate([start, own, grid], axis=1)
         x = self.norm(run_blocks(self.blocks, x, remat=self.remat))[:, self.special :]
         return self.pixels(x, frames)

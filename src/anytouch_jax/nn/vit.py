@@ -11,8 +11,18 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.nn.layers import Block, Dense, LayerNorm, gelu, lean, rows_of, run_blocks, stacked_blocks, table
-from anytouch_jax.nn.matmul import product
+from anytouch_jax.nn.layers import (
+    Block,
+    Dense,
+    LayerNorm,
+    gelu,
+    lean,
+    product,
+    rows_of,
+    run_blocks,
+    stacked_blocks,
+    table,
+)
 from anytouch_jax.ops import tokens
 
 Resample = Literal["none", "bicubic", "shifted", "antialias"]

@@ -1,6 +1,7 @@
-"""Images and clips as token sequences: patches, position tables, segments, sensor tokens (Sec. 3.1, 3.5).
+"""Images and clips as token sequences: patches, position tables, segments, sensor tokens (Sec. 3.1, 3.5), masking.
 
-B batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, D width.
+B batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, K kept ones, D width. Masking is random
+(Sec. 3.2; He et al., 2022).
 """
 
 from __future__ import annotations
@@ -72,3 +73,32 @@ def draw_tokens(sensor: Array, uniform: Array, probability: Array, universal_row
     `sensor` i32 (B,), `uniform` (B,) in [0, 1). Returns rows i32 (B,) of the sensor-token table.
     """
     return jnp.where(uniform < probability, universal_row, sensor)
+
+
+def count_visible(positions: int, ratio: float) -> int:
+    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the release."""
+    return int(positions * ratio)
+
+
+def random_mask(noise: Array, keep: int) -> tuple[Array, Array, Array]:
+    """Keep the `keep` positions of smallest noise, each sample by its own row of `noise` (B, N).
+
+    Returns keep_ids (B, K) in ascending order of noise, restore_ids (B, N), and hidden (B, N). Position n is element
+    restore_ids[n] of [visible, hidden]. `hidden` is True where a position was removed (Omega_M of Eq. 1).
+    """
+    order = jnp.argsort(noise, axis=1)
+    restore_ids = jnp.argsort(order, axis=1)
+    return order[:, :keep], restore_ids, restore_ids >= keep
+
+
+def keep(x: Array, keep_ids: Array) -> Array:
+    """Return the positions `keep_ids` (B, K) of `x` (B, N, ...), as (B, K, ...)."""
+    ids = keep_ids.reshape(keep_ids.shape + (1,) * (x.ndim - 2))
+    return jnp.take_along_axis(x, ids, axis=1)
+
+
+def restore(visible: Array, mask_token: Array, restore_ids: Array) -> Array:
+    """Put `visible` (B, K, D) back to its positions and the mask token (D,) everywhere else: (B, N, D)."""
+    batch, count, width = visible.shape
+    hidden = jnp.broadcast_to(mask_token.astype(visible.dtype), (batch, restore_ids.shape[1] - count, width))
+    return jnp.take_along_axis(jnp.concatenate([visible, hidden], axis=1), restore_ids[..., None], axis=1)

@@ -27,9 +27,9 @@ from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import unit_rows
+from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.encoder.linear_head import LinearHead
-from anytouch_jax.encoder.preprocess import Preprocess
 from anytouch_jax.encoder.stream import Embedded, open_source, stream
 from anytouch_jax.errors import UserError
 from anytouch_jax.view.space import FeatureMap

@@ -14,8 +14,7 @@ import numpy as np
 from anytouch_jax.config import UNIVERSAL, ModelConfig
 from anytouch_jax.weights.compatible import resize_position
 from anytouch_jax.weights.keymaps import Entry, Heads, KeyMap, Shape, Weights, param_shapes
-from anytouch_jax.weights.keymaps.anytouch import PROBE, STAGE1, STAGE2
-from anytouch_jax.weights.keymaps.clip import HF_CLIP, OPENCLIP
+from anytouch_jax.weights.layouts import HF_CLIP, OPENCLIP, PROBE, STAGE1, STAGE2
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten, nest
 

@@ -16,9 +16,9 @@ from anytouch_jax.config.parsing import Above0, Count, check, read_value
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Resample, Vit, VitConfig
-from anytouch_jax.weights import compatible, load, registry
+from anytouch_jax.weights import compatible, layouts, load, registry
 from anytouch_jax.weights.convert import KEYMAPS, check_arrays, file_shapes, fill, refuse_unknown
-from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth, vit
+from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten, nest
 
@@ -101,7 +101,7 @@ _HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_to
 _PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"
 _PHOTO = Preparation(crop="centre", filter="bicubic", mean=IMAGENET_MEAN, std=IMAGENET_STD)
 _DINOV2: dict[str, Any] = {"unused": r"mask_token|embeddings\.mask_token", "image_size": (224, 224)}
-_HF_VIT: dict[str, Any] = {"prefixes": ("vit.", "deit.", ""), "unused": _PARTS, "eps": 1e-12, "resample": "bicubic"}
+_HF_VIT: dict[str, Any] = {"prefixes": ("layouts.", "deit.", ""), "unused": _PARTS, "eps": 1e-12, "resample": "bicubic"}
 FAMILIES = (
     *(
         Family(
@@ -112,11 +112,13 @@ FAMILIES = (
             lacks=("cls_token",), unused="mask_token", image_size=(320, 240), frames=frames, video=frames == 4,
             feature="mean", tokens="patches",
         )
-        for title, table, frames, stride in (("Sparsh", vit.SPARSH, 2, 5), ("Sparsh V-JEPA", vit.SPARSH_VIDEO, 4, 2))
+        for title, table, frames, stride in (
+            ("Sparsh", layouts.SPARSH, 2, 5), ("Sparsh V-JEPA", layouts.SPARSH_VIDEO, 4, 2)
+        )
     ),
     Family(
         "anytouch2", "AnyTouch 2", "MIT", "GelSight, DIGIT, GelSight Mini, DuraGel by tokens",
-        vit.ANYTOUCH2, ("touch_model.embeddings.patch_embedding.weight", "sensor_token"),
+        layouts.ANYTOUCH2, ("touch_model.embeddings.patch_embedding.weight", "sensor_token"),
         Preparation("subtract", "offset", mean=CLIP_MEAN, std=CLIP_STD),  # not ImageNet's, unlike AnyTouch
         lacks=("video_patch_embedding.weight",), prefixes=("touch_mae_model.",), eps=1e-5, frames=4, video=True,
         unused=r"(decoder|mask_token|new_position_ids).*", feature="projected", tokens="hidden",
@@ -124,36 +126,36 @@ FAMILIES = (
     ),
     Family(
         "sitr", "SITR", "MIT by its README, without a licence file", "GelSight designs, by calibration images",
-        vit.SITR, (*_TIMM_NEEDS, "contrastive_head.weight"),
+        layouts.SITR, (*_TIMM_NEEDS, "contrastive_head.weight"),
         Preparation("subtract", "plain", crop="square",
                     mean=(-1.2223, -1.8114, -1.7090), std=(11.7932, 12.7956, 13.6452)),
         prefixes=("base_model.", ""), unused=r"decoder_pred\..*", eps=1e-5, feature="unit",
     ),
     Family(
         "dinov2", "DINOv2 (Hugging Face)", _APACHE, _IMAGES,
-        vit.HF_DINOV2, (*_HF_NEEDS, "encoder.layer.0.layer_scale1.lambda1"), _PHOTO,
+        layouts.HF_DINOV2, (*_HF_NEEDS, "encoder.layer.0.layer_scale1.lambda1"), _PHOTO,
         prefixes=("dinov2.", "dinov2_with_registers.", ""), resample="bicubic", **_DINOV2,
     ),
     Family(
         "dinov2", "DINOv2 (its authors' layout)", _APACHE, _IMAGES,
-        vit.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma"), _PHOTO, resample="shifted", **_DINOV2,
+        layouts.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma"), _PHOTO, resample="shifted", **_DINOV2,
     ),
     Family(
         "vit_mae", "ViT-MAE (Hugging Face)", _NON_COMMERCIAL, _IMAGES,
-        vit.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO,
+        layouts.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO,
         beside="decoder.mask_token", **_HF_VIT,
     ),
     Family(
         "vit", "ViT or DeiT (Hugging Face)", _APACHE, _IMAGES,
-        vit.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO, **_HF_VIT,
+        layouts.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO, **_HF_VIT,
     ),
     Family(
         "t3", "T3", "MIT", "one file for each sensor",
-        vit.T3, (*_TIMM_NEEDS, "trunk.norm.weight"), replace(_PHOTO, filter="bilinear"), resample="bicubic",
+        layouts.T3, (*_TIMM_NEEDS, "trunk.norm.weight"), replace(_PHOTO, filter="bilinear"), resample="bicubic",
     ),
     Family(
         "vit", "ViT, DeiT or MAE (timm's layout)", "that of the weights (DeiT: Apache-2.0, MAE: CC BY-NC 4.0)", _IMAGES,
-        vit.TIMM, (*_TIMM_NEEDS, "norm.weight"), _PHOTO, unused=_PARTS, resample="antialias",
+        layouts.TIMM, (*_TIMM_NEEDS, "norm.weight"), _PHOTO, unused=_PARTS, resample="antialias",
     ),
 )
 # fmt: on

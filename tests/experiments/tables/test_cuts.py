@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.embed import text_column
 from experiments.tables import cuts, plan, scores
 
 SENSORS = ("digit", "gelsight", plan.UNSEEN)
@@ -41,8 +40,8 @@ def folder(tmp_path_factory):
 
 def test_a_sensor_by_itself_has_touches_of_nobody(folder):
     table = manifests.read(folder / "digit.parquet")
-    assert set(text_column(table, "sensor")) == {"digit"} and len(table) == 9 * FRAMES
-    assert not table.present("touch").any() and "background" not in text_column(table, "split")
+    assert set(table.text_column("sensor")) == {"digit"} and len(table) == 9 * FRAMES
+    assert not table.present("touch").any() and "background" not in table.text_column("split")
     assert len(table.clips(4, "train")) == 3 * (FRAMES - 3)
 
 
@@ -54,12 +53,12 @@ def test_static_is_the_deepest_frame_of_each_recording(folder):
 
 def test_a_grasp_is_held_or_slipped_and_seen_twice(folder):
     table = manifests.read(folder / cuts.GRASP)
-    moment, frame = text_column(table, "label.moment"), np.asarray(table.column("frame_index"))
-    assert set(text_column(table, "label.motion")) == {"slide", "twist"}
+    moment, frame = table.text_column("label.moment"), np.asarray(table.column("frame_index"))
+    assert set(table.text_column("label.motion")) == {"slide", "twist"}
     assert len(table) == 2 * 6 * len(SENSORS)
     assert set(frame[moment == "during"]) == {4} and set(frame[moment == "after"]) == {8}  # 3.5 rounds to even
-    slipped = np.array([int(touch) % 2 == 1 for touch in text_column(table, "touch")])
-    assert np.array_equal(text_column(table, "label.held") == "slipped", slipped)
+    slipped = np.array([int(touch) % 2 == 1 for touch in table.text_column("touch")])
+    assert np.array_equal(table.text_column("label.held") == "slipped", slipped)
 
 
 @pytest.mark.parametrize("frames", [0, 2])
@@ -67,7 +66,7 @@ def test_labelled_frames_of_a_new_sensor_stand_in_train(folder, frames):
     name = scores.labelled(folder, frames)
     assert name == f"{folder.name}/new{frames}.parquet"
     table = manifests.read(folder.parent / name)
-    sensor, split = text_column(table, "sensor"), text_column(table, "split")
+    sensor, split = table.text_column("sensor"), table.text_column("split")
     assert np.sum((sensor == plan.UNSEEN) & (split == "train")) == frames
     assert np.sum((sensor == plan.UNSEEN) & (split == "val")) == 0
     assert np.sum((sensor == plan.UNSEEN) & (split == "test")) == 3 and np.sum(sensor == "digit") == 9

@@ -117,10 +117,9 @@ def test_adapted_runs_are_made_again_for_other_data_or_weights(tmp_path, monkeyp
         return 0
 
     monkeypatch.setattr(scores, "main", command)
-    table = SimpleNamespace(column=lambda name: np.array(["train" if name == "split" else plan.UNSEEN] * 3))
+    table = SimpleNamespace(text_column=lambda name: np.array(["train" if name == "split" else plan.UNSEEN] * 3))
     monkeypatch.setattr(scores.manifests, "read", lambda path: table)
     data, here = tmp_path / "new2.parquet", SimpleNamespace(folder=tmp_path / "work")
-    monkeypatch.setattr(scores, "text_column", lambda table, name: table.column(name))
     counts = []
     for text, weight in (("a", "first"), ("a", "first"), ("b", "first"), ("b", "second")):
         data.write_text(text)

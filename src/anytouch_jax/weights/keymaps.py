@@ -1,6 +1,6 @@
 """Key maps: which array of a weights file is which parameter of the model.
 
-A family of weights is a table in a module of this folder: which key of a file is which of our parameters. A row takes
+A family of weights is a table in `layouts`: which key of a file is which of our parameters. A row takes
 part where the model has its parameter, and the sizes of a model are read from the arrays by the same rows. Our names
 are those of `Net.abstract()`: paths joined with "/", blocks stacked on axis 0, kernels as (in, out).
 """

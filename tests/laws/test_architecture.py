@@ -55,7 +55,7 @@ ONLY_IN: dict[str, set[str]] = {
     "tyro": {"cli"},
     "torch": set(),
     "tensorflow": set(),
-    "pickle": {"weights.torch_file", "data.readers.forces"},
+    "pickle": {"weights.torch_file", "data.readers.common"},
     "starlette": {"view.server"},
     "uvicorn": {"view.server"},
     "importlib": {"__init__", "cli.app"},

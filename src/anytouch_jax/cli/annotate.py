@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
 from anytouch_jax.cli import output
 from anytouch_jax.cli.output import log, refuse_unused
-from anytouch_jax.config.parsing import Count, NotNegative
+from anytouch_jax.config.parsing import Count, NotNegative, Range
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class AnnotateOptions:
     estimate: bool = False  # Print the estimate and stop.
     price_in: NotNegative[float | None] = None  # Price of a million input tokens, for the estimate.
     price_out: NotNegative[float | None] = None  # Price of a million output tokens.
-    limit: int | None = None  # Number of captions to ask for, to look at a sample first.
+    limit: Count[int | None] = None  # Number of captions to ask for, to look at a sample first.
     captions: Path | None = None
     """Read captions from this table (.csv, .parquet) with a key column and `text`, and ask no model."""
     key: str | None = None  # Column that joins --captions and the manifest: caption_id, sequence, object, path, ...
@@ -49,8 +50,8 @@ class AnnotateOptions:
     """Prompt of your dataset, as in: mydata photograph."""
     second_image: str = "image2_path"  # Column of a second photograph, for the prompt object.
     overwrite: bool = False  # Also ask for rows that have a caption.
-    threads: int = 4  # Questions at a time.
-    side: int = 512  # Longest side of the pictures that are sent, pixels.
+    threads: Count[int] = 4  # Questions at a time.
+    side: Annotated[int, Range(16, math.inf, "16 or more")] = 512  # Longest side of the pictures that are sent, pixels.
     timeout: float = 60.0  # Seconds to wait for an answer.
     tries: int = 5  # Tries for a question.
     max_tokens: int = 200  # Largest number of tokens of an answer.

@@ -23,7 +23,7 @@ from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import Array, mean_interval
-from anytouch_jax.evaluate.tasks import best_rows, number_column
+from anytouch_jax.evaluate.tasks import best_rows
 
 Metric = Literal["cosine", "euclidean"]
 
@@ -409,7 +409,7 @@ def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
 
 def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
     """Return numeric columns as f64 (rows, columns), NaN for an empty cell. Raises UserError for text."""
-    return np.stack([number_column(manifest, name)[rows] for name in names], 1)
+    return np.stack([manifest.number_column(name)[rows] for name in names], 1)
 
 
 def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1) -> Array:

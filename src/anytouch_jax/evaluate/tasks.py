@@ -212,7 +212,7 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     used = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
     used &= np.isin(split, ("train", "val", "test")) & ~np.isin(table.text_column("sensor"), FIELD_SENSORS)
     for column, value in task.where:
-        used &= table.text_column(column) == value if isinstance(value, str) else number_column(table, column) > value
+        used &= table.text_column(column) == value if isinstance(value, str) else table.number_column(column) > value
     length = max(task.frames, frames or 1)
     if length > 1:
         used &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
@@ -258,23 +258,13 @@ def _label_column(table: Manifest, task: Task) -> str:
 
 def _labels(table: Manifest, task: Task) -> Array:
     if task.kind == "regression" or task.above is not None:
-        number = number_column(table, task.label)
+        number = table.number_column(task.label)
         if task.above is None:
             return number
         return np.where(np.isfinite(number), np.where(number > task.above, "yes", "no"), "")
     values = table.column(task.label).to_pylist()
     texts = np.array([label_text(value, f"Column {task.label!r}") for value in values], dtype=str)
     return np.where(np.isin(texts, task.classes), texts, "") if task.classes else texts
-
-
-def number_column(table: Manifest, name: str) -> Array:
-    """Return a column as f64 (rows,), NaN where it is empty or missing. Raises UserError for text."""
-    if name not in table.table.column_names:
-        return np.full(len(table), np.nan)
-    try:
-        return table.column(name).cast(pa.float64()).to_numpy().astype(np.float64)
-    except pa.ArrowException:
-        raise UserError(f"Column {name!r} contains text. It must have numbers.") from None
 
 
 def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
@@ -285,14 +275,14 @@ def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
         return rows
     sequence, frame = table.codes("sequence", own=True), np.asarray(table.column("frame_index"))
     if which == "press":
-        force = number_column(table, "label.force")[rows]
+        force = table.number_column("label.force")[rows]
         known = np.isfinite(force)
         deepest = best_rows(rows[known], sequence[rows[known]], force[known])
         return np.sort(np.concatenate([rows[~known], deepest]))
     last = np.zeros(sequence.max() + 1)
     np.maximum.at(last, sequence, frame)
     late = -np.abs(frame - 2 / 3 * last[sequence])[rows]  # motion lasts from a third to five sixths of a recording
-    slip = np.nan_to_num(number_column(table, "label.slip")[rows], nan=0.0).round(2)
+    slip = np.nan_to_num(table.number_column("label.slip")[rows], nan=0.0).round(2)
     return np.sort(best_rows(rows, sequence[rows], slip, late))
 
 
@@ -305,7 +295,7 @@ def best_rows(rows: Array, groups: Array, *keys: Array) -> Array:
 def _touching(table: Manifest) -> Array:
     """Return whether each frame is contact, bool (rows,), by force, flag or score; all are in a file without these."""
     # Force comes first: a flag or a score depends on the picture, and would leave out soft objects for some sensors.
-    force, contact_score = (number_column(table, f"label.{name}") for name in ("force", "contact_score"))
+    force, contact_score = (table.number_column(f"label.{name}") for name in ("force", "contact_score"))
     flag = known_contact(table)
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):

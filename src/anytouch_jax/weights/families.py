@@ -101,7 +101,7 @@ _HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_to
 _PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"
 _PHOTO = Preparation(crop="centre", filter="bicubic", mean=IMAGENET_MEAN, std=IMAGENET_STD)
 _DINOV2: dict[str, Any] = {"unused": r"mask_token|embeddings\.mask_token", "image_size": (224, 224)}
-_HF_VIT: dict[str, Any] = {"prefixes": ("layouts.", "deit.", ""), "unused": _PARTS, "eps": 1e-12, "resample": "bicubic"}
+_HF_VIT: dict[str, Any] = {"prefixes": ("vit.", "deit.", ""), "unused": _PARTS, "eps": 1e-12, "resample": "bicubic"}
 FAMILIES = (
     *(
         Family(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anytouch_jax.data.manifest import clips as w
+from anytouch_jax.data.manifest import content as w
 from anytouch_jax.data.manifest import manifest as manifests
 
 

@@ -264,7 +264,7 @@ def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
 
 
 def test_clips_of_many_rows():
-    from anytouch_jax.data.manifest.clips import clip_windows
+    from anytouch_jax.data.manifest.content import clip_windows
 
     n = 400_000
     sequence, frame = np.repeat(np.arange(n // 100), 100), np.tile(np.arange(100), n // 100)

@@ -21,8 +21,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, ModelConfig, SpellingError, check_spelling
-from anytouch_jax.data.manifest.clips import clip_windows
-from anytouch_jax.data.manifest.content import Summary, content_digest, summarise, table_blocks
+from anytouch_jax.data.manifest.content import Summary, clip_windows, content_digest, summarise, table_blocks
 from anytouch_jax.data.manifest.remote import is_remote, local_copy
 from anytouch_jax.data.manifest.schema import (
     PATHS,
@@ -89,6 +88,15 @@ class Manifest:
     def text_column(self, name: str) -> np.ndarray:
         """Return a column as strings (rows,), "" for null."""
         return np.array(["" if value is None else str(value) for value in self.column(name).to_pylist()])
+
+    def number_column(self, name: str) -> np.ndarray:
+        """Return a column as f64 (rows,), NaN where it is empty or missing. Raises ManifestError for text."""
+        if name not in self.table.column_names:
+            return np.full(len(self), np.nan)
+        try:
+            return np.asarray(pc.fill_null(self.table[name].cast(pa.float64()), np.nan))
+        except pa.ArrowException:
+            raise ManifestError(f"Column {name!r} contains text. It must have numbers.") from None
 
     def codes(self, name: str, *, own: bool = False) -> np.ndarray:
         """Return a text column as i64 (rows,): equal numbers for equal values, -1 for null.

@@ -11,6 +11,7 @@ import base64
 import hashlib
 import html
 import json
+import math
 import os
 import urllib.parse
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,13 +19,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.bars import bar
-from anytouch_jax.config.parsing import parse_json
+from anytouch_jax.config.parsing import Count, Range, check, parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.data.prepare.prompts import (
@@ -125,18 +126,15 @@ class Endpoint:
     url: str
     model: str
     key_variable: str = "OPENAI_API_KEY"
-    timeout: float = 60.0
-    tries: int = 5
-    max_tokens: int = 200
+    timeout: Annotated[float, Range(math.ulp(0.0), 86_400, "above 0 seconds and at most 86,400")] = 60.0
+    tries: Count[int] = 5
+    max_tokens: Count[int] = 200
     temperature: float | None = 0.0
     json_mode: bool = True
     token_field: str = "max_tokens"
 
     def __post_init__(self) -> None:
-        if not 0 < self.timeout <= 86_400:
-            raise AnnotateError(f"timeout {self.timeout} must be above 0 seconds and at most 86,400")
-        if self.tries < 1 or self.max_tokens < 1:
-            raise AnnotateError(f"tries {self.tries} and max-tokens {self.max_tokens} must be at least 1")
+        check(self, "--")
         try:
             parts = urllib.parse.urlsplit(self.url)
             valid = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and self.url.isascii()
@@ -290,10 +288,6 @@ def annotate(
     that was expanded moves to the column `phrase`. Raises AnnotateError if `confirm` returns False or if the first
     questions all fail, or if the endpoint cannot be used, and UserError if no caption is missing.
     """
-    if threads < 1 or side < 16:
-        raise AnnotateError(f"threads {threads} must be at least 1 and side {side} at least 16")
-    if limit is not None and limit < 1:
-        raise AnnotateError(f"limit {limit} must be at least 1; omit it for all captions")
     jobs, left_out = find_caption_jobs(
         manifest, split=split, families=families, overwrite=overwrite, second_image=second_image
     )

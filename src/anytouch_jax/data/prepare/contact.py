@@ -414,12 +414,7 @@ def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple
             f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with; "
             "name one with --reference"
         )
-    if name == "label.contact":
-        return name, known_contact(manifest)
-    try:
-        return name, np.asarray(pc.fill_null(manifest.table[name].cast(pa.float64()), np.nan))
-    except pa.ArrowException:
-        raise UserError(f"column {name} holds something that is no number; contact must be a number") from None
+    return name, known_contact(manifest) if name == "label.contact" else manifest.number_column(name)
 
 
 def contact_quality(

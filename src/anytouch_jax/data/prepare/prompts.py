@@ -24,6 +24,7 @@ from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.images import decode_bytes
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, resolve_path
+from anytouch_jax.data.prepare.untouched_gel import scale_picture
 from anytouch_jax.errors import UserError
 
 Family = Literal["photograph", "object", "phrase"]
@@ -252,8 +253,5 @@ def image_bytes(manifest: Manifest, row: int, column: str) -> bytes:
 def small_jpeg(data: bytes, name: str, side: int) -> bytes:
     """Return an encoded image as JPEG with no side longer than `side`. Raises ImageError (a UserError)."""
     pixels = decode_bytes(data, name)
-    scale = side / max(pixels.shape[:2])
-    if scale < 1:
-        size = [max(1, round(length * scale)) for length in pixels.shape[1::-1]]
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    pixels = scale_picture(pixels, side) if max(pixels.shape[:2]) > side else pixels
     return cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()

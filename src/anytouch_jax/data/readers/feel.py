@@ -8,8 +8,8 @@ files are `calandra_corl2017_*.h5`. No licence of the data is stated.
   others. `after` shows the outcome and is `unused`. Every frame is a sequence: no clip spans the phases.
 * `grasp_group` is the grasp, the same for both fingers (`unit` A and B). They press opposite sides and not one place,
   so it is no `touch`, and nothing is matched by it.
-* The split is that of `split_<k>.npy`, which is never unpickled, or of `split_<k>.json` with the same content. Without
-  either it is by hash of the object.
+* The split is that of `split_<k>.npy`, or of `split_<k>.json` with the same content. Without either it is by hash of
+  the object.
 * From the original files, `export` first writes the pictures as PNG (needs `pip install h5py`).
 """
 
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import csv
 import io
-import pickletools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,13 +26,13 @@ import numpy as np
 from anytouch_jax.bars import tracked
 from anytouch_jax.data.images import natural
 from anytouch_jax.data.readers.common import (
-    PARTS,
     DatasetError,
     DatasetIndex,
     DatasetReader,
     published_splits,
     read_json,
     read_lines,
+    read_pickle,
     save_png,
 )
 from anytouch_jax.files import atomic_write
@@ -108,41 +107,11 @@ def _splits_of_fold(index: DatasetIndex, base: str) -> dict[str, str] | None:
     if path is None:
         index.notes.append(f"no split_{fold}.npy or .json: split by hash of the object")
         return None
-    table = read_json(path) if path.suffix == ".json" else strings_in_pickle(path)
-    if not {"train", "test"} <= table.keys() or not all(isinstance(names, list) for names in table.values()):
+    table: Any = read_json(path) if path.suffix == ".json" else np.ravel(read_pickle(path))[0]
+    lists = table.values() if isinstance(table, dict) and {"train", "test"} <= table.keys() else [None]
+    if not all(isinstance(names, list) for names in lists):
         raise DatasetError(f"{path}: expected the lists 'train' and 'test' of object names")
     return published_splits(path, table)
-
-
-def strings_in_pickle(path: Path) -> dict[str, list[str]]:
-    """Return the lists of names under 'train', 'val', 'test' in a .npy file that holds a pickled dict of lists.
-
-    The pickle is scanned and never run: names are taken in order, each for the last of the three keys before it.
-    Raises DatasetError for anything else in the lists, which a scan could misread.
-    """
-    lists: dict[str, list[str]] = {}
-    memo: dict[int, str] = {}
-    last, current = "", ""
-    try:
-        ops = list(pickletools.genops(path.read_bytes().partition(b"\n")[2]))  # behind the header, a line of text
-    except (OSError, ValueError, IndexError) as error:
-        raise DatasetError(f"{path} is not a .npy file with a pickled dict: {error}") from None
-    for op, argument, _ in ops:
-        value: Any = argument
-        if op.name == "MEMOIZE":
-            memo[len(memo)] = last
-        elif op.name in ("BINPUT", "LONG_BINPUT"):
-            memo[value] = last
-        elif current and op.name in ("GLOBAL", "STACK_GLOBAL", "REDUCE"):
-            raise DatasetError(f"{path} holds more than lists of names; save it as {path.with_suffix('.json').name}")
-        word = memo.get(value, "") if op.name in ("BINGET", "LONG_BINGET") else value if "UNICODE" in op.name else None
-        last = word if isinstance(word, str) else ""
-        if word in PARTS:
-            current = word
-            lists[current] = []
-        elif word and current:
-            lists[current].append(word)
-    return lists
 
 
 def export_grasps(root: Path, names: Sequence[str]) -> int:

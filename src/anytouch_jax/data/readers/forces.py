@@ -2,14 +2,11 @@
 
 Layouts are those of public code: the loaders of github.com/facebookresearch/sparsh (`data/digit/utils.py` and its
 read-me) and `data/downstream_dataset.py` of github.com/GeWu-Lab/AnyTouch2. That of FreeTacMan is in `start_collect.py`
-and `pose_to_joint.py` of github.com/OpenDriveLab/FreeTacMan. Its data set card has the names of files. Pickles may
-hold plain values and arrays of NumPy alone: no other code is run.
+and `pose_to_joint.py` of github.com/OpenDriveLab/FreeTacMan. Its data set card has the names of files.
 """
 
 from __future__ import annotations
 
-import io
-import pickle
 import re
 from pathlib import Path
 from typing import Any
@@ -24,34 +21,15 @@ from anytouch_jax.data.readers.common import (
     DatasetReader,
     export_video,
     read_json,
+    read_pickle,
     save_png,
 )
 from anytouch_jax.files import atomic_write
 
 _SPARSH = "Higuera et al., Sparsh: Self-supervised touch representations for vision-based tactile sensing, CoRL 2024"
-_ALLOWED = {
-    ("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode"), ("collections", "OrderedDict"),
-    *((f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")),
-    *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
-}  # fmt: skip
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
 TEST_BATCHES = ("flat/batch_1",)  # the tests of Sparsh's configuration
 TEST_OBJECTS, TRAIN_OBJECTS = (18, 22, 61), (6, 41, 52, 53, 59, 69, 70)  # of AnyTouch 2's probe of ToucHD
-
-
-class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ALLOWED:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
-        return super().find_class(module, name)
-
-
-def read_pickle(path: Path) -> Any:
-    """Return the content of a pickle of plain values and arrays. Raises DatasetError for anything else."""
-    try:
-        return _Unpickler(io.BytesIO(path.read_bytes())).load()
-    except Exception as error:  # a damaged pickle fails anywhere
-        raise DatasetError(f"{path} is no pickle of plain values and arrays: {error}; download it again") from None
 
 
 def _force(index: DatasetIndex) -> None:

@@ -52,38 +52,34 @@ def _lerobot(index: DatasetIndex) -> None:
     for name in index.options.values:
         if name not in features:
             raise DatasetError(f"{index.root} has no feature {name}; it has {', '.join(features)}")
-    for folder, _, files in index.walk("data/"):
-        for file in (name for name in files if name.endswith(".parquet")):
-            path = f"data/{folder}/{file}".replace("//", "/")
-            columns = pa.parquet.read_schema(index.root / path).names
-            table = pa.parquet.read_table(index.root / path, columns=[name for name in wanted if name in columns])
-            rows = table.to_pylist()
-            labels = _vector_labels(rows, index.options.values)
-            for key in keys:
-                episode = [int(row["episode_index"]) for row in rows]
-                frame = [int(row["frame_index"]) for row in rows]
-                paths = [f"{path}/{key}/{at}" for at in range(len(rows))]
-                if key in films:
-                    paths = [_frame_path(key, e, f) for e, f in zip(episode, frame, strict=True)]
-                index.add(
-                    paths, sensor=sensor, unit=key, sequence=[f"episode-{e:06d}/{key}" for e in episode],
-                    frame_index=frame, split=[index.split_of(f"episode-{e:06d}") for e in episode],
-                    episode=episode, index=[int(row["index"]) for row in rows],
-                    timestamp=[float(row["timestamp"]) for row in rows],
-                    **({"label.task": [tasks.get(row.get("task_index")) for row in rows]} if tasks else {}), **labels,
-                )  # fmt: skip
+    for path in index.paths(".parquet", "data/"):
+        columns = pa.parquet.read_schema(index.root / path).names
+        table = pa.parquet.read_table(index.root / path, columns=[name for name in wanted if name in columns])
+        rows = table.to_pylist()
+        labels = _vector_labels(rows, index.options.values)
+        labels |= {"label.task": [tasks.get(row.get("task_index")) for row in rows]} if tasks else {}
+        episode, frame = ([int(row[name]) for row in rows] for name in ("episode_index", "frame_index"))
+        for key in keys:
+            paths = [f"{path}/{key}/{at}" for at in range(len(rows))]
+            if key in films:
+                paths = [_frame_path(key, e, f) for e, f in zip(episode, frame, strict=True)]
+            index.add(
+                paths, sensor=sensor, unit=key, sequence=[f"episode-{e:06d}/{key}" for e in episode],
+                frame_index=frame, split=[index.split_of(f"episode-{e:06d}") for e in episode], episode=episode,
+                index=[int(row["index"]) for row in rows], timestamp=[float(row["timestamp"]) for row in rows],
+                **labels,
+            )  # fmt: skip
 
 
 def _parquet_rows(index: DatasetIndex, base: str) -> Iterator[dict[str, Any]]:
     if not (index.root / base).is_dir():
         raise DatasetError(f"{index.root} has no {base}; download all of the data set")
-    for folder, _, files in index.walk(base):
-        for file in (name for name in files if name.endswith(".parquet")):
-            try:
-                table = pa.parquet.read_table(index.root / base / folder / file)
-            except (pa.ArrowException, OSError) as error:
-                raise DatasetError(f"{index.root / base / folder / file} cannot be read: {error}") from None
-            yield from table.select([n for n in table.column_names if not n.startswith("stats/")]).to_pylist()
+    for path in index.paths(".parquet", base):
+        try:
+            table = pa.parquet.read_table(index.root / path)
+        except (pa.ArrowException, OSError) as error:
+            raise DatasetError(f"{index.root / path} cannot be read: {error}") from None
+        yield from table.select([n for n in table.column_names if not n.startswith("stats/")]).to_pylist()
 
 
 def _tasks(index: DatasetIndex) -> dict[int, str]:

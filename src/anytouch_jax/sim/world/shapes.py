@@ -6,9 +6,11 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
+from anytouch_jax.config.parsing import Above0, NotNegative, Range, check
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.world.textures import GRAINS, TEXTURES, Array, namespace, warp
 
@@ -30,15 +32,15 @@ class Shape:
 
     primitive: str
     texture: str = "smooth"
-    size: float = 6.0
-    texture_pitch: float = 1.5
-    texture_depth: float = 0.25
-    seed: int = 0
-    texture_angle: float = 0.0
-    irregularity: float = 0.0
+    size: Above0[float] = 6.0
+    texture_pitch: Above0[float] = 1.5
+    texture_depth: NotNegative[float] = 0.25
+    seed: NotNegative[int] = 0
+    texture_angle: Annotated[float, Range(-1e9, 1e9, "a finite number of radians")] = 0.0
+    irregularity: NotNegative[float] = 0.0
     grain: str = "none"
-    grain_pitch: float = 0.8
-    grain_depth: float = 0.0
+    grain_pitch: Above0[float] = 0.8
+    grain_depth: NotNegative[float] = 0.0
     letter: str = "A"
 
     def __post_init__(self) -> None:
@@ -49,19 +51,7 @@ class Shape:
             name = getattr(self, field)
             if name not in table:
                 raise UserError(f"there is no {field} {name!r}; choose one of {', '.join(table)}")
-        for field in ("size", "texture_pitch", "grain_pitch"):
-            value = getattr(self, field)
-            if not (math.isfinite(value) and value > 0):
-                raise UserError(f"a shape's {field} must be above 0 mm, not {value}")
-        for field in ("texture_depth", "irregularity", "grain_depth"):
-            value = getattr(self, field)
-            if not (math.isfinite(value) and value >= 0):
-                raise UserError(f"a shape's {field} may not be below 0, as {value} is")
-        if not math.isfinite(self.texture_angle) or self.seed < 0:
-            raise UserError(
-                f"a shape's texture_angle must be finite and its seed not negative, "
-                f"not {self.texture_angle} and {self.seed}"
-            )
+        check(self)
 
 
 def base(shape: Shape, x: Array, y: Array) -> Array:

@@ -157,6 +157,16 @@ def _check_header(file: IO[bytes], file_size: int, name: str) -> np.ndarray:
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
+def check_array(name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str = "f") -> None:
+    """Raise ValueError unless an array has a shape and a kind of type in `kinds`, and finite values."""
+    import numpy as np
+
+    if array.shape != shape or array.dtype.kind not in kinds:
+        raise ValueError(f"its {name} is {array.dtype} {array.shape}, not of shape {shape}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"its {name} has values that are not finite")
+
+
 def _part(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
 

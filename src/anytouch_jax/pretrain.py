@@ -18,11 +18,13 @@ from jax.sharding import Mesh
 from anytouch_jax import objectives
 from anytouch_jax.batch import Stage2Batch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
+from anytouch_jax.data.images import encode
 from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import reconstruction
+from anytouch_jax.files import atomic_write
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
@@ -179,7 +181,7 @@ def _draw_reconstructions(step: int, params: Params, batch: Any, *, run: Path, n
     if jax.process_index():
         return
     image = reconstruction.reconstruction_panels(params, clip, sensor, net=net, config=config)
-    reconstruction.write_png(run / "figures" / f"reconstruction_{step:06d}.png", image)
+    atomic_write(run / "figures" / f"reconstruction_{step:06d}.png", encode(image))
 
 
 class _Callable(ModuleType):

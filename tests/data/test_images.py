@@ -8,7 +8,7 @@ import pytest
 from places import SHARED
 
 from anytouch_jax.data import images
-from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes
+from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes, encode
 from anytouch_jax.errors import UserError
 
 RNG = np.random.default_rng(0)
@@ -30,6 +30,15 @@ def test_lossless_formats_give_the_exact_rgb(tmp_path, suffix):
     got = images.decode(path)
     assert got.dtype == np.uint8 and got.flags.c_contiguous
     np.testing.assert_array_equal(got, RGB)
+
+
+def test_an_encoded_picture_is_decoded_again():
+    picture = np.random.default_rng(0).integers(0, 256, (9, 7, 3), np.uint8)
+    np.testing.assert_array_equal(decode_bytes(encode(picture), "p"), picture)
+    smooth = np.full((32, 32, 3), (200, 100, 50), np.uint8)
+    coded = encode(smooth, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
+    np.testing.assert_allclose(decode_bytes(coded, "p"), smooth, atol=4)
+    assert len(encode(smooth, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 10)) < len(coded)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp"])

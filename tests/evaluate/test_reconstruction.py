@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import jax
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from anytouch_jax.evaluate.reconstruction import (
     pixel_scores,
     plain_reconstruction,
     reconstruction_panels,
-    write_png,
 )
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch, stage1_terms
@@ -159,20 +157,3 @@ def test_normalised_patches_are_brought_back_to_pixels(monkeypatch):
     grid = cells(reconstruction_panels(PARAMS, CLIP, SENSOR, net=NET, config=config)).astype(int)
     assert np.abs(grid[:, 6:9] - CLIP[:, :3].astype(int)).max() <= 1
     assert np.abs(grid[:, 10] - CLIP[:, 3].astype(int)).max() <= 1
-
-
-def test_a_figure_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
-    path = tmp_path / "figures" / "a.png"
-    write_png(path, CLIP[0, 0])
-    np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], CLIP[0, 0])
-    before = path.read_bytes()
-
-    def full(self, data):
-        with open(self, "wb") as file:
-            file.write(data[:10])
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    with pytest.raises(OSError, match=r"No space left .*a\.png"):
-        write_png(path, CLIP[0, 1])
-    assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == ["a.png"]

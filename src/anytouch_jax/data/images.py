@@ -126,6 +126,11 @@ def decode_bytes(data: bytes, name: str | Path) -> np.ndarray:
     return to_rgb(pixels, name)
 
 
+def encode(picture: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:
+    """Return a picture RGB u8 (h, w, 3) as PNG or JPEG; `settings` are those of cv2.imencode."""
+    return cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
+
+
 def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
     """Return pixels as RGB u8 (h, w, 3) by the rules of `decode`; `path` is for errors. Raises ImageError."""
     if pixels.ndim == 2:

@@ -151,8 +151,7 @@ class Encoder:
         (which alignment trains), the mean of the patch tokens, or both (B, 2E). Raises UserError for another shape or
         type.
         """
-        frames = np.asarray(frames)
-        frames = frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+        frames = as_clips(frames)
         side = self.config.model.image_size
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
             raise UserError(
@@ -160,14 +159,17 @@ class Encoder:
                 f"{frames.shape}; resize each frame with encoder.preprocess(frame)"
             )
         check_frames(self.config.model, frames.shape[1])
-        rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
-        count, key = len(frames), (pooling, join)
+        return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
+
+    def _encode(self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any) -> np.ndarray:
+        """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled once for each `key`."""
+        rows = rows_of_sensors(sensor, len(clips), self.sensor_row, len(self.config.model.sensors))
         if key not in self._compiled:
-            self._compiled[key] = jax.jit(self.traceable(pooling, join))
-        if not count:  # the network has no shape for nothing: embed one touch and return none
-            frames, rows = np.zeros((1, *frames.shape[1:]), np.uint8), np.zeros(1, np.int32)
+            self._compiled[key] = jax.jit(run)
+        if not (count := len(clips)):  # the network has no shape for nothing: embed one touch and return none
+            clips, rows = np.zeros((1, *clips.shape[1:]), clips.dtype), np.zeros(1, np.int32)
         with precision(self.config):
-            return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
+            return np.asarray(self._compiled[key](self._placed, clips, rows))[:count]
 
     @cached_property
     def _placed(self) -> Params:
@@ -333,13 +335,24 @@ def check_frames(model: ModelConfig, frames: int) -> None:
         raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
 
 
+def as_clips(frames: Any) -> np.ndarray:
+    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips (B, T, H, W, 3)."""
+    frames = np.asarray(frames)
+    return frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+
+
+def check_choices(pooling: Pooling, join: Join) -> None:
+    """Raise UserError for another pooling or join than there are."""
+    for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
+        if value not in get_args(kind):
+            raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
+
+
 def touch_features(
     params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
 ) -> jax.Array:
     """Return features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,): a traceable `encode_touch`."""
-    for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
-        if value not in get_args(kind):
-            raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
+    check_choices(pooling, join)
     clips = normalise_touch(clips)
     if pooling == "class":
         return net.encode_touch(params, clips, sensor, join).astype(jnp.float32)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial, reduce
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,7 @@ from PIL import Image
 
 from anytouch_jax.config import UNIVERSAL, Config, DataConfig, check_spelling
 from anytouch_jax.data.images import decode, to_rgb
-from anytouch_jax.encoder.arrays import rows_of_sensors
-from anytouch_jax.encoder.base import Encoder, precision
+from anytouch_jax.encoder.base import Encoder, as_clips, check_choices, precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, warn
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import Part
@@ -140,15 +139,14 @@ class FamilyEncoder(Encoder):
         family's own feature: a class token, its projection, or the mean of the patches if there is none. H and W may be
         others than `image_size` if the positions allow it. Raises UserError for another shape or type.
         """
-        return self._encode(frames, sensor, partial(self._features, pooling=pooling, join=join), (pooling, join))
+        return self._encode(self._checked(frames), sensor, self.traceable(pooling, join), (pooling, join))
 
     def encode_tokens(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
         """Return the tokens f32 (B, S, D) that the family's authors publish, for frames as in `encode_touch`."""
-        return self._encode(frames, sensor, self._tokens, "tokens")
+        return self._encode(self._checked(frames), sensor, self._tokens, "tokens")
 
-    def _encode(self, frames: Any, sensor: Any, run: Callable[..., jax.Array], key: Any) -> np.ndarray:
-        frames = np.asarray(frames)
-        frames = frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+    def _checked(self, frames: Any) -> np.ndarray:
+        frames = as_clips(frames)
         patch, fixed = self.form.model.patch, self.form.resample == "none" and self.form.grid is not None
         sides, is_clip = frames.shape[2:4], frames.ndim == 5 and frames.shape[-1] == 3
         fits = sides == tuple(self.image_size) if fixed else all(side and not side % patch for side in sides)
@@ -158,23 +156,14 @@ class FamilyEncoder(Encoder):
                 f"frames must be float32 of {high} x {wide} pixels, (B, T, {high}, {wide}, 3), not {frames.dtype} "
                 f"{frames.shape}; prepare each frame with encoder.preprocess(frame)"
             )
-        rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
-        count = len(frames)
-        if key not in self._compiled:
-            self._compiled[key] = jax.jit(run)
-        if not count:
-            frames, rows = np.zeros((1, *frames.shape[1:]), np.float32), np.zeros(1, np.int32)
-        with precision(self.config):
-            return np.asarray(self._compiled[key](self._placed, frames, rows))[:count]
+        return frames
 
     def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., jax.Array]:
         """Return the function from params, frames (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
         return partial(self._features, pooling=pooling, join=join)
 
     def _features(self, params: Any, clips: jax.Array, rows: jax.Array, *, pooling: Pooling, join: Join) -> jax.Array:
-        for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
-            if value not in get_args(kind):
-                raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
+        check_choices(pooling, join)
         clips, parts = self._clips(clips), []
         for part in jnp.moveaxis(clips, 1, 0):  # one for a family of clips
             parts.append(pooled(self.family, self.form, self._run(params, part, rows), pooling))

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.novelty import Assessment, Calibration
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path, read_arrays
+from anytouch_jax.files import atomic_path, check_array, read_arrays
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Pooling
@@ -163,11 +163,7 @@ def _check_head(head: LinearHead) -> None:
     columns = 1 if count == 2 else count
     shapes = {"classes": (count,), "weights": (width, columns), "bias": (columns,), "mean": (width,), "scale": (width,)}
     for name, shape in shapes.items():
-        array = getattr(head, name)
-        if array.shape != shape or array.dtype.kind != ("U" if name == "classes" else "f"):
-            raise ValueError(f"{name} is {array.dtype} {array.shape}, not of shape {shape}")
-        if name != "classes" and not np.isfinite(array).all():
-            raise ValueError(f"{name} has values that are not finite")
+        check_array(name, getattr(head, name), shape, "U" if name == "classes" else "f")
     if count < 2 or not width or not (head.scale > 0).all() or not (head.label and head.fingerprint):
         raise ValueError("it needs two classes, features, scales above 0, a label and the mark of an encoder")
     if len(set(head.classes)) < count:

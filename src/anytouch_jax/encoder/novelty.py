@@ -20,6 +20,7 @@ from scipy.special import expit, log_softmax, softmax
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import check_array
 
 Array = npt.NDArray[Any]
 
@@ -66,17 +67,14 @@ class Calibration:
         values: dict[str, Any] = {
             field.name: arrays[f"calibration/{field.name}"] for field in dataclasses.fields(Calibration)
         }
-        references, sensors, turn = values["references"], values["sensors"], values["whitening"]
-        if turn.shape != (width, width) or turn.dtype.kind != "f" or not np.isfinite(turn).all():
-            raise ValueError(f"its whitening is {turn.dtype} {turn.shape}, or not finite")
-        if references.ndim != 2 or references.shape[1] != width or references.dtype.kind != "f" or not len(references):
-            raise ValueError(f"its references are {references.dtype} {references.shape}")
-        if sensors.shape != references.shape[:1] or sensors.dtype.kind != "U" or not np.isfinite(references).all():
-            raise ValueError("its references have no sensors, or are not finite")
+        count = max(len(values["references"]), 1)
+        shapes = {"whitening": (width, width), "references": (count, width), "sensors": (count,)}
         for name, value in values.items():
-            if name not in ("whitening", "references", "sensors"):
-                if value.shape != () or value.dtype.kind not in "fi" or np.isnan(value):
-                    raise ValueError(f"its {name} is no number")
+            if name in shapes:
+                check_array(name, value, shapes[name], "U" if name == "sensors" else "f")
+            elif value.shape != () or value.dtype.kind not in "fi" or np.isnan(value):
+                raise ValueError(f"its {name} is no number")
+            else:
                 values[name] = value.item()
         if not 0 < values["temperature"] < np.inf:
             raise ValueError(f"its temperature is {values['temperature']}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -15,7 +14,6 @@ from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import UNTOUCHED
-from anytouch_jax.files import atomic_write
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import losses, tokens
 
@@ -113,8 +111,3 @@ def reconstruction_panels(
 @partial(jax.jit, static_argnames=("net", "config"))
 def _predict(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> Any:
     return reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)
-
-
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an RGB image u8 (H, W, 3), whole or not at all. Raises OSError."""
-    atomic_write(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())

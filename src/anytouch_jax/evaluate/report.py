@@ -17,7 +17,7 @@ import numpy as np
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
-from anytouch_jax.data.images import decode
+from anytouch_jax.data.images import decode, encode
 from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import read_file
@@ -31,7 +31,7 @@ from anytouch_jax.evaluate.feature_cache import RANDOM, background_difference, p
 from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.plots import ShareBar
 from anytouch_jax.evaluate.probing import ProbeResult
-from anytouch_jax.evaluate.reconstruction import pixel_scores, reconstruction_panels, write_png
+from anytouch_jax.evaluate.reconstruction import pixel_scores, reconstruction_panels
 from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
 from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.evaluate.tasks import best_rows
@@ -275,7 +275,7 @@ def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) 
     _, batch = next(iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")))
     image = reconstruction_panels(params, batch.clip, batch.sensor, net=encoder.net, config=config)
     path = folder / "figures" / "reconstructions.png"
-    write_png(path, image)
+    atomic_write(path, encode(image))
     names = ", ".join(manifest.text_column("sensor")[rows])
     share = f"{config.objective.keep_ratio:.0%}".replace("%", " %")
     text = f"Stage 1 reads {share} of the patches of a held-out object. From above: {names}."

@@ -21,7 +21,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from anytouch_jax.config import UNIVERSAL
-from anytouch_jax.data.images import open_video
+from anytouch_jax.data.images import encode, open_video
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
@@ -33,11 +33,12 @@ from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.stream import Embedded, open_source, stream
 from anytouch_jax.errors import UserError
 from anytouch_jax.view.space import FeatureMap
-from anytouch_jax.view.tables import jpeg, scale_down, touch_panels
+from anytouch_jax.view.tables import scale_down, touch_panels
 
 Array = npt.NDArray[Any]
 _KEPT = 600  # frames whose times make p50 and p99, as on the page
 _SEARCH = 0.5  # seconds between searches for the nearest touches
+_QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 _WAITING = 64  # pictures that wait for the disk: more are dropped and counted
 
 
@@ -195,7 +196,7 @@ class Live:
             "recording": None if self.recorder is None else self.recorder.state(),
         }  # fmt: skip
         about |= self._classify(frame.values) | {"near": self._nearest(frame.values)}
-        self._publish(about, jpeg(view, 85))
+        self._publish(about, encode(view, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 85))
 
     def _classify(self, values: Array) -> dict[str, Any]:
         if self._head is None:
@@ -280,9 +281,9 @@ class LiveRecorder:
         try:
             part.mkdir(parents=True)
             if gel is not None:
-                _save(part / "background.png", gel)
+                (part / "background.png").write_bytes(encode(gel, ".png", *_QUICK))
             while (picture := waiting.get()) is not None:
-                _save(part / f"{self._written:06d}.png", picture)
+                (part / f"{self._written:06d}.png").write_bytes(encode(picture, ".png", *_QUICK))
                 self._written += 1
             if not self._written:
                 self._done = "No frame came, and nothing was written."
@@ -310,7 +311,3 @@ class LiveRecorder:
             tables = [manifests.read(file).table, manifests.from_columns(columns, file).table]
             columns = pa.concat_tables(tables, promote_options="permissive").to_pydict()
         manifests.write(manifests.from_columns(columns, file), file)
-
-
-def _save(path: Path, picture: Array) -> None:
-    path.write_bytes(cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())

@@ -15,6 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import cv2
 import numpy as np
 import uvicorn
 from starlette.applications import Starlette
@@ -27,10 +28,11 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from anytouch_jax.config import parse_json
+from anytouch_jax.data.images import encode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.tables import Table, jpeg, open_film, open_folder, scale_down
+from anytouch_jax.view.tables import Table, open_film, open_folder, scale_down
 from anytouch_jax.view.training import Run
 
 if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
@@ -115,42 +117,21 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
         about = [{"name": one.name, "kind": one.kind, "about": one.about()} for one in sources]
         return _json(about)
 
-    def touch(request: Request) -> Response:
+    def touch(request: Request, table: Table) -> Response:
         filters = parse_json(request.query_params.get("filters", "{}"))
         if not isinstance(filters, dict) or not all(isinstance(value, str) for value in filters.values()):
             raise UserError("Filters are texts by the name of their column.")
-        table: Table = source(request, "table")
         row = request.query_params.get("row")
         place = _number(request, "place") if row is None else table.place_of(_number(request, "row"))
         return _json(table.touch(place, filters))
 
-    def frame(request: Request) -> Response:
-        strip, score = source(request, "table").panels(request.path_params["row"])
+    def frame(request: Request, table: Table) -> Response:
+        strip, score = table.panels(request.path_params["row"])
         count = 1 if np.isnan(score) else 3
         return _picture(strip, {"X-Panels": str(count), "X-Score": "" if np.isnan(score) else f"{score:.2f}"})
 
-    def photo(request: Request) -> Response:
-        return _picture(source(request, "table").photo(request.path_params["row"]))
-
-    def points(request: Request) -> Response:
-        return _json(source(request, "space").map(request.query_params.get("method", "pca")))
-
-    def colours(request: Request) -> Response:
-        query = request.query_params
-        return _json(source(request, "space").colours(query.get("method", "pca"), query.get("column", "")))
-
-    def neighbours(request: Request) -> Response:
-        others = request.query_params.get("others") == "1"
-        return _json(source(request, "space").neighbours(_number(request, "row"), others=others))
-
-    def losses(request: Request) -> Response:
-        return _json(source(request, "run").losses(_number(request, "after")))
-
-    def figure(request: Request) -> Response:
-        return _picture(source(request, "run").figure(request.path_params["name"]), side=4000)
-
-    def stream(request: Request) -> Response:
-        return StreamingResponse(source(request, "live").packets(), media_type="application/octet-stream")
+    def of(kind: str, path: str, answer: Callable[[Request, Any], Response]) -> Route:
+        return Route(f"/api/{{source:int}}/{path}", lambda request: answer(request, source(request, kind)))
 
     async def control(request: Request) -> Response:
         if request.headers.get(HEADER) is None:
@@ -170,13 +151,21 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
         data = (files("anytouch_jax.view") / (name or "page.html")).read_bytes()
         return Response(data, media_type=_ASSETS[name], headers=_SAFE | {"Cache-Control": "no-cache"})
 
-    each = "/api/{source:int}"
     routes = [
-        Route("/", page), Route("/{name:str}", page), Route("/api/sources", listed), Route(f"{each}/touch", touch),
-        Route(f"{each}/frame/{{row:int}}", frame), Route(f"{each}/photo/{{row:int}}", photo),
-        Route(f"{each}/map", points), Route(f"{each}/colours", colours), Route(f"{each}/neighbours", neighbours),
-        Route(f"{each}/losses", losses), Route(f"{each}/figure/{{name:str}}", figure),
-        Route(f"{each}/stream", stream), Route(f"{each}/control", control, methods=["POST"]),
+        Route("/", page), Route("/{name:str}", page), Route("/api/sources", listed),
+        of("table", "touch", touch), of("table", "frame/{row:int}", frame),
+        of("table", "photo/{row:int}", lambda request, table: _picture(table.photo(request.path_params["row"]))),
+        of("space", "map", lambda request, space: _json(space.map(_method(request)))),
+        of("space", "colours", lambda request, space: _json(
+            space.colours(_method(request), request.query_params.get("column", "")))),
+        of("space", "neighbours", lambda request, space: _json(
+            space.neighbours(_number(request, "row"), others=request.query_params.get("others") == "1"))),
+        of("run", "losses", lambda request, run: _json(run.losses(_number(request, "after")))),
+        of("run", "figure/{name:str}",
+           lambda request, run: _picture(run.figure(request.path_params["name"]), side=4000)),
+        of("live", "stream",
+           lambda _, live: StreamingResponse(live.packets(), media_type="application/octet-stream")),
+        Route("/api/{source:int}/control", control, methods=["POST"]),
     ]  # fmt: skip
     guards = [Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)), Middleware(_Token, token=token)]
     return Starlette(routes=routes, middleware=guards, exception_handlers={UserError: _refuse, ValueError: _refuse})
@@ -245,6 +234,10 @@ def _refuse(_: Request, error: Exception) -> Response:
     return _json({"error": str(error)}, 400)
 
 
+def _method(request: Request) -> str:
+    return request.query_params.get("method", "pca")
+
+
 def _number(request: Request, name: str) -> int:
     text = request.query_params.get(name, "0")
     if not (text.isascii() and text.isdecimal() and len(text) < 16):
@@ -258,4 +251,5 @@ def _json(value: Any, status: int = 200) -> Response:
 
 def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = 3 * 320) -> Response:
     headers = _SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
-    return Response(jpeg(scale_down(picture, side), 90), media_type="image/jpeg", headers=headers)
+    data = encode(scale_down(picture, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
+    return Response(data, media_type="image/jpeg", headers=headers)

@@ -232,12 +232,6 @@ def touch_panels(frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold
     return cv2.hconcat([view, difference, contact]), contact_score(change)
 
 
-def jpeg(picture: Array, quality: int) -> bytes:
-    """Return a picture RGB u8 (h, w, 3) as JPEG."""
-    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)  # a view with strides takes OpenCV twice as long
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-
-
 def open_folder(folder: Path) -> Table:
     """Return the pictures of a folder as one recording. Raises UserError if there are none."""
     frames, named = list_images(folder)

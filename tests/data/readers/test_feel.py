@@ -90,9 +90,7 @@ class _Evil:
 def test_code_in_a_split_file_is_never_run(tmp_path, read):
     _tree(tmp_path)
     np.save(tmp_path / "split_0.npy", {"train": ["mug", _Evil(str(tmp_path / "run"))], "test": []}, allow_pickle=True)
-    with pytest.raises(
-        UserError, match=r"split_0.npy is no pickle of plain values .*: it asks for posix.mkdir"
-    ):
+    with pytest.raises(UserError, match=r"split_0.npy is no pickle of plain values .*: it asks for posix.mkdir"):
         read("feel")
     assert not (tmp_path / "run").exists()
 

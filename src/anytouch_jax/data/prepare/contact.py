@@ -27,7 +27,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from anytouch_jax.data.images import ImageError, decode
+from anytouch_jax.data.images import ImageError, decode, encode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_column, select_rows
 from anytouch_jax.data.manifest.schema import shown
 from anytouch_jax.data.prepare.scan import EXAMPLES
@@ -205,7 +205,7 @@ def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -
     is_free = manifest.text_column("split") == "background"
     for rows, gel in scores.gels:
         name = folder / f"{sha256(gel.picture.tobytes()).hexdigest()[:16]}.png"
-        atomic_write(name, cv2.imencode(".png", gel.picture[..., ::-1])[1].tobytes())
+        atomic_write(name, encode(gel.picture))
         for row in rows[~is_free[rows]].tolist():
             cells[row] = Path(os.path.relpath(name, manifest.files[manifest.source[row]].parent)).as_posix()
     return replace_column(manifest, "background_path", cells)

@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from anytouch_jax.config.parsing import parse_json
-from anytouch_jax.data.images import decode_bytes
+from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, resolve_path
 from anytouch_jax.data.prepare.untouched_gel import scale_picture
@@ -254,4 +254,4 @@ def small_jpeg(data: bytes, name: str, side: int) -> bytes:
     """Return an encoded image as JPEG with no side longer than `side`. Raises ImageError (a UserError)."""
     pixels = decode_bytes(data, name)
     pixels = scale_picture(pixels, side) if max(pixels.shape[:2]) > side else pixels
-    return cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+    return encode(pixels, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)

@@ -18,12 +18,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-import cv2
 import numpy as np
 
 from anytouch_jax.bars import Item, tracked
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling, parse_json
-from anytouch_jax.data.images import count_frames, frames_from_video, natural
+from anytouch_jax.data.images import count_frames, encode, frames_from_video, natural
 from anytouch_jax.data.manifest.remote import open_store
 from anytouch_jax.data.manifest.schema import REQUIRED
 from anytouch_jax.errors import UserError
@@ -305,8 +304,7 @@ class DatasetIndex:
 def save_png(file: Path, picture: np.ndarray) -> None:
     """Write a picture RGB u8 (h, w, 3) as PNG, unless the file exists."""
     if not file.is_file():
-        bgr = np.ascontiguousarray(picture[..., ::-1])
-        atomic_write(file, cv2.imencode(".png", bgr)[1].tobytes(), sync=False)
+        atomic_write(file, encode(np.ascontiguousarray(picture)), sync=False)
 
 
 def export_video(video: Path) -> int:

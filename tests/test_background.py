@@ -13,9 +13,8 @@ from touch_world import make_touches
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import DataConfig, preset
 from anytouch_jax.data.images import decode
-from anytouch_jax.data.loading.evaluation import evaluation
 from anytouch_jax.data.loading.loader import Loader
-from anytouch_jax.data.loading.samples import SampleError, SampleReader
+from anytouch_jax.data.loading.samples import SampleError, SampleReader, evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.base import Preprocess

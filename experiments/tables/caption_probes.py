@@ -24,7 +24,7 @@ import numpy as np
 import optax
 from flax import nnx
 
-from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder

@@ -9,7 +9,7 @@ from tiny_models import tiny_config
 from touch_world import make_touches
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD
-from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.evaluate import reconstruction
 from anytouch_jax.evaluate.reconstruction import (

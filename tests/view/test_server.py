@@ -21,8 +21,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import Features, save_npz
 from anytouch_jax.errors import UserError
 from anytouch_jax.view import server
-from anytouch_jax.view.tables import Table
-from anytouch_jax.view.training import Run
+from anytouch_jax.view.tables import Run, Table
 
 
 def client(*paths, **options) -> TestClient:

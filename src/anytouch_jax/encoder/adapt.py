@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, from_json, to_json
-from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.base import precision

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.bars import tracked
-from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, read_arrays

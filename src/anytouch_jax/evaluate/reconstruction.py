@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
-from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import UNTOUCHED
 from anytouch_jax.objectives import normalise_touch, reconstruct

@@ -18,7 +18,7 @@ import numpy as np
 from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.images import decode, encode
-from anytouch_jax.data.loading.evaluation import evaluation
+from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest

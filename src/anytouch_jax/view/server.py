@@ -32,8 +32,7 @@ from anytouch_jax.data.images import encode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.tables import Table, open_film, open_folder, scale_down
-from anytouch_jax.view.training import Run
+from anytouch_jax.view.tables import Run, Table, open_film, open_folder, scale_down
 
 if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
     from anytouch_jax.view.live import Live

@@ -1,4 +1,4 @@
-"""Recordings for the page: a manifest, a folder of pictures or a film, as touches of one or more sensors.
+"""What the page shows of files: touches of a manifest, a folder of pictures or a film, and run folders.
 
 A touch is the recordings (sequences) that share a value of `touch`, by any sensors. A recording without one is a touch
 by itself. Pictures are read when they are shown.
@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from anytouch_jax.config import parse_json
 from anytouch_jax.data.images import QUIET, count_frames, decode, list_images, open_video, to_rgb
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -29,6 +30,8 @@ Array = npt.NDArray[Any]
 UNKNOWN = "unknown"  # the sensor of a folder or a film
 SIDE = 320  # pixels of the long side of a picture on the page
 _MOST_ROWS, _MOST_CLIPS, _MOST_CHOICES = 5000, 12, 500  # frames of a clip, clips of a touch, values of a filter
+_LINES = 2_000  # points of a loss curve on the page
+_BLOCK = 1 << 22  # bytes of metrics.jsonl that are read at once
 _FILTERS = ("sensor", "object", "split", "dataset", "unit")
 _TINTED = (np.arange(256)[None, :, None] / 2 + (127, 60, 0)).astype(np.uint8)  # colours of contact
 
@@ -255,3 +258,55 @@ def _one_recording(folder: Path, names: list[str], background: Path | None) -> M
     if background is not None:
         columns["background_path"] = [background.name] * count
     return manifests.from_columns(columns, folder / "manifest.parquet")
+
+
+class Run:
+    """A run folder of `anytouch train`, also while it trains: its metrics.jsonl and figures/."""
+
+    kind = "run"
+
+    def __init__(self, folder: Path) -> None:
+        self.name, self._folder = folder.name, folder.resolve()
+
+    def about(self) -> dict[str, Any]:
+        """Return nothing: all of it may change."""
+        return {}
+
+    def losses(self, start: int) -> dict[str, Any]:
+        """Return lines {step, loss, ...} of metrics.jsonl from byte `start`, the byte after them, and the figures.
+
+        A file that has become shorter is read from its beginning.
+        """
+        file = self._folder / "metrics.jsonl"
+        lines: list[dict[str, float]] = []
+        if file.is_file():
+            start = start if 0 <= start <= file.stat().st_size else 0
+            with open(file, "rb") as opened:
+                opened.seek(start)
+                block = opened.read(_BLOCK)
+            whole = block[: block.rfind(b"\n") + 1]
+            for line in whole.splitlines():
+                try:
+                    row = parse_json(line.decode())
+                except ValueError:
+                    continue
+                if isinstance(row, dict) and _is_number(row.get("step")):
+                    lines.append({str(name)[:60]: value for name, value in row.items() if _is_number(value)})
+            start += len(whole)
+        every = -(-len(lines) // _LINES)
+        return {"lines": lines[:: max(1, every)], "next": start, "figures": sorted(self._figures(), reverse=True)}
+
+    def figure(self, name: str) -> np.ndarray:
+        """Return a figure of the run, RGB u8 (h, w, 3). Raises UserError."""
+        if name not in self._figures():
+            raise UserError("The run has no such figure.")
+        return decode(self._figures()[name])
+
+    def _figures(self) -> dict[str, Path]:
+        """Return the PNG files in figures/ by name, without links to other places."""
+        files = sorted((self._folder / "figures").glob("*.png"))
+        return {file.name: file for file in files if file.resolve().is_relative_to(self._folder)}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and abs(value) < 1e300  # not NaN: no comparison with it is true

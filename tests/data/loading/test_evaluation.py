@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from anytouch_jax.data.loading.evaluation import evaluation
-from anytouch_jax.data.loading.samples import SampleError
+from anytouch_jax.data.loading.samples import SampleError, evaluation
 from anytouch_jax.data.manifest.manifest import ManifestError
 from anytouch_jax.errors import UserError
 

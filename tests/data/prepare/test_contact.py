@@ -349,7 +349,7 @@ def test_splits_references_and_nothing_to_compare(tmp_path):
         c.contact_quality(manifest, scores, reference="label.depth")
     with pytest.raises(UserError, match=r"both a value in label\.contact and a score"):
         c.contact_quality(manifest, _scores([np.nan] * 3, "none"))
-    with pytest.raises(UserError, match="holds something that is no number"):
+    with pytest.raises(UserError, match=r"contains text\. It must have numbers"):
         c.contact_quality(_manifest(tmp_path, **{"label.force": ["x"]}), _scores([1]))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.view import live as live_module
 from anytouch_jax.view import server
 from anytouch_jax.view.live import Live, LiveRecorder
 from anytouch_jax.view.space import FeatureMap
@@ -74,15 +74,16 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
 
 
 def test_frames_before_a_full_disk_are_kept(tmp_path, monkeypatch):
-    save, saved = live_module._save, []
+    saved = []
 
-    def full(path, picture):
+    def full(path, content):
         if len(saved) == 2:
             raise OSError(28, "No space left on device")
         saved.append(path)
-        save(path, picture)
+        with open(path, "wb") as file:
+            return file.write(content)
 
-    monkeypatch.setattr(live_module, "_save", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     recorder = LiveRecorder(tmp_path, "digit")
     recorder.start("cup", "train", None)
     for _ in range(60):

@@ -29,7 +29,7 @@ import numpy as np
 
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.embed import embed_rows, run_in_batches, text_column
+from anytouch_jax.encoder.embed import embed_rows, run_in_batches
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, load_engine, random_encoder
 from anytouch_jax.encoder.engines import CALIBRATION
 from anytouch_jax.encoder.export import export
@@ -75,7 +75,7 @@ def touches_of(encoder: Encoder, table: Any, rows: np.ndarray) -> tuple[np.ndarr
     """Return prepared touches u8 (n, 1, H, W, 3) and sensor rows (n,) of manifest rows."""
     clips: list[np.ndarray] = []
     given, _ = embed_rows(encoder, table, rows, edit=lambda part, _: (clips.append(part), part)[1], log=silent)
-    sensors = text_column(table, "sensor")[given]
+    sensors = table.text_column("sensor")[given]
     return np.concatenate(clips), np.array([encoder.sensor_row(one, silent) for one in sensors], np.int32)
 
 
@@ -121,7 +121,7 @@ def quality(name: str, table: Any, folder: Path) -> dict[str, dict[str, Any]]:
             for one in retrieval.cross_sensor_retrieval(table, {engine: values[: len(test)]}, test, centre=(True,))
             if one.query_sensor == retrieval.ALL
         )
-        labels, groups = (text_column(table, column)[rows] for column in (PROBED, "object"))
+        labels, groups = (table.text_column(column)[rows] for column in (PROBED, "object"))
         split = np.array(["test"] * len(test) + ["train"] * len(train))
         probe = probe_features(values, labels, groups, split, seeds=0)
         found[engine] |= {"recall": recall.top1, "accuracy": probe.accuracy}

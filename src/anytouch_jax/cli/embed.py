@@ -218,9 +218,7 @@ def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray
     """Return those of `rows` that have images and end a clip of `frames` frames; log how many others there are."""
     import numpy as np
 
-    from anytouch_jax.encoder.embed import text_column
-
-    fields = np.isin(text_column(manifest, "sensor")[rows], FIELD_SENSORS)
+    fields = np.isin(manifest.text_column("sensor")[rows], FIELD_SENSORS)
     if fields.any():
         log(f"{fields.sum()} rows of force-field sensors have no images and are left out")
         rows = rows[~fields]

@@ -101,7 +101,7 @@ def _calibration(encoder: Encoder, options: ExportOptions) -> tuple[np.ndarray, 
 
     from anytouch_jax.cli.embed import usable_rows
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder.embed import embed_rows, text_column
+    from anytouch_jax.encoder.embed import embed_rows
     from anytouch_jax.encoder.engines import CALIBRATION
 
     manifest, clips = manifests.read(options.data), list[np.ndarray]()
@@ -115,7 +115,7 @@ def _calibration(encoder: Encoder, options: ExportOptions) -> tuple[np.ndarray, 
         return part
 
     given, _ = embed_rows(encoder, manifest, rows, options.frames, edit=keep, log=log)
-    sensors = text_column(manifest, "sensor")[given]
+    sensors = manifest.text_column("sensor")[given]
     return np.concatenate(clips), np.array([encoder.sensor_row(name, lambda _: None) for name in sensors], np.int32)
 
 

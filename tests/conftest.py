@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
@@ -21,6 +22,7 @@ if jax.__version_info__[:2] == (0, 10):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_disable_most_optimizations", True)
 
+LIBC = ctypes.CDLL(None)
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]  # experiments, tests.parity and the tests' helpers
 
@@ -63,6 +65,8 @@ def _free_compiled_programs():
     yield
     jax.clear_caches()
     gc.collect()
+    if hasattr(LIBC, "malloc_trim"):  # of glibc: else free memory stays with the process
+        LIBC.malloc_trim(0)
 
 
 @pytest.fixture(scope="session")

@@ -142,6 +142,7 @@ def run(options: OptimiserOptions) -> int:
                 "ms": 1e3 * float(np.median(times[number])), "ratio": float(np.median(ratio[number])),
                 "ratio_low": float(low), "ratio_high": float(high),
             }  # fmt: skip
+    save(results, options)
     table = manifests.read([options.data])
     rows = np.linspace(0, len(table) - 1, min(len(table), 2000)).astype(int)
     pictures = np.stack([cv2.resize(decode(table.file(int(row))), (SIDE, SIDE)) for row in rows])
@@ -151,10 +152,15 @@ def run(options: OptimiserOptions) -> int:
         plain = plain or ends
         results[way.name]["loss"] = ends
         results[way.name]["loss_ratio"] = [one / base for one, base in zip(ends, plain, strict=True)]
+        save(results, options)
+    return 0
+
+
+def save(results: dict[str, dict[str, Any]], options: OptimiserOptions) -> None:
+    """Write and print what was measured so far."""
     for name, record in results.items():
         write_record(options.out, name, record | {"steps": options.steps})
         print(name, {key: value for key, value in record.items() if key != "machine"}, flush=True)
-    return 0
 
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "backgrounds": ("backgrounds.jsonl", studies.backgrounds),
     "untouched_gel": (studies.GELS, studies.untouched_gel),
     "motion": ("motion.jsonl", studies.motion),
-    "by_contact": (studies.CONTACTS, studies.by_contact),
     "lookalikes": ("lookalikes.jsonl", studies.lookalikes),
     "teaching": ("teaching.jsonl", studies.teaching),
     "left_out": ("named.jsonl", studies.left_out),

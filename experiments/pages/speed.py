@@ -285,7 +285,7 @@ def engines(folder: Path) -> Page:
         )
     if small := [one for one in records if one["encoder"] == "small"]:
         met = any(one["p50_ms"] < 15 and one["p99_ms"] < 25 for one in small)
-        findings.append(f"small: the goal of 15 ms and 25 ms is {'met' if met else 'missed'} on this busy machine.")
+        findings.append(f"small: the goal of 15 ms and 25 ms is {'met' if met else 'missed'} on this machine.")
     findings.append(
         "XLA stays the default of `anytouch stream`: it needs no other package and no export, and it runs on GPUs."
     )

@@ -13,8 +13,6 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import mean_interval
 from experiments.benchmarks.untouched_gel import NAME as GELS
 from experiments.benchmarks.untouched_gel import WAYS
-from experiments.encoders.by_contact import NAME as CONTACTS
-from experiments.encoders.by_contact import WAYS as CONTACT_WAYS
 from experiments.pages.page import Measure, Page, Value, compare, over_seeds
 from experiments.pouring import table as pours
 from experiments.real.scores import HEADS, TASKS, TRAINED, Score
@@ -24,7 +22,6 @@ from experiments.translation.settings import OURS, PIXELS, TRANSLATIONS, one_tab
 
 PATCHES = {"": "plain", "_convolutional": "convolutional"}
 HELD_OUT = "held_out.jsonl"
-FIRST = next(iter(CONTACT_WAYS))
 NAMED, UNNAMED = ("hardness", "roughness", "material"), "indenter"
 
 
@@ -86,45 +83,6 @@ def _grades(path: Path) -> dict[str, list[Record]]:
     if len({len(several) for several in result.values()}) > 1:
         raise UserError(f"{path} lacks a seed of {min(result, key=lambda grade: len(result[grade]))}. Run it again.")
     return dict(sorted(result.items(), reverse=True))
-
-
-def by_contact(folder: Path) -> Page:
-    """Stage 1 with masks and losses by contact: steps to the error and the recall of the paper's way."""
-    records = [*records_of(folder / CONTACTS).values()]
-    plain = {one["seed"]: np.array(one["curve"]) for one in records if one["way"] == FIRST}
-    rows, findings = [], []
-    for way in dict.fromkeys(one["way"] for one in records):
-        curves = {one["seed"]: np.array(one["curve"]) for one in records if one["way"] == way}
-        ends = [over_seeds([curve[-1, column] for curve in curves.values()]) for column in (1, 2, 3)]
-        gains = {
-            what: [_fewer_steps(curve[:, column] * sign, plain[seed][:, column] * sign) for seed, curve in
-                   curves.items()]
-            for what, column, sign in (("error", 1, 1), ("error of contact", 2, 1), ("recall@1", 3, -1))
-        }  # fmt: skip
-        rows.append((way, *ends[:2], ends[2].times(100), *(float(np.mean(gain)) for gain in gains.values())))
-        if way != FIRST:
-            words = ", ".join(f"{np.mean(gain):.2f} for the same {what}" for what, gain in gains.items())
-            findings.append(f"{way}: steps of the paper's way, divided by its own, are {words}.")
-    one = records[0]
-    return Page(
-        "by_contact",
-        "Does stage 1 learn faster where something touches?",
-        f"A small encoder learns {one['touches'][0]:,} stills of 56 pixels for {one['steps']:,} steps, less the "
-        f"untouched gel. It is judged on {one['touches'][1]:,} stills of other objects, with masks by chance. "
-        "The error is that of all hidden patches, and of hidden patches with contact. Recall@1 is the share of "
-        "touches whose nearest other touch by the same sensor is of the same object. A gain is the number of "
-        "steps after which the paper's way ends, divided by the steps until this way is as good. From and to "
-        "are the seeds.",
-        ("way", Measure("error", ".4f"), Measure("error of contact", ".4f"), Measure("recall@1, %", ".1f"),
-         *(Measure(f"gain, {what}", ".2f", False) for what in ("error", "error of contact", "recall@1"))),
-        rows, findings, (CONTACTS,), "python -m experiments.encoders.by_contact MANIFEST",
-    )  # fmt: skip
-
-
-def _fewer_steps(values: np.ndarray, base: np.ndarray) -> float:
-    """Return the factor by which a falling curve reaches the best of another with fewer steps, 0 if it never does."""
-    reached = np.flatnonzero(values <= base.min())
-    return float(base.argmin() + 1) / (reached[0] + 1) if len(reached) else 0.0
 
 
 def left_out(folder: Path) -> Page:

@@ -67,7 +67,7 @@ def versions(folder: Path) -> Page:
         ratio = Value(one["ratio"], one["ratio_low"], one["ratio_high"])
         error = one["error"].get("gradient", one["error"]["output"])
         rows.append((one["work"], one["dtype"], one["version"], one["ms"], ratio, error, one["temp_bytes"] / 2**20,
-                     str(one["onednn"])))  # fmt: skip
+                     one["onednn"]))  # fmt: skip
         ratios.setdefault((one["version"], one["dtype"]), []).append(one["ratio"])
     findings = [
         f"{version}, {dtype}: {min(several):.2f} to {max(several):.2f} of the time of {base}."
@@ -83,7 +83,8 @@ def versions(folder: Path) -> Page:
         "of products that jax uses on a CPU by default, and the flag oneDNN puts another in its place. Other work ran "
         "beside, at a low priority.",
         ("work", "type", "version", Measure("ms", ".1f", False), Measure("time / baseline", ".2f"),
-         Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False), "calls of oneDNN"),
+         Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False),
+         Measure("calls of oneDNN", ".0f", False)),
         rows, [*findings, "a newer jax without flags is the best choice here: no flag is faster in all works."],
         (VERSIONS,), "python -m experiments.benchmarks.versions --python PATH",
     )  # fmt: skip
@@ -115,7 +116,7 @@ def optimiser(folder: Path) -> Page:
         f"An update of all parameters is timed by itself, and all ways take turns ({_machine(first['machine'])}). The "
         "state holds both moments. The loss is that of the last 100 steps of stage 1 on stills of 56 pixels, as a "
         "share of the loss with float32 and the same seed. From and to are quartiles of the time, and the least and "
-        "largest of the seeds of the loss.",
+        f"largest of the loss over seeds ({len(first['loss'])}).",
         ("way", "preset", Measure("ms", ".1f", False), Measure("time / ours", ".2f"),
          Measure("state, MiB", ".0f", False), Measure("loss / float32", ".4f")),
         rows, findings, (OPTIMISER,), "python -m experiments.benchmarks.optimiser MANIFEST",

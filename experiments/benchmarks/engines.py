@@ -3,7 +3,7 @@
     python -m experiments.benchmarks.engines quality --corpus data/corpus/00000/manifest.parquet
     python -m experiments.benchmarks.engines time --corpus data/corpus/00000/manifest.parquet
 
-`quality` takes minutes and may run beside other work. `time` wants a quiet machine: engines take turns, a touch each.
+`quality` takes minutes, also while other work runs. `time` wants a quiet machine: engines take turns, a touch each.
 A line an encoder and engine goes to `experiments/results/engines.jsonl`. `make results` makes the page from that file.
 """
 

@@ -81,7 +81,7 @@ def versions(folder: Path) -> Page:
         f"{records[0]['preset']}). The ratio is to {base} without flags, in the same type. The error is that of the "
         "gradient, or of the output of an embedding, against float64. From and to are quartiles. YNNPACK is a library "
         "of products that jax uses on a CPU by default, and the flag oneDNN puts another in its place. Other work ran "
-        "beside, at a low priority.",
+        "at the same time, at a low priority.",
         ("work", "type", "version", Measure("ms", ".1f", False), Measure("time / baseline", ".2f"),
          Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False),
          Measure("calls of oneDNN", ".0f", False)),

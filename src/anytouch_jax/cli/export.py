@@ -123,8 +123,8 @@ def _export_card(options: ExportOptions, folder: Path) -> int:
     from anytouch_jax.encoder.encoder import find_tokenizer
     from anytouch_jax.weights import load, registry
 
-    jax_only = ("to", "frames", "platforms", "pooling", "join", "dtype", "between", "share", "out", *_INT8)
-    refuse_unused(options, jax_only, "with --card, which writes all weights of MODEL")
+    file_only = ("to", "frames", "platforms", "pooling", "join", "dtype", "between", "share", "out", *_INT8)
+    refuse_unused(options, file_only, "with --card, which writes all weights of MODEL")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} is not an empty folder. Name a new one with --card.")
     check_folder(folder)

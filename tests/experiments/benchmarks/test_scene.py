@@ -55,7 +55,7 @@ def test_the_mean_of_one_patch_is_the_patch(encoder, frames):
 
 def test_the_patches_that_changed_most_are_kept(frames):
     order = patches_by_change(frames.change)
-    assert (order[:10] == np.arange(16)).all(), "an untouched gel has no order of its own"
+    assert (order[:10] == np.arange(16)).all(), "an untouched gel has no order"
     kept = np.take_along_axis(frames.change[10:], order[10:, :4].astype(int), axis=1)
     assert (kept == [15, 14, 13, 12]).all()
 

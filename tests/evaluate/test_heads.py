@@ -268,7 +268,7 @@ def test_heads_of_the_first_release_still_load(tmp_path):
         ("weights", np.full((2, 1), np.nan)), ("weights", np.ones((3, 1))), ("scale", np.zeros(2)),
         ("mean", np.zeros(0)), ("classes", np.zeros(2)), ("bias", np.array("0")), ("frames", np.zeros(3)),
         ("pooling", "sum"), ("mark", 3), ("extra", 1),
-        ("label", ""), ("mark", ""), ("classes", np.array(["a", "a"])),
+        ("label", ""), ("mark", ""), ("classes", np.array(["a", "a"])), ("frames", "1"), ("frames", 1.0),
     ):  # fmt: skip
         np.savez(tmp_path / "h.npz", **{"format": "anytouch_jax.head.1", **arrays, name: value})
         with pytest.raises(UserError, match=r"h\.npz is not the head of a probe"):

@@ -47,9 +47,7 @@ class ExportOptions:
     data: tuple[Path, ...] = ()  # onnx: manifests (.csv, .parquet) with touches like those to come.
     frames: int = 1  # jax, onnx: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")  # jax: the platforms it runs on.
-    pooling: Literal["class", "mean", "both"] = (
-        "class"  # jax, onnx: the class token, the mean of the patch tokens, or both.
-    )
+    pooling: Literal["class", "mean", "both"] = "class"  # jax, onnx: class token, mean of patch tokens, or both.
     join: Literal["mean", "sum", "concat"] = "mean"  # jax: how the segments of a long clip are joined.
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""

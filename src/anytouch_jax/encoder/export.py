@@ -280,7 +280,7 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
     wrong = [name for name, kind in fields.items() if type(about.get(name)) is not kind]
     wrong += [] if "form" in wrong or about["form"] in _ENGINES else ["form"]
     wrong = wrong or [name for name in ("frames", "image_size", "features") if not 0 < about[name] < 1 << 20]
-    if wrong or list(about["sensors"].values()) != list(range(len(about["sensors"]))):
+    if wrong or list(about["sensors"].values()) != list(range(max(len(about["sensors"]), 1))):
         name = (wrong or ["sensors"])[0]
         raise UserError(f"{describes(path)} is damaged: {name} is missing or wrong; export it again")
     if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:

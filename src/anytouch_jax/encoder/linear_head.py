@@ -145,6 +145,7 @@ def load_head(path: str | Path) -> LinearHead:
             arrays[name] = str(arrays[name])
         if arrays.pop("format") not in FORMATS:
             raise ValueError("it has no format of a head")
+        check_array("frames", arrays["frames"], (), "iu")
         known = Calibration.from_arrays(arrays, len(arrays["mean"]))
         arrays = {name: value for name, value in arrays.items() if not name.startswith("calibration/")}
         head = LinearHead(frames=int(arrays.pop("frames")), fingerprint=arrays.pop("mark"), calibration=known, **arrays)

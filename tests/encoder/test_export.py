@@ -150,7 +150,7 @@ def test_a_damaged_artefact_is_refused(copied, damage):
 
 def test_a_damaged_or_missing_description_is_refused(copied):
     about = json.loads(describes(copied).read_text())
-    changes = {"format": "other.2"}, {"frames": -1}, {"features": 1 << 80}, {"sensors": {}}
+    changes = {"format": "other.2"}, {"frames": -1}, {"features": 1 << 80}, {"sensors": {}}, {"platforms": []}
     wrong = (json.dumps(about | change) for change in changes)
     for text in ("{", "[1]", "{}", '{"format": 3}', *wrong):
         describes(copied).write_text(text)

@@ -277,10 +277,10 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
         raise UserError(f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}")
     about.setdefault("form", "jax")  # files of version 0.2
     fields = _FIELDS | (_ONNX_FIELDS if about["form"] == "onnx" else {})
-    wrong = [name for name, kind in fields.items() if type(about.get(name)) is not kind]
+    wrong = [name for name, kind in fields.items() if type(about.get(name)) is not kind or about[name] in ([], {})]
     wrong += [] if "form" in wrong or about["form"] in _ENGINES else ["form"]
     wrong = wrong or [name for name in ("frames", "image_size", "features") if not 0 < about[name] < 1 << 20]
-    if wrong or list(about["sensors"].values()) != list(range(max(len(about["sensors"]), 1))):
+    if wrong or list(about["sensors"].values()) != list(range(len(about["sensors"]))):
         name = (wrong or ["sensors"])[0]
         raise UserError(f"{describes(path)} is damaged: {name} is missing or wrong; export it again")
     if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:

@@ -17,11 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 SIZES = {"cpu": 2048, "gpu": 8192, "tpu": 8192}  # of the square matrices whose product is the peak
+VECTORS = {"amx_tile": "AMX", "avx512f": "AVX-512", "avx2": "AVX2"}  # flags of Linux, the widest first
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Where figures were measured. `memory_gib` is the host's, `load` the mean of its last minute, as it began."""
+    """Where figures were measured. `memory_gib` is the host's, `load` the mean of its last minute, as it began.
+
+    `vectors` is the widest kind of vector instructions: AMX, AVX-512 or AVX2; empty where the system does not say.
+    """
 
     device: str
     devices: int
@@ -32,10 +36,12 @@ class Machine:
     python: str
     jax: str
     system: str
+    vectors: str = ""
 
     def sentence(self) -> str:
         """One line for a report."""
-        parts = [f"{self.devices} x {self.device}", f"{self.processor}, {self.cores} cores, {self.memory_gib:.0f} GiB"]
+        processor = f"{self.processor}{' with ' * bool(self.vectors)}{self.vectors}"
+        parts = [f"{self.devices} x {self.device}", f"{processor}, {self.cores} cores, {self.memory_gib:.0f} GiB"]
         parts += [f"Python {self.python}", f"jax {self.jax}", self.system]
         return f"{'; '.join(parts)}; load {self.load:.1f} at the start."
 
@@ -47,22 +53,24 @@ def describe() -> Machine:
     return Machine(
         device=first.device_kind,
         devices=jax.device_count(),
-        processor=_processor(),
+        processor=_cpuinfo("model name") or platform.machine(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         memory_gib=pages / 2**30,
         load=os.getloadavg()[0],
         python=platform.python_version(),
         jax=jax.__version__,
         system=platform.system(),
+        vectors=next((name for flag, name in VECTORS.items() if flag in _cpuinfo("flags").split()), ""),
     )
 
 
-def _processor() -> str:
+def _cpuinfo(field: str) -> str:
+    """Return a field of the first processor, empty where the system does not have it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         lines = []
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith(field)), "")
 
 
 def matmul(

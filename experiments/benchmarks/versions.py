@@ -136,12 +136,13 @@ class _Worker:
         assert self._process.stdout
         line = self._process.stdout.readline()
         if not line:
+            self.close()
             raise UserError(f"{' '.join(self._process.args)} failed. Its reason is above.")  # type: ignore[arg-type]
         return json.loads(line)
 
     def close(self) -> None:
-        self._process.kill()
-        self._process.wait()
+        with self._process:  # its end closes the pipes
+            self._process.kill()
 
 
 @contextlib.contextmanager

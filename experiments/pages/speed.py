@@ -27,34 +27,62 @@ def _ratio(row: dict[str, Any]) -> Value:
 
 
 def _machine(about: dict[str, Any]) -> str:
-    return f"{about['processor'].replace('(R)', '')}, {about['cores']} core{'s' * (about['cores'] > 1)}"
+    vectors = f" with {about['vectors']}" if about.get("vectors") else ""
+    return f"{about['processor'].replace('(R)', '')}{vectors}, {about['cores']} core{'s' * (about['cores'] > 1)}"
 
 
 def variants(folder: Path) -> Page:
     """Variants of a step: time, error and memory."""
-    numbers = read_records(folder / VARIANTS)["small"]
-    rows, ratios = [], {}
-    for several in numbers["results"].values():
-        for row in several:
-            error = row["error_gradient"] or row["error_output"]
-            ratios.setdefault(row["variant"], []).append(row["ratio"])
+    records = [*read_records(folder / VARIANTS).values()]
+    rows: list[Any] = []
+    ratios: dict[tuple[str, str], list[float]] = {}
+    errors: dict[tuple[str, str], float] = {}
+    for numbers in records:
+        machine = numbers["machine"].get("vectors") or numbers["machine"]["device"]
+        for row in (row for several in numbers["results"].values() for row in several):
+            error, key = row["error_gradient"] or row["error_output"], (machine, row["variant"])
+            ratios.setdefault(key, []).append(row["ratio"])
+            errors[key] = max(error, errors.get(key, 0))
             shown = (1e3 * row["seconds"], _ratio(row), error, row["temp_bytes"] / 2**20)
-            rows.append((row["workload"], row["variant"], *shown))
+            rows.append((machine, numbers["preset"], row["workload"], row["variant"], *shown))
     findings = [
-        f"{name}: a step takes {min(several):.2f} to {max(several):.2f} of the time in float32."
-        for name, several in ratios.items()
+        f"{machine}, {name}: a step takes {min(several):.2f} to {max(several):.2f} of the time in float32."
+        for (machine, name), several in ratios.items()
         if name != "float32"
     ]
+    points = {f"{machine}, {name}": (float(np.median(several)), errors[machine, name])
+              for (machine, name), several in ratios.items()}  # fmt: skip
+    known = {numbers["machine"].get("vectors"): numbers["machine"] for numbers in records}
     return Page(
         "variants",
-        "What do precision, attention and memory options cost?",
-        f"Variants of a step run in turns in one process, preset small ({_machine(numbers['machine'])}). {BATCHES} The "
-        "error is that of the gradient, or of the output of an embedding, against float64. From and to are quartiles.",
-        ("work", "variant", Measure("ms", ".0f", False), Measure("time / float32", ".2f"),
-         Measure("error", ".0e", False),
-         Measure("memory, MiB", ".0f", False)),
-        rows, findings, (VARIANTS,), 'make bench WHAT="stage1 stage2 embed" PRESET=small',
+        "What do precision, attention and memory options cost, and which pay where?",
+        "Variants of a step run in turns in one process. The machines are "
+        f"{' and '.join(_machine(one) for one in known.values())}. {BATCHES} The error is that of the gradient, or of "
+        "the output of an embedding, against float64. From and to are quartiles. A choice counts a variant that "
+        "saves a tenth of the time or more at the median of the works.",
+        ("machine", "preset", "work", "variant", Measure("ms", ".0f", False), Measure("time / float32", ".2f"),
+         Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False)),
+        rows, [*_choices(folder, points), *findings], (VARIANTS,),
+        'make bench WHAT="stage1 stage2 embed" PRESET=small',
+        "Median time ratio of a variant over its works, against its largest error.",
+        lambda path: pareto(path, points, x="time / float32", y="error"),
     )  # fmt: skip
+
+
+def _choices(folder: Path, points: dict[str, tuple[float, float]]) -> list[str]:
+    """Return a sentence for each kind of processor: which type to train in, and which engine embeds."""
+    engines = [one for one in read_records(folder / ENGINES).values() if one.get("encoder") == "anytouch-tiny"]
+    best = min((one for one in engines if "ratio" in one and one["error"] < 1e-4), key=lambda one: one["ratio"])
+    embeds = f"`{best['engine'].split(',')[0]}` embeds a touch in {best['ratio']:.2f} of the time of XLA"
+    sentences = []
+    for kind in ("AVX2", "AMX"):
+        if (name := f"{kind}, bfloat16") not in points:
+            continue
+        time, error = points[name]
+        pays = (f"train and embed in bfloat16. A work takes {time:.2f} of the time, at an error up to {error:.0e}"
+                if time <= 0.9 else f"stay with float32. In bfloat16 a work takes {time:.2f} of the time")  # fmt: skip
+        sentences.append(f"on a CPU with {kind}, {pays}.{f' {embeds}.' if kind == 'AVX2' else ''}")
+    return [*sentences, "on a GPU, run `make bench-gpu` first: these rows are from CPUs alone."]
 
 
 def versions(folder: Path) -> Page:

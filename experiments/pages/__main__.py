@@ -44,6 +44,7 @@ STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
     "scene": (speed.SCENE, speed.scene),
     "view": (speed.VIEW, speed.view),
     "engines": (speed.ENGINES, speed.engines),
+    "by_contact": (studies.CONTACTS, studies.by_contact),
     "photometry": (speed.SIMULATOR, speed.photometry),
     "contact": (speed.SIMULATOR, speed.contact),
     "compare": (COMPARED, compare_encoders),

@@ -1,7 +1,7 @@
-"""The check before a release: `make release-check`, or `python -m tests.release [FOLDER]`.
+"""The check before a release: `make release-check`, or `python -m tests.release`.
 
 It builds the wheel and the source archive, reads their metadata, installs the wheel into an empty environment, and runs
-the README's Python there. FOLDER keeps all of it. The default is build/release.
+the README's Python there. All of it stays in build/release.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def sdist_faults(sdist: Path) -> list[str]:
 
 def main() -> int:
     """Check a release, and return 0 if it may go out."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "build" / "release").resolve()
+    folder = ROOT / "build" / "release"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     wheel, sdist = build(folder)

@@ -11,7 +11,7 @@ No picture with a non-commercial licence is read.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +137,8 @@ def build(pack: Path, second: Path) -> dict[str, Array]:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 4:
-        raise SystemExit("usage: python -m experiments.benchmarks.looks PACK PACK2 OUT.npz")
-    np.savez_compressed(sys.argv[3], **build(Path(sys.argv[1]), Path(sys.argv[2])))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, what in (("pack", "a pack of real pictures"), ("pack2", "another"), ("out", "the .npz file to write")):
+        parser.add_argument(name, type=Path, help=what)
+    options = parser.parse_args()
+    np.savez_compressed(options.out, **build(options.pack, options.pack2))

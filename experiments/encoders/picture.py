@@ -5,7 +5,7 @@ python -m experiments.encoders.picture docs/pictures/first_touch.png
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -51,4 +51,8 @@ def draw(out: Path, model: str = "anytouch-tiny") -> None:
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]), *sys.argv[2:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, help="the picture to write")
+    parser.add_argument("model", nargs="?", default="anytouch-tiny", help="name or path of an encoder")
+    options = parser.parse_args()
+    draw(options.out, options.model)

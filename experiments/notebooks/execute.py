@@ -5,7 +5,7 @@ Each `NN_name.py` becomes `NN_name.ipynb` next to it, with its outputs. Notebook
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import jupytext
@@ -35,7 +35,9 @@ def notebook(source: Path) -> str:
 
 
 if __name__ == "__main__":
-    for path in sources(sys.argv[1:]):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("number", nargs="*", help="how the names of the notebooks begin (default: all)")
+    for path in sources(parser.parse_args().number):
         text = notebook(path)
         path.with_suffix(".ipynb").write_text(text + "\n", encoding="utf-8")
         print(f"{path.with_suffix('.ipynb').name}: {len(text) / 1e3:.0f} kB", flush=True)

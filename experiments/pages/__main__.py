@@ -6,6 +6,7 @@ values the README gets too.
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from collections.abc import Callable, Mapping
@@ -91,8 +92,10 @@ def write(folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=RESULTS, help="data of the pages (default: %(default)s)")
     try:
-        for path in write(Path(sys.argv[1]) if len(sys.argv) > 1 else RESULTS):
+        for path in write(parser.parse_args().folder):
             print(path)
     except UserError as error:
         sys.exit(str(error))

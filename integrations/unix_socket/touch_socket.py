@@ -3,10 +3,10 @@
 python integrations/unix_socket/touch_socket.py 0 digit /tmp/touch.sock gel.png
 """
 
+import argparse
 import contextlib
 import json
 import socket
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,13 @@ if __name__ == "__main__":
     from anytouch_jax.encoder.novelty import ContactGate
     from anytouch_jax.encoder.stream import open_source, stream
 
-    camera, sensor, address, *gel = sys.argv[1:]
-    encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(camera)
-    background = decode(gel[0]) if gel else None
-    preprocess, gate = at.Preprocess(encoder, background), ContactGate(background, sensor)
-    serve(stream(encoder, source, preprocess, live=live, sensor=encoder.sensor_row(sensor), contact=gate), address)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, what in (("camera", "a camera's number, film or folder"), ("sensor", "its kind"), ("address", "socket")):
+        parser.add_argument(name, help=what)
+    parser.add_argument("background", nargs="?", help="picture of the untouched gel")
+    given = parser.parse_args()
+    encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(given.camera)
+    background = decode(given.background) if given.background else None
+    preprocess, gate = at.Preprocess(encoder, background), ContactGate(background, given.sensor)
+    frames = stream(encoder, source, preprocess, live=live, sensor=encoder.sensor_row(given.sensor), contact=gate)
+    serve(frames, given.address)

@@ -257,3 +257,27 @@ def test_a_public_name_stays_callable_when_its_module_is_imported() -> None:
     assert callable(at.pretrain)
     with pytest.raises(TypeError, match="missing"):
         at.pretrain()
+
+
+# The repository --------------------------------------------------------------------------------------------------------
+
+TOP = {
+    ".ci", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md", "docs",
+    "experiments", "integrations", "mkdocs.yml", "pyproject.toml", "requirements.txt", "src", "tests",
+}  # fmt: skip
+
+
+def test_nothing_else_lies_at_the_top() -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT.parents[1], capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("the sources are not a clone")
+    assert {name.partition("/")[0].strip('"') for name in listed.stdout.splitlines()} <= TOP
+
+
+def test_every_command_has_a_parser() -> None:
+    """Words taken from sys.argv by place make a folder of `--help`."""
+    for folder in ("src", "experiments", "integrations", "docs"):
+        for path in (ROOT.parents[1] / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                taken = isinstance(node, ast.Subscript) and ast.unparse(node) in {f"sys.argv[{i}]" for i in range(1, 9)}
+                assert not taken, f"{path}: parse the words of the command"

@@ -93,7 +93,7 @@ def write(folder: Path) -> list[Path]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?", default=RESULTS, help="data of the pages (default: %(default)s)")
+    parser.add_argument("folder", type=Path, nargs="?", default=RESULTS, help="data of the pages")
     try:
         for path in write(parser.parse_args().folder):
             print(path)

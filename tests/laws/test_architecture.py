@@ -259,7 +259,7 @@ def test_a_public_name_stays_callable_when_its_module_is_imported() -> None:
         at.pretrain()
 
 
-# The repository --------------------------------------------------------------------------------------------------------
+# The repository -------------------------------------------------------------------------------------------------------
 
 TOP = {
     ".ci", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md", "docs",

@@ -16,7 +16,7 @@ from experiments.records import read_records
 
 @pytest.mark.parametrize("wrong", [{"flags": ("one DNN",)}, {"works": ("stage3",)}])
 def test_an_unknown_name_is_refused_before_anything_starts(wrong):
-    with pytest.raises(UserError, match="is none of the .* Choose among"):
+    with pytest.raises(UserError, match=r"is none of the .* Choose among"):
         versions.run(VersionOptions(**wrong))
 
 
@@ -42,5 +42,5 @@ def test_a_process_that_fails_is_named(tmp_path):
     broken = tmp_path / "python"
     broken.write_text("#!/bin/sh\nexit 3\n")
     broken.chmod(0o755)
-    with pytest.raises(UserError, match="failed. Its reason is above"):
+    with pytest.raises(UserError, match=r"failed\. Its reason is above"):
         versions._Worker(broken, "", "embed one clip", "float32", VersionOptions())

@@ -9,6 +9,10 @@ PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.made
 TORCH  := .venv-torch
 DOCS   := .venv-docs
+# Another jax, and an interpreter that it supports, for test-jax.
+JAX       ?= 0.12.0.1
+NEWPYTHON ?= python3.13
+NEWER     := .venv-jax-$(JAX)
 
 PRESET     ?= tiny
 SCENES     ?= data/scenes
@@ -53,7 +57,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all lint format bench bench-torch bench-gpu compare pouring translation long-clips experiments results notebooks corpus weights figures release-check docs clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all test-jax lint format bench bench-torch bench-gpu compare pouring translation long-clips experiments results notebooks corpus weights figures release-check docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -100,6 +104,10 @@ test: $(STAMP) ## the quick tests, some minutes on two cores
 test-all: $(STAMP) ## every test
 	-$(PY) -m pip install -q playwright "moto[server]" s3fs
 	$(PYTEST)
+	$(if $(shell $(NEWPYTHON) -c "print(1)" 2>/dev/null),$(MAKE) test-jax)
+
+test-jax: $(NEWER)/.made ## tests of what is computed, under another jax in its own environment: [JAX=0.12.0.1 NEWPYTHON=python3.13]
+	$(NEWER)/bin/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" tests/ops tests/nn tests/train tests/parity tests/test_objectives.py
 
 lint: $(STAMP) ## ruff (rules and format), mypy and the rules of prose
 	$(PY) -m ruff check $(CHECKED)
@@ -166,7 +174,7 @@ docs: $(STAMP) ## the documentation site, in build/site, in a separate venv
 	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
 
 clean: ## remove .venv, builds and caches; runs stay
-	rm -rf $(VENV) $(TORCH) $(DOCS) build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(TORCH) $(DOCS) .venv-jax-* build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SCENES)/manifest.parquet: | $(STAMP)
@@ -182,6 +190,12 @@ $(DOCS)/.made: docs/requirements.txt
 	$(PYTHON) -m venv $(DOCS)
 	@echo '*' > $(DOCS)/.gitignore
 	$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
+$(NEWER)/.made: pyproject.toml
+	$(NEWPYTHON) -m venv $(NEWER)
+	@echo '*' > $(NEWER)/.gitignore
+	$(NEWER)/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]" "jax==$(JAX)"
 	@touch $@
 
 $(STAMP): requirements.txt pyproject.toml

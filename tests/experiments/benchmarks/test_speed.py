@@ -273,6 +273,19 @@ def test_the_peak_is_that_of_a_square_product():
     (product,) = machine.matmul("bfloat16", 32)[0]()
     assert product.dtype == jnp.float32  # the one form of it that a CPU computes fast
     assert machine.describe().cores >= 1 and "jax" in machine.describe().sentence()
+    assert machine.describe().vectors in {"", *machine.VECTORS.values()}
+
+
+@pytest.mark.parametrize(
+    ("flags", "found"),
+    [("sse avx2 avx512f amx_tile", "AMX"), ("avx2 avx512f", "AVX-512"), ("avx avx2", "AVX2"), ("sse", "")],
+)
+def test_a_machine_names_its_widest_vectors(flags, found, monkeypatch):
+    known = {"model name": "A processor", "flags": flags}
+    monkeypatch.setattr(machine, "_cpuinfo", known.__getitem__)
+    here = machine.describe()
+    assert here.vectors == found and here.processor == "A processor"
+    assert (f"A processor with {found}," if found else "A processor,") in here.sentence()
 
 
 # Many devices -------------------------------------------------------------------------------------------------------

@@ -54,14 +54,15 @@ UNTRAINED = {"small": preset("small"), "demo": preset("tiny")}  # presets; the d
 UNTRAINED["demo"] = replace(
     UNTRAINED["demo"], model=replace(UNTRAINED["demo"].model, image_size=84, touch=Stack(128, 2, 4, 512))
 )
-ENCODERS = ("anytouch-tiny", *UNTRAINED)
+FRAMES = {"anytouch-tiny, clips": 3}  # of a touch, else 1
+ENCODERS = ("anytouch-tiny", *FRAMES, *UNTRAINED)
 SENSOR, BATCH = 0, 16
 PROBED, TRAIN_ROWS = "label.indenter", 1000
 
 
 def source_of(name: str) -> Encoder:
     """Return the live encoder in float32."""
-    encoder = random_encoder(UNTRAINED[name]) if name in UNTRAINED else load_encoder(name)
+    encoder = random_encoder(UNTRAINED[name]) if name in UNTRAINED else load_encoder(name.partition(",")[0])
     return encoder.computed_in("float32")
 
 
@@ -71,20 +72,20 @@ def encoder_on(encoder: str, engine: str, folder: Path) -> Encoder:
     return source_of(encoder).computed_in(what) if kind == "xla" else load_engine(folder / what, kind)  # type: ignore[arg-type]
 
 
-def touches_of(encoder: Encoder, table: Any, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return prepared touches u8 (n, 1, H, W, 3) and sensor rows (n,) of manifest rows."""
+def touches_of(encoder: Encoder, table: Any, rows: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return prepared touches u8 (n, frames, H, W, 3) and sensor rows (n,) of manifest rows."""
     clips: list[np.ndarray] = []
-    given, _ = embed_rows(encoder, table, rows, edit=lambda part, _: (clips.append(part), part)[1], log=silent)
+    given, _ = embed_rows(encoder, table, rows, frames, edit=lambda part, _: (clips.append(part), part)[1], log=silent)
     sensors = table.text_column("sensor")[given]
     return np.concatenate(clips), np.array([encoder.sensor_row(one, silent) for one in sensors], np.int32)
 
 
-def write_files(encoder: Encoder, table: Any, folder: Path) -> None:
+def write_files(encoder: Encoder, table: Any, folder: Path, frames: int) -> None:
     """Export to `folder` in float32 and in int8, calibrated on 200 rows of the training split."""
     rows = table.rows_of("train")
-    calibration = touches_of(encoder, table, rows[np.linspace(0, len(rows) - 1, CALIBRATION).astype(int)])
-    export(encoder, folder / "f32.onnx", form="onnx")
-    export(encoder, folder / "int8.onnx", form="onnx", calibration=calibration)
+    calibration = touches_of(encoder, table, rows[np.linspace(0, len(rows) - 1, CALIBRATION).astype(int)], frames)
+    export(encoder, folder / "f32.onnx", frames=frames, form="onnx")
+    export(encoder, folder / "int8.onnx", frames=frames, form="onnx", calibration=calibration)
 
 
 def store(encoder: str, engine: str, found: dict[str, Any], about: dict[str, Any]) -> None:
@@ -106,7 +107,7 @@ def quality(name: str, table: Any, folder: Path) -> dict[str, dict[str, Any]]:
     train = retrieval.deepest_rows(table, table.rows_of("train"), split="train")
     train = train[np.linspace(0, len(train) - 1, min(TRAIN_ROWS, len(train))).astype(int)]
     rows = test if name in UNTRAINED else np.concatenate([test, train])
-    touches, sensors = touches_of(source, table, rows)
+    touches, sensors = touches_of(source, table, rows, FRAMES.get(name, 1))
     found: dict[str, dict[str, Any]] = {}
     live = None
     for engine in ENGINES:
@@ -132,20 +133,20 @@ def quality(name: str, table: Any, folder: Path) -> dict[str, dict[str, Any]]:
 # Time ---------------------------------------------------------------------------------------------------------------
 
 
-def one_touch(encoder: Encoder) -> Callable[[np.ndarray], np.ndarray]:
-    """Return what `anytouch stream` runs for a touch (1, 1, H, W, 3)."""
-    run = compile_for_one(encoder, SENSOR, 1)
+def one_touch(encoder: Encoder, frames: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return what `anytouch stream` runs for a touch (1, frames, H, W, 3)."""
+    run = compile_for_one(encoder, SENSOR, frames)
     return lambda touch: np.asarray(run(jax.device_put(touch)))
 
 
 def timed(name: str, folder: Path, rounds: int) -> dict[str, dict[str, Any]]:
     """Return p50 and p99 of one touch in ms and touches/s in batches. Engines take turns."""
     rng, ready = np.random.default_rng(0), {}
-    side = source_of(name).config.model.image_size
+    side, frames = source_of(name).config.model.image_size, FRAMES.get(name, 1)
     for engine in ENGINES:
         encoder = encoder_on(name, engine, folder)
-        ready[engine] = (one_touch(encoder), encoder.encode_touch)
-    several = rng.integers(0, 256, (BATCH, 1, side, side, 3), np.uint8)
+        ready[engine] = (one_touch(encoder, frames), encoder.encode_touch)
+    several = rng.integers(0, 256, (BATCH, frames, side, side, 3), np.uint8)
     rows = np.full(BATCH, SENSOR, np.int32)
     ones: dict[str, list[float]] = {engine: [] for engine in ENGINES}
     many: dict[str, list[float]] = {engine: [] for engine in ENGINES}
@@ -180,8 +181,9 @@ def started(name: str, engine: str, folder: Path) -> dict[str, float]:
     jax.device_put(np.zeros(1)).block_until_ready()
     before, begin = resident(), time.perf_counter()
     encoder = encoder_on(name, engine, folder)
-    touch = encoder.blank[None, None]
-    run = one_touch(encoder)
+    frames = FRAMES.get(name, 1)
+    touch = np.repeat(encoder.blank[None, None], frames, 1)
+    run = one_touch(encoder, frames)
     run(touch)
     seconds = time.perf_counter() - begin
     for _ in range(20):
@@ -229,7 +231,7 @@ def main() -> None:
                 continue
             table = manifests.read(options.corpus)
             if not (folder / "int8.onnx").exists():
-                write_files(source_of(name), table, folder)
+                write_files(source_of(name), table, folder, FRAMES.get(name, 1))
             if options.what == "quality":
                 found = quality(name, table, folder)
                 for engine, (kind, what) in ENGINES.items():

@@ -29,7 +29,8 @@ WORKERS    ?= 2
 CORPUS     ?= data/corpus
 REAL       ?=
 TOUCH      ?=
-WEIGHTS    ?= runs/anytouch-tiny
+ENCODER    ?= anytouch-tiny
+WEIGHTS    ?= runs/$(ENCODER)
 ENCODERS   ?=
 
 DEMO       ?= runs/demo
@@ -154,11 +155,11 @@ notebooks: $(STAMP) ## run the notebooks of experiments/notebooks again, in plac
 corpus: $(STAMP) ## the simulated touches that the shipped encoders are trained on: [CORPUS=data/corpus]
 	$(PY) -m experiments.encoders.corpus $(CORPUS)
 
-weights: $(STAMP) ## train the shipped encoder again: [CORPUS= REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
-	$(PY) -m experiments.encoders.train --corpus $(CORPUS) --real $(REAL) --out $(WEIGHTS)
+weights: $(STAMP) ## train a shipped encoder again: [ENCODER=anytouch-tiny CORPUS= REAL="a.csv b.csv" WEIGHTS=runs/ENCODER]
+	$(PY) -m experiments.encoders.train --encoder $(ENCODER) --corpus $(CORPUS) --real $(REAL) --out $(WEIGHTS)
 
 figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
-	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
+	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny anytouch-tiny-conv untrained:anytouch-tiny-conv$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.real.run anytouch-tiny --backgrounds$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png
 	$(PY) -m experiments.pages

@@ -23,7 +23,7 @@ from anytouch_jax.train.mesh import enable_compilation_cache
 
 SENSORS = ("gelsight_mini", "digit", "gelsight", "gelslim", "duragel", "9dtact")
 SHARD = 850  # touches, each by every sensor
-GRADES = ("fine", "fine", "coarse", "fine")  # of one shard after the other
+GRADES = ("fine", "fine", "coarse", "fine")  # coarse: each sensor touches as by hand
 TOUCHED = 0.08  # mm of the deepest point that count as contact
 
 
@@ -43,6 +43,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--touches", type=int, default=3400)
     parser.add_argument("--frames", type=int, default=6)
+    parser.add_argument("--grades", nargs="+", default=GRADES, choices=set(GRADES), help="of one shard after the other")
     parser.add_argument("--seed", type=int, default=41)
     options = parser.parse_args()
     enable_compilation_cache()  # each shard compiles the same programs
@@ -50,7 +51,7 @@ def main() -> None:
     for first in range(0, options.touches, SHARD):
         scenes = Scenes(
             touches=min(SHARD, options.touches - first), sensors=SENSORS, seed=options.seed,
-            grade=GRADES[first // SHARD % len(GRADES)], depth=(0.15, 1.0),
+            grade=options.grades[first // SHARD % len(options.grades)], depth=(0.15, 1.0),
             frames=options.frames, objects=480, size=128, first=first,
             vision=0.4, text=0.7,
         )  # fmt: skip

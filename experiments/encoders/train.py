@@ -1,4 +1,4 @@
-"""Training of the encoder in the package: stage 1, stage 2 in two parts, then the folder with its card.
+"""Training of the encoders in the package: stage 1, stage 2 in two parts, then the folder with its card.
 
     python -m experiments.encoders.train --corpus data/corpus --real a.csv b.csv --out runs/anytouch-tiny
 
@@ -22,14 +22,14 @@ from anytouch_jax.files import atomic_path
 from anytouch_jax.pretrain import pretrain
 from experiments.encoders.resident import ResidentLoader
 
-NOTES = Path(__file__).with_name("anytouch-tiny.md")
 DATA = [
     "--preset", "tiny", "--data.background", "subtract", "--data.contact-only", "--data.jitter", "0", "0", "0", "0",
     "--data.affine", "8", "0.04", "0.1", "--run.figure-every", "0",
 ]  # fmt: skip
+CONV = [*DATA, "--model.patch-encoder", "convolutional"]
 SMALL = ("width=128", "depth=2", "heads=4", "mlp=512")  # the image tower: photographs are few and simple
 STAGE2 = [
-    *DATA, "--optim.layer-decay", "0.75", "--model.match-head", "cosine", "--objective.match-weight", "8",
+    "--optim.layer-decay", "0.75", "--model.match-head", "cosine", "--objective.match-weight", "8",
     "--data.negatives", "same_sensor", "--model.text.stack.depth", "2",
     *(word for part in SMALL for word in (f"--model.image.{part.partition('=')[0]}", part.partition("=")[2])),
 ]  # fmt: skip
@@ -40,17 +40,27 @@ def real_share(slip: int, press: int) -> list[str]:
     return ["--data.weights", "incipient_slip-gelsight_mini_markers", str(slip), "gelslam-gelsight_mini", str(press)]
 
 
+WIDE1 = ["--batch", "256", "--optim.learning-rate", "1.5e-3", "--objective.norm-pix-loss"]
+WIDE2 = [
+    *STAGE2, "--batch", "256", "--optim.learning-rate", "1e-3", "--objective.match-keep", "0.75",
+    "--data.clip-share", "0.2",
+]  # fmt: skip
+LAST = [*STAGE2, "--optim.learning-rate", "5e-4", "--objective.match-keep", "0.5", "--data.clip-share", "0"]
 # Folder, stage, steps, steps after which it stops, options, draws of real recordings. Each starts from the one before.
-PARTS = (
-    ("stage1", 1, 12666, None,
-     [*DATA, "--batch", "256", "--optim.learning-rate", "1.5e-3", "--objective.norm-pix-loss"], real_share(10, 20)),
-    ("stage2-wide", 2, 2109, 175,
-     [*STAGE2, "--batch", "256", "--optim.learning-rate", "1e-3", "--objective.match-keep", "0.75",
-      "--data.clip-share", "0.2"], real_share(8, 20)),
-    ("stage2", 2, 850, None,
-     [*STAGE2, "--batch", "64", "--optim.learning-rate", "5e-4", "--optim.warmup", "30",
-      "--objective.match-keep", "0.5", "--data.clip-share", "0"], real_share(8, 20)),
-)  # fmt: skip
+RECIPES = {
+    "anytouch-tiny": (
+        ("stage1", 1, 12666, None, [*DATA, *WIDE1], real_share(10, 20)),
+        ("stage2-wide", 2, 2109, 175, [*DATA, *WIDE2], real_share(8, 20)),
+        ("stage2", 2, 850, None, [*DATA, *LAST, "--batch", "64", "--optim.warmup", "30"], real_share(8, 20)),
+    ),
+    "anytouch-tiny-conv": (
+        ("stage1", 1, 12000, None, [*CONV, *WIDE1], real_share(5, 10)),
+        ("stage2-wide", 2, 12000, 3221, [*CONV, *WIDE2], real_share(5, 10)),
+        ("stage2", 2, 400, None,
+         [*CONV, *LAST, "--batch", "128", "--optim.warmup", "20", "--objective.alpha-tv", "0", "--objective.alpha-vl",
+          "0"], real_share(30, 75)),
+    ),
+}  # fmt: skip
 
 
 def leave_out(manifest: Path, sensor: str) -> Path:
@@ -63,6 +73,7 @@ def leave_out(manifest: Path, sensor: str) -> Path:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--encoder", choices=RECIPES, default="anytouch-tiny", help="which encoder to train")
     parser.add_argument("--corpus", type=Path, required=True)
     parser.add_argument("--real", type=Path, nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, required=True)
@@ -72,7 +83,7 @@ def main() -> None:
     shards = sorted(options.corpus.glob("*/manifest.parquet"))
     init: list[str] = []
     ResidentLoader.processes = options.processes
-    for folder, stage, steps, stop, recipe, share in PARTS:
+    for folder, stage, steps, stop, recipe, share in RECIPES[options.encoder]:
         if stage == 2 and options.without:
             shards = [leave_out(path.with_name("manifest.parquet"), options.without) for path in shards]
         data = [str(path) for path in (*shards, *options.real)]
@@ -85,7 +96,8 @@ def main() -> None:
         if result.interrupted:
             raise SystemExit(130)
         init = ["--init", run]
-    anytouch(["export", "--card", str(options.out / "anytouch-tiny"), "--model", run, "--notes", str(NOTES)])
+    notes = Path(__file__).with_name(f"{options.encoder}.md")
+    anytouch(["export", "--card", str(options.out / options.encoder), "--model", run, "--notes", str(notes)])
 
 
 if __name__ == "__main__":

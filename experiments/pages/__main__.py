@@ -14,6 +14,7 @@ from pathlib import Path
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
+from anytouch_jax.weights.registry import DEFAULT
 from experiments.compare.page import NAME as COMPARED
 from experiments.compare.page import compare_encoders
 from experiments.pages import matrix, page, speed, studies, trust
@@ -72,7 +73,7 @@ def readme(text: str, several: list[page.Page]) -> str:
     """Return the README with the values of the pages that its table links to, written as `name` 1.2 %."""
     lines = text.splitlines(keepends=True)
     for one in several:
-        values = {row[2].partition(":")[0]: row[3] for row in one.rows if row[:2] == SHOWN.get(one.name)}
+        values = {row[2].removesuffix(f":{DEFAULT}"): row[3] for row in one.rows if row[:2] == SHOWN.get(one.name)}
         for name, value in values.items():
             pattern = re.compile(rf"(?<={re.escape(name)}`) [\d.]+ %")
             lines = [pattern.sub(f" {value.mean:.1f} %", line) if f"/{one.name}.md" in line else line for line in lines]

@@ -305,7 +305,8 @@ def real(folder: Path) -> Page:
             key = f"{task}, {head}"
             scores = {name: _score(one["tasks"][key]) for name, one in records.items() if key in one["tasks"]}
             for name, score in sorted(scores.items(), key=lambda item: -item[1].share):
-                fresh = next((other for other in scores if other.startswith("untrained:")), "")
+                twins = sorted((other for other in scores if other.startswith("untrained:")), key=len)
+                fresh = f"untrained:{name}" if f"untrained:{name}" in twins else next(iter(twins), "")
                 changes = [_minus(score, scores.get(other)) if other != name else None for other in ("pixels", fresh)]
                 rows.append((task, head, name, Value(score.share, *score.interval()).times(100), *changes))
                 if name in encoders and head in HEADS:
@@ -332,7 +333,9 @@ def real(folder: Path) -> Page:
         "task leaves objects out.",
         ("task", "head", "features", Measure("right, %"), Measure("minus pixels", "+.1f"),
          Measure("minus untrained", "+.1f")),
-        rows, [*findings, *times], (path.name,), "python -m experiments.real.run anytouch-tiny untrained:anytouch-tiny",
+        rows, [*findings, *times], (path.name,),
+        "python -m experiments.real.run anytouch-tiny untrained:anytouch-tiny anytouch-tiny-conv "
+        "untrained:anytouch-tiny-conv",
     )  # fmt: skip
 
 
@@ -442,13 +445,14 @@ def lookalikes(folder: Path) -> Page:
             for name in record["encoders"]
         ]
     return Page(
-        "lookalikes", "Does the encoder in the package find the same touch by another sensor?",
+        "lookalikes", "Do the encoders in the package find the same touch by another sensor?",
         "Touches are simulated, of objects that training left out, by the six sensors of training. The right answer "
         "stands among 50 touches that resemble it most in place, depth and force. With fine alignment all sensors "
-        "touch in the same way. With coarse alignment each touches as by hand. Intervals are over objects. The rows "
-        "`convolutional` and `held_out` are other encoders, with convolutional patches.",
+        "touch in the same way. With coarse alignment each touches as by hand. Intervals are over objects. The row "
+        "`held_out` is another encoder, with convolutional patches.",
         ("touches", "features", Measure("recall@1, %")), rows, findings, (path.name,),
-        "python -m experiments.encoders.lookalikes anytouch-tiny --fine data/corpus/00000 --coarse data/corpus/01700",
+        "python -m experiments.encoders.lookalikes anytouch-tiny anytouch-tiny-conv untrained:anytouch-tiny "
+        "--fine data/corpus/00000 --coarse data/corpus/01700",
     )  # fmt: skip
 
 

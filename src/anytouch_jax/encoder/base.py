@@ -42,7 +42,7 @@ class Encoder:
     `whole` model: they stay on the host until they are used. `tokenizer_file` is None without a tokenizer.json.
     """
 
-    config: Config
+    config: Config = field(repr=False)
     params: Params = field(repr=False)
     source: str
     trained_sensors: tuple[str, ...] | None = None

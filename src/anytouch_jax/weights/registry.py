@@ -1,7 +1,7 @@
 """Encoders by name: those in the package, and those on the Hugging Face hub.
 
 >>> list_encoders()
-['anytouch-tiny']
+['anytouch-tiny', 'anytouch-tiny-conv']
 >>> locate("anytouch-tiny")  # a file of the installed package
 """
 

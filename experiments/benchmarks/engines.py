@@ -80,9 +80,14 @@ def touches_of(encoder: Encoder, table: Any, rows: np.ndarray, frames: int) -> t
     return np.concatenate(clips), np.array([encoder.sensor_row(one, silent) for one in sensors], np.int32)
 
 
+def ends_of(table: Any, rows: np.ndarray, frames: int) -> np.ndarray:
+    """Return the rows that end a clip of `frames` frames."""
+    return rows if frames == 1 else rows[np.isin(rows, table.clips(frames)[:, -1])]
+
+
 def write_files(encoder: Encoder, table: Any, folder: Path, frames: int) -> None:
     """Export to `folder` in float32 and in int8, calibrated on 200 rows of the training split."""
-    rows = table.rows_of("train")
+    rows = ends_of(table, table.rows_of("train"), frames)
     calibration = touches_of(encoder, table, rows[np.linspace(0, len(rows) - 1, CALIBRATION).astype(int)], frames)
     export(encoder, folder / "f32.onnx", frames=frames, form="onnx")
     export(encoder, folder / "int8.onnx", frames=frames, form="onnx", calibration=calibration)
@@ -101,13 +106,13 @@ def store(encoder: str, engine: str, found: dict[str, Any], about: dict[str, Any
 
 def quality(name: str, table: Any, folder: Path) -> dict[str, dict[str, Any]]:
     """Return the largest error of the features of each engine; of a trained encoder also accuracy and recall@1."""
-    source = source_of(name)
-    test = retrieval.deepest_rows(table, table.rows_of("test"))
+    source, frames = source_of(name), FRAMES.get(name, 1)
+    test = ends_of(table, retrieval.deepest_rows(table, table.rows_of("test")), frames)
     test = test[:64] if name in UNTRAINED else test
-    train = retrieval.deepest_rows(table, table.rows_of("train"), split="train")
+    train = ends_of(table, retrieval.deepest_rows(table, table.rows_of("train"), split="train"), frames)
     train = train[np.linspace(0, len(train) - 1, min(TRAIN_ROWS, len(train))).astype(int)]
     rows = test if name in UNTRAINED else np.concatenate([test, train])
-    touches, sensors = touches_of(source, table, rows, FRAMES.get(name, 1))
+    touches, sensors = touches_of(source, table, rows, frames)
     found: dict[str, dict[str, Any]] = {}
     live = None
     for engine in ENGINES:

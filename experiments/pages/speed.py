@@ -58,8 +58,8 @@ def variants(folder: Path) -> Page:
         "What do precision, attention and memory options cost, and which pay where?",
         "Variants of a step run in turns in one process. The machines are "
         f"{' and '.join(_machine(one) for one in known.values())}. {BATCHES} The error is that of the gradient, or of "
-        "the output of an embedding, against float64. From and to are quartiles. A choice counts a variant that "
-        "saves a tenth of the time or more at the median of the works.",
+        "the output of an embedding, against float64. From and to are quartiles. The sentences that say what to choose "
+        "speak of the median over the works.",
         ("machine", "preset", "work", "variant", Measure("ms", ".0f", False), Measure("time / float32", ".2f"),
          Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False)),
         rows, [*_choices(folder, points), *findings], (VARIANTS,),
@@ -79,8 +79,8 @@ def _choices(folder: Path, points: dict[str, tuple[float, float]]) -> list[str]:
         if (name := f"{kind}, bfloat16") not in points:
             continue
         time, error = points[name]
-        pays = (f"train and embed in bfloat16. A work takes {time:.2f} of the time, at an error up to {error:.0e}"
-                if time <= 0.9 else f"stay with float32. In bfloat16 a work takes {time:.2f} of the time")  # fmt: skip
+        pays = (f"train and embed in bfloat16. It takes {time:.2f} of float32's time, at an error up to {error:.0e}"
+                if time <= 0.9 else f"stay with float32. bfloat16 takes {time:.2f} of its time")  # fmt: skip
         sentences.append(f"on a CPU with {kind}, {pays}.{f' {embeds}.' if kind == 'AVX2' else ''}")
     return [*sentences, "on a GPU, run `make bench-gpu` first: these rows are from CPUs alone."]
 

@@ -492,8 +492,8 @@ def by_contact(folder: Path) -> Page:
         "by_contact",
         "Does stage 1 learn faster where something touches?",
         f"A small encoder learns {one['touches'][0]:,} stills of 56 pixels for {one['steps']:,} steps. The "
-        f"untouched gel is subtracted. It is judged on {one['touches'][1]:,} touches of other objects, with masks by chance. "
-        "The error is that of all hidden patches, and of hidden patches with contact. Recall@1 is the share of "
+        f"untouched gel is subtracted. It is judged on {one['touches'][1]:,} touches of other objects, with masks by "
+        "chance. The error is that of all hidden patches, and of hidden patches with contact. Recall@1 is the share of "
         "touches whose lighter frame finds its deepest frame among all by the same sensor. A gain is the number of "
         "steps after which the paper's way is at its best, divided by the steps until this way is as good. It is 0 "
         "for a seed that never is. From and to are over three seeds.",

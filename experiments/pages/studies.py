@@ -478,7 +478,13 @@ def by_contact(folder: Path) -> Page:
                    curves.items()]
             for what, column, sign in (("error", 1, 1), ("error of contact", 2, 1), ("recall@1", 3, -1))
         }  # fmt: skip
-        rows.append((way, *ends[:2], ends[2].times(100), *(float(np.mean(gain)) for gain in gains.values())))
+        rows.append(
+            (
+                way,
+                *(end.times(factor) for end, factor in zip(ends, (1000, 1000, 100), strict=True)),
+                *(float(np.mean(gain)) for gain in gains.values()),
+            )
+        )
         if way != FIRST:
             findings += [
                 f"{way}: the same {what} is reached {np.mean(gain):.2f} times as fast." if min(gain) > 0 else
@@ -497,7 +503,8 @@ def by_contact(folder: Path) -> Page:
         "touches whose lighter frame finds its deepest frame among all by the same sensor. A gain is the number of "
         "steps after which the paper's way is at its best, divided by the steps until this way is as good. It is 0 "
         "for a seed that never is. From and to are over three seeds.",
-        ("way", Measure("error", ".4f"), Measure("error of contact", ".4f"), Measure("recall@1, %", ".1f"),
+        ("way", Measure("1000 x error", ".1f"), Measure("1000 x error of contact", ".1f"),
+         Measure("recall@1, %", ".1f"),
          *(Measure(f"gain, {what}", ".2f", False) for what in ("error", "error of contact", "recall@1"))),
         rows, findings, (CONTACTS,), "python -m experiments.encoders.by_contact MANIFEST",
     )  # fmt: skip

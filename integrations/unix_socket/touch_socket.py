@@ -40,13 +40,11 @@ if __name__ == "__main__":
     from anytouch_jax.encoder.novelty import ContactGate
     from anytouch_jax.encoder.stream import open_source, stream
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for name, what in (("camera", "a camera's number, film or folder"), ("sensor", "its kind"), ("address", "socket")):
-        parser.add_argument(name, help=what)
-    parser.add_argument("background", nargs="?", help="picture of the untouched gel")
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, count in {"camera": None, "sensor": None, "address": None, "background": "?"}.items():
+        parser.add_argument(name, nargs=count)
     given = parser.parse_args()
     encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(given.camera)
-    background = decode(given.background) if given.background else None
+    background, row = given.background and decode(given.background), encoder.sensor_row(given.sensor)
     preprocess, gate = at.Preprocess(encoder, background), ContactGate(background, given.sensor)
-    frames = stream(encoder, source, preprocess, live=live, sensor=encoder.sensor_row(given.sensor), contact=gate)
-    serve(frames, given.address)
+    serve(stream(encoder, source, preprocess, live=live, sensor=row, contact=gate), given.address)

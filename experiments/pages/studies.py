@@ -419,7 +419,7 @@ def motion(folder: Path) -> Page:
             f"`{name}`: a linear probe on the change of the mean token names {100 * record['pooled']:.0f} % of turns.",
         ]
     return Page(
-        "motion", "Can frozen features tell which way an object turns?",
+        "motion", "Do frozen features show which way an object turns?",
         "A small antisymmetric head reads the patch tokens of the first and the last touched frame of a clip. "
         "Clips are simulated. Test clips are of objects that the head never met. "
         "In the rows `without` a sensor, the head never met that "

@@ -63,7 +63,10 @@ class ContactOptions:
 
 @dataclass(frozen=True)
 class Stills:
-    """The deepest frame and a lighter one of each touch u8 (n, SIDE, SIDE, 3), less the gel, and sensors i32 (n,)."""
+    """Two frames of each touch u8 (n, SIDE, SIDE, 3), the gel subtracted, and sensors i32 (n,).
+
+    `pictures` are the deepest frames, `lighter` are others.
+    """
 
     pictures: np.ndarray
     lighter: np.ndarray

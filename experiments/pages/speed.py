@@ -63,7 +63,7 @@ def variants(folder: Path) -> Page:
         ("machine", "preset", "work", "variant", Measure("ms", ".0f", False), Measure("time / float32", ".2f"),
          Measure("error", ".0e", False), Measure("memory, MiB", ".0f", False)),
         rows, [*_choices(folder, points), *findings], (VARIANTS,),
-        'make bench WHAT="stage1 stage2 embed" PRESET=small',
+        'make bench WHAT="stage1 stage2 embed" PRESET=small`, on AVX2 `make bench WHAT="stage1 embed" PRESET=tiny',
         "Median time ratio of a variant over its works, against its largest error.",
         lambda path: pareto(path, points, x="time / float32", y="error"),
     )  # fmt: skip
@@ -331,8 +331,8 @@ def engines(folder: Path) -> Page:
         "engines",
         "Which engine embeds touch fastest?",
         f"One exported encoder runs on several engines, with {first['machine']['cores']} threads each "
-        f"({_machine(first['machine'])}). Engines take turns, one touch at a time, {rounds} times or more. It "
-        "is a still, and in clips three frames. `small` "
+        f"({_machine(first['machine'])}). Engines take turns, one touch at a time, {rounds} times or more. A "
+        "touch has one frame, and in clips three. `small` "
         "(384 wide, 224 pixels) is untrained. Batches have 16 touches. Start is from "
         "the imported package to the first features, in a fresh process. Memory is what that process grew by. Error is "
         "the largest difference as a share of the largest feature. int8 is calibrated on 200 other touches. On "

@@ -11,6 +11,7 @@ from scipy.stats import binomtest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import mean_interval
+from anytouch_jax.weights.registry import DEFAULT
 from experiments.benchmarks.untouched_gel import NAME as GELS
 from experiments.benchmarks.untouched_gel import WAYS
 from experiments.encoders.by_contact import NAME as CONTACTS
@@ -314,6 +315,9 @@ def real(folder: Path) -> Page:
                         compare(f"`{name}`", words, change, f"{task}, {head} head")
                         for words, change in zip(("pixels", "an untrained encoder"), changes, strict=True)
                     ]
+                if name.startswith(f"{DEFAULT}-") and head in HEADS:
+                    change = _minus(score, scores.get(DEFAULT))
+                    findings.append(compare(f"`{name}`", f"`{DEFAULT}`", change, f"{task}, {head} head"))
     for count in ("1", "2", "5"):
         shares = {name: one["label_curve"][count] for name, one in records.items() if "label_curve" in one}
         rows += [

@@ -208,7 +208,7 @@ def test_labels_agree_with_the_pressure(takes):
         np.testing.assert_array_equal(take.labels["force"] > 0, touching)
         assert not take.field[~touching].any()
         assert ((take.labels["slip"] >= 0) & (take.labels["slip"] <= 1)).all()
-        if recording.gesture.motion == "hold":
+        if scene.MOTIONS[recording.gesture.motion] == "hold":
             assert np.abs(take.field[..., 1:]).max() < 0.4 * recording.depth.max()  # only squeezed to the sides
 
 

@@ -89,6 +89,7 @@ class ModelConfig:
     decoder_norm_eps: NotNegative[float] = 1e-12  # Epsilon of the decoder's layer norms.
     decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
     patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.
+    fields: Number = 0  # Channels of the decoder of depth, shear, contact and force. 0: none.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
     lora_rank: Number = 0  # Rank of the image tower's LoRA. 0: off.
     lora_alpha: float = 16.0  # Scale of LoRA, divided by its rank.

@@ -13,6 +13,7 @@ from jax import Array
 
 from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.clip import ImageTower, Lora, TextEncoder
+from anytouch_jax.nn.fields import STATES, FieldDecoder, FieldOutput
 from anytouch_jax.nn.layers import Dense, Mlp, gelu, rows_of, table
 from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
 from anytouch_jax.ops import tokens
@@ -35,6 +36,8 @@ class AnyTouch(nnx.Module):
         self.touch = TouchEncoder(model)
         self.decoder = TouchDecoder(model)
         self.frames, self.embed = model.frames, model.embed
+        if model.fields:
+            self.fields = FieldDecoder(model)
         if model.image is not None:
             self.image = ImageTower(model, model.image)
             if model.lora_rank:
@@ -85,6 +88,10 @@ class AnyTouch(nnx.Module):
         if hasattr(self.decoder, "sensor_projection"):
             own = rows_of(self.touch.sensor_tokens[...], sensor if decoder_sensor is None else decoder_sensor)
         return self.decoder(latent, restore_ids, frames, own)
+
+    def measure(self, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
+        """Return the fields of the last frame of clips, see `FieldDecoder`."""
+        return self.fields(self.touch.states(clip, sensor, STATES), clip, aspect)
 
     def match(self, z_first: Array, z_second: Array) -> Array:
         """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5), from their element-wise product."""

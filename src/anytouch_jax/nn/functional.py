@@ -18,6 +18,7 @@ from jax.typing import DTypeLike
 from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.clip import merge_lora
+from anytouch_jax.nn.fields import FieldOutput
 from anytouch_jax.ops import tokens
 
 Params = dict[str, Any]
@@ -70,6 +71,13 @@ class Net:
     ) -> Array:  # fmt: skip
         """Return pixels (B, N, frames, P*P*3) of every position from the visible patches `keep_ids` (B, K)."""
         return self.bind(params).reconstruct(clip, sensor, keep_ids, restore_ids, frames, decoder_sensor)
+
+    def measure(self, params: Params, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
+        """Return depth, shear, contact and force of normalised clips (B, T, H, W, 3), see `nn.fields`.
+
+        `aspect` (B,) is the logarithm of the height over the width that the picture shows.
+        """
+        return self.bind(params).measure(clip, sensor, aspect)
 
     def encode_image(self, params: Params, image: Array) -> Array:
         """Return image embeddings (V, E) of normalised photographs (V, H, W, 3); not unit-norm."""

@@ -57,8 +57,9 @@ class ClipOutput(NamedTuple):
     image: Any  # u8 (T, h, w, 3), or None for a field sensor
     background: Any  # u8 (h, w, 3), or None for a field sensor
     field: Any  # f32 (T, 20, 20, 6) mm and N of a field sensor, or (T, h, w, channels) of requested fields, or None
-    # f32 (T,) each: force N, depth mm of the deepest point, area mm2, x and y mm of the pressure in the image,
-    # slip (share of the contact that slides). With fidelity exact also whether the solver converged.
+    # f32 (T,) each: normal force N, force_x and force_y N along the image, torque N mm about the centre of pressure,
+    # depth mm of the deepest point, area mm2, x and y mm of the pressure in the image, slip (share of the contact that
+    # slides). With fidelity exact also whether the solver converged.
     labels: dict[str, Any]
 
 
@@ -94,14 +95,32 @@ def gel_motion(clip: ClipInput) -> Array:
     return jnp.stack([*rotated(steps[:, 0], steps[:, 1], clip.unit.rotation), steps[:, 2]], 1)
 
 
+class View(NamedTuple):
+    """How a sensor is solved and shown: the grid (rows, columns), its `pitch` mm, and the image (height, width).
+
+    `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields` is the (height, width)
+    of the requested fields, that of the image if None.
+    """
+
+    grid: tuple[int, int]
+    pitch: Any
+    image: tuple[int, int]
+    photometry: optics.Photometry | None = None
+    stretched: bool = False
+    fields: tuple[int, int] | None = None
+
+
 def simulate_clip(
-    clip: ClipInput, *, sensor: Sensor, fidelity: Fidelity, size: int, fields: tuple[str, ...] = ()
-) -> ClipOutput:
+    clip: ClipInput, *, sensor: Sensor, fidelity: Fidelity, size: int = 0, fields: tuple[str, ...] = (),
+    view: View | None = None,
+) -> ClipOutput:  # fmt: skip
     """Simulate one clip by `sensor`: contact of every frame, shear with its history, images and labels.
 
-    `size` is the short side of the image in pixels, 0 for the sensor's resolution.
+    `size` is the short side of the image in pixels, 0 for the sensor's resolution. `view` replaces the grid and the
+    image that follow from `size`. With it, the numbers of `sensor` may be traced, so that one program serves many.
     """
-    (rows, columns), pitch = solve_grid(sensor, size, fidelity)
+    view = View(*solve_grid(sensor, size, fidelity), optics.picture_size(sensor, size)) if view is None else view
+    (rows, columns), pitch = view.grid, view.pitch
     y, x = jnp.meshgrid(*((jnp.arange(n) - (n - 1) / 2) * pitch for n in (rows, columns)), indexing="ij")
     gel = unit_gel(sensor, clip.unit)
     press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
@@ -121,15 +140,16 @@ def simulate_clip(
             contact.displacement, sheared.displacement, contact.pressure, sheared.traction, keys[1:]
         )
         return ClipOutput(None, None, measured, labels)
-    shape = optics.picture_size(sensor, size)
-    draw = partial(optics.render, pitch=pitch, sensor=sensor, unit=clip.unit, resolution=shape)
-    behind = optics.backdrop(sensor, clip.unit, shape)
-    image = jax.vmap(lambda u, t, key, drift: draw(u, t, key=key, behind=behind, drift=drift))(
+    shown: dict[str, Any] = {"sensor": sensor, "unit": clip.unit, "stretched": view.stretched}
+    behind = optics.backdrop(resolution=view.image, **shown)
+    look = {"resolution": view.image, "photometry": view.photometry, "behind": behind} | shown
+    draw = partial(optics.render, pitch=pitch, **look)
+    image = jax.vmap(lambda u, t, key, drift: draw(u, t, key=key, drift=drift))(
         contact.displacement, sheared.displacement, keys[1:], clip.drift
     )
-    background = optics.background(sensor, clip.unit, keys[0], resolution=shape)
-    mapped = _fields(fields, contact, sheared, partial(optics.onto_picture, pitch=pitch, sensor=sensor, unit=clip.unit,
-                                                     resolution=shape))  # fmt: skip
+    background = optics.background(key=keys[0], **look)
+    mapped = _fields(fields, contact, sheared,
+                     partial(optics.onto_picture, pitch=pitch, resolution=view.fields or view.image, **shown))  # fmt: skip
     return ClipOutput(image, background, mapped, labels)
 
 
@@ -160,6 +180,9 @@ def _labels(clip: ClipInput, contact: PressResult, sheared: shear.Shear, pitch: 
         "x": shown[:, 0],
         "y": shown[:, 1],
         "slip": sheared.slip_fraction,
+        "force_x": sheared.force[:, 0] * clip.unit.mirror[0],
+        "force_y": sheared.force[:, 1] * clip.unit.mirror[1],
+        "torque": sheared.twist_torque * clip.unit.mirror[0] * clip.unit.mirror[1],
         "converged": (contact.converged & sheared.converged).astype(jnp.float32),
     }
 

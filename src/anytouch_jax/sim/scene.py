@@ -10,18 +10,20 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from anytouch_jax.config.parsing import Below1, Count, NotNegative, Share, check
 from anytouch_jax.errors import UserError
+from anytouch_jax.sim.draws import Rng, either, namespace_of
 from anytouch_jax.sim.sensing.sensors import SENSORS, THINNEST, Unit, draw_drift, draw_unit
 from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
 
 Array = np.ndarray
 Grade = Literal["fine", "coarse"]
-Motion = Literal["hold", "slide", "twist"]
+MOTIONS = ("hold", "slide", "slide", "twist", "twist")  # a gesture has the number of one, each as likely
 
 FIELDS = ("displacement", "pressure", "shear")
 _MAX_SIZE = 4096  # pixels of a side
@@ -94,21 +96,21 @@ class Touch(NamedTuple):
 
 
 class Gesture(NamedTuple):
-    """A motion of the sensor: deepest `depth` mm, total `slide` (2,) mm and `twist` rad.
+    """A motion of the sensor: deepest `depth` mm, total `slide` (2,) mm and `twist` rad. `motion` numbers MOTIONS.
 
     `phases` (7,) are the shares of lift, press, pause, move, pause, release and lift. A clip shows `shown` of the
     gesture around `middle`. At `lift` the sensor is off for a moment and comes back moved by `regrasp` (3,).
     """
 
-    depth: float
-    motion: Motion
-    slide: Array
-    twist: float
-    phases: Array
-    shown: float
-    middle: float
-    lift: float
-    regrasp: Array
+    depth: Any
+    motion: Any
+    slide: Any
+    twist: Any
+    phases: Any
+    shown: Any
+    middle: Any
+    lift: Any
+    regrasp: Any
 
 
 class Recording(NamedTuple):
@@ -156,28 +158,40 @@ def draw_touch(scenes: Scenes, number: int, splits: Sequence[str]) -> Touch:
     rng = np.random.default_rng([scenes.seed, _TOUCH, number])
     turn, place = divmod(number, len(splits))
     thing = int(np.random.default_rng([scenes.seed, _OBJECTS, turn]).permutation(len(splits))[place])
-    angle, away = rng.uniform(0, 2 * math.pi), 3.0 * math.sqrt(rng.uniform())
-    where = np.array([math.cos(angle), math.sin(angle)]) * away
-    yaw = float(rng.uniform(-math.pi, math.pi))
-    return Touch(number, thing, splits[thing], where, yaw, _draw_gesture(scenes, rng))
+    place, yaw = draw_place(rng)
+    return Touch(number, thing, splits[thing], place, yaw, draw_gesture(scenes.depth, rng))
 
 
-def _draw_gesture(scenes: Scenes, rng: np.random.Generator, like: Gesture | None = None) -> Gesture:
+def draw_place(rng: Rng) -> tuple[Any, Any]:
+    """Return a place (2,) mm within 3 mm of an object's middle, and the yaw of the sensor there."""
+    xp = namespace_of(rng)
+    angle, away = rng.uniform(0, 2 * math.pi), 3.0 * xp.sqrt(rng.uniform())
+    return xp.stack([xp.cos(angle), xp.sin(angle)]) * away, rng.uniform(-math.pi, math.pi)
+
+
+def draw_gesture(depths: tuple[float, float], rng: Rng, like: Gesture | None = None) -> Gesture:
     """Return a gesture. With `like`, its depth is similar and its speed and motion are drawn."""
-    low, high = scenes.depth
-    depth = float(rng.uniform(low, high) if like is None else np.clip(like.depth * rng.uniform(0.7, 1.3), low, high))
-    motion: Motion = ("hold", "slide", "slide", "twist", "twist")[int(rng.integers(5))]
+    xp, (low, high) = namespace_of(rng), depths
+    depth = rng.uniform(low, high) if like is None else xp.clip(like.depth * rng.uniform(0.7, 1.3), low, high)
+    motion = rng.integers(len(MOTIONS))
     angle, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.4, 2.5)
     turn = rng.choice([-1, 1]) * rng.uniform(math.radians(4), math.radians(20))
-    slide = np.array([math.cos(angle), math.sin(angle)]) * length * (motion == "slide")
+    slides, twists = ((motion >= first) & (motion <= first + 1) for first in (1, 3))
+    slide = xp.stack([xp.cos(angle), xp.sin(angle)]) * length * slides
     phases = rng.uniform([0, 0.1, 0, 0.25, 0, 0.08, 0], [0.15, 0.35, 0.15, 0.5, 0.2, 0.2, 0.1])
     phases = phases / phases.sum()
     first, last = phases[:2].sum() * 0.8, 1 - phases[5:].sum()
-    shown, middle = math.exp(rng.uniform(math.log(0.35), math.log(1.2))), float(rng.uniform(first, last))
-    lift = float(rng.uniform(first, last)) if rng.uniform() < 0.12 else -1.0
+    shown, middle = xp.exp(rng.uniform(math.log(0.35), math.log(1.2))), rng.uniform(first, last)
+    lift = either(rng, rng.uniform() < 0.12, lambda: rng.uniform(first, last), -1.0)
     regrasp = rng.normal(0, 1, 3) * np.array([0.8, 0.8, math.radians(8)])
-    twist = float(turn) * (motion == "twist")
-    return Gesture(depth, motion, slide, twist, phases, shown, middle, lift, regrasp)
+    return Gesture(depth, motion, slide, turn * twists, phases, shown, middle, lift, regrasp)
+
+
+def draw_by_hand(depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: Any) -> tuple[Gesture, Any, Any, Any]:
+    """Return another sensor's gesture, yaw, offset (2,) mm and tilt (2,) at a touch of grade coarse."""
+    gesture = draw_gesture(depths, rng, gesture)
+    yaw = yaw + math.radians(12) * rng.standard_normal()
+    return gesture, yaw, 0.8 * rng.standard_normal(2), math.tan(math.radians(2.5)) * rng.standard_normal(2)
 
 
 def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
@@ -190,10 +204,7 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
         unit = unit._replace(mirror=np.ones(2, np.float32), window=np.zeros(2, np.float32), zoom=np.float32(1))
     gesture, yaw, offset, tilt = touch.gesture, touch.yaw, np.zeros(2), np.zeros(2)
     if scenes.grade == "coarse":
-        gesture = _draw_gesture(scenes, rng, gesture)
-        yaw += math.radians(12) * rng.standard_normal()
-        offset = 0.8 * rng.standard_normal(2)
-        tilt = math.tan(math.radians(2.5)) * rng.standard_normal(2)
+        gesture, yaw, offset, tilt = draw_by_hand(scenes.depth, rng, gesture, yaw)
     motion, depth = trajectory(scenes.frames, gesture)
     start = np.array([*offset, yaw])
     has_photo, has_text = (bool(rng.random() < share) for share in (scenes.vision, scenes.text))
@@ -208,24 +219,28 @@ def shared_unit(scenes: Scenes, sensor: str) -> Unit:
     return unit._replace(mirror=none + 1, rotation=none[0], offset=none)
 
 
-def trajectory(frames: int, gesture: Gesture) -> tuple[Array, Array]:
+def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
     """Return motion (T, 3) since the touch, and depth (T,), negative without contact. A still is the deepest press."""
     if frames == 1:
         return np.zeros((1, 3)), np.array([gesture.depth])
-    t = gesture.middle + gesture.shown * np.linspace(-0.5, 0.5, frames)
-    ends = np.cumsum(gesture.phases)
+    times = gesture.middle + gesture.shown * np.linspace(-0.5, 0.5, frames)
+    return moved(gesture, times, max(0.04, gesture.shown / (frames - 1) / 2), np)
 
-    def smooth(phase: int) -> Array:
-        x = np.clip((t - ends[phase - 1]) / gesture.phases[phase], 0, 1)
+
+def moved(gesture: Gesture, times: Any, gap: Any, xp: ModuleType) -> tuple[Any, Any]:
+    """Return motion (T, 3) and depth (T,) as `trajectory` at `times` (T,). A lift lasts `gap` to both sides."""
+    ends = xp.cumsum(gesture.phases)
+
+    def smooth(phase: int) -> Any:
+        x = xp.clip((times - ends[phase - 1]) / gesture.phases[phase], 0, 1)
         return x**2 * (3 - 2 * x)
 
     depth = gesture.depth * (0.05 + 0.95 * smooth(1)) * (1 - 0.95 * smooth(5))
-    off = (t < ends[0]) | (t > ends[5])
-    motion = smooth(3)[:, None] * np.array([*gesture.slide, gesture.twist])
-    if gesture.lift >= 0:
-        off |= np.abs(t - gesture.lift) <= max(0.04, gesture.shown / (frames - 1) / 2)
-        motion = motion + (t > gesture.lift)[:, None] * gesture.regrasp
-    return motion, np.where(off, -1.0, depth)
+    motion = smooth(3)[:, None] * xp.stack([*gesture.slide, gesture.twist])
+    lifted = gesture.lift >= 0
+    off = (times < ends[0]) | (times > ends[5]) | (lifted & (xp.abs(times - gesture.lift) <= gap))
+    motion = motion + (lifted & (times > gesture.lift))[:, None] * gesture.regrasp
+    return motion, xp.where(off, -1.0, depth)
 
 
 MOVES = (0.1, math.radians(1))  # mm and rad that the gel must be moved to be labelled so
@@ -242,9 +257,9 @@ def directions(recording: Recording) -> dict[str, str]:
     *slid, turn = steps[touching[1:] & touching[:-1]].sum(0)
     turn *= float(unit.mirror[0] * unit.mirror[1])
     motion, twist, slide = "hold", "none", "none"
-    if recording.gesture.motion == "twist" and abs(turn) > MOVES[1]:
+    if MOTIONS[recording.gesture.motion] == "twist" and abs(turn) > MOVES[1]:
         motion, twist = "twist", "clockwise" if turn > 0 else "counterclockwise"
-    elif recording.gesture.motion == "slide" and math.hypot(*slid) > MOVES[0]:
+    elif MOTIONS[recording.gesture.motion] == "slide" and math.hypot(*slid) > MOVES[0]:
         motion = "slide"
         c, s = math.cos(float(unit.rotation)), math.sin(float(unit.rotation))
         x, y = np.array([[c, -s], [s, c]]) @ np.asarray(slid) * np.asarray(unit.mirror)

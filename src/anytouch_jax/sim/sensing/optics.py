@@ -47,23 +47,32 @@ def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
     return round(sensor.field[0] * scale), round(sensor.field[1] * scale)
 
 
-def picture_view(sensor: Sensor, unit: Unit, resolution: tuple[int, int]) -> PictureView:
-    """Return the part of the field in an image of (height, width): the largest of its shape, zoomed and mirrored."""
+def picture_view(
+    sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False
+) -> PictureView:
+    """Return the part of the field in an image of (height, width): the largest of its shape, zoomed and mirrored.
+
+    If `stretched`, the whole field fills the image, whose pixels need not be square: what `encoder.preprocess` makes.
+    """
     height, width = resolution
-    scale = min(sensor.field[0] / height, sensor.field[1] / width)
-    x = unit.window[0] + unit.mirror[0] * unit.zoom * scale * (jnp.arange(width) + 0.5 - width / 2)
-    y = unit.window[1] + unit.mirror[1] * unit.zoom * scale * (jnp.arange(height) + 0.5 - height / 2)
+    tall, wide = sensor.field[0] / height, sensor.field[1] / width
+    if not stretched:
+        tall = wide = min(tall, wide)
+    x = unit.window[0] + unit.mirror[0] * unit.zoom * wide * (jnp.arange(width) + 0.5 - width / 2)
+    y = unit.window[1] + unit.mirror[1] * unit.zoom * tall * (jnp.arange(height) + 0.5 - height / 2)
     du, dv, su, sv = unit.lights
     return PictureView(x, y, du + su * 2 * x / sensor.field[1], dv + sv * 2 * y / sensor.field[0])
 
 
-def backdrop(sensor: Sensor, unit: Unit, resolution: tuple[int, int] | None = None) -> Array:
+def backdrop(
+    sensor: Sensor, unit: Unit, resolution: tuple[int, int] | None = None, *, stretched: bool = False
+) -> Array:
     """Return the untouched image of a unit without markers and noise, f32 (3, H, W) in 0..1.
 
     Pass it to `render` as `behind` if many frames of one unit are rendered outside of one `vmap`.
     """
     resolution = resolution or picture_size(sensor)
-    place, shape = picture_view(sensor, unit, resolution), unit.base.shape
+    place, shape = picture_view(sensor, unit, resolution, stretched=stretched), unit.base.shape
     rows = interpolation.spline((place.v + 1) / 2 * shape[0] - 0.5, shape[0])[0]
     columns = interpolation.spline((place.u + 1) / 2 * shape[1] - 0.5, shape[1])[0]
     image = jnp.einsum("ih,hwc,jw->cij", rows, unit.base, columns)
@@ -96,6 +105,7 @@ def render(
     photometry: Photometry | None = None,
     behind: Array | None = None,
     drift: Array | None = None,
+    stretched: bool = False,
 ) -> Array:
     """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
 
@@ -103,16 +113,16 @@ def render(
     mm (x, y) moves the markers. `key` draws the noise, and None omits it. `resolution` is (height, width), by default
     square pixels with a short side of 224. `photometry` replaces that of the sensor. `sensor` and `resolution` are
     static under jit. `behind` is the `backdrop` of the same unit and resolution. `drift` (3, 3) changes the light
-    (`sensors.draw_drift`). Raises UserError for a sensor without a camera.
+    (`sensors.draw_drift`). `stretched` is as in `picture_view`. Raises UserError for a sensor without a camera.
     """
     resolution = resolution or picture_size(sensor)
-    place = picture_view(sensor, unit, resolution)
+    place = picture_view(sensor, unit, resolution, stretched=stretched)
     photometry = look(sensor) if photometry is None else photometry
     matrices = _resample(displacement.shape, pitch, place)
     skin = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
     nx, ny = tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
     glow: tuple[Array, ...] | None = None
-    if np.any(np.asarray(photometry.halo)):
+    if is_traced(photometry.halo) or np.any(np.asarray(photometry.halo)):
         soft = _blurred(displacement, sensor.halo / pitch)
         depth = matrices[0] @ soft @ matrices[2].T
         lit = (*rotated(*_slopes(soft, matrices, pitch), unit.light_angle), depth)
@@ -136,7 +146,7 @@ def render(
         return jnp.round(jnp.clip(255 * image + noise, 0, 255)).astype(jnp.uint8)
 
     if behind is None:
-        behind = backdrop(sensor, unit, resolution)
+        behind = backdrop(sensor, unit, resolution, stretched=stretched)
     # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU backend cannot fuse the
     # arithmetic into the transpose, whose inner loop over three channels is not vectorised (six times slower).
     planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift))
@@ -200,21 +210,20 @@ def _channels(
     }
 
 
-def background(
-    sensor: Sensor, unit: Unit, key: Array | None = None, *, resolution: tuple[int, int] | None = None
-) -> Array:
-    """Render the background image of a unit, u8 (H, W, 3) RGB, with its markers and noise as in `render`."""
-    return render(jnp.zeros((8, 8)), None, 1.0, sensor, unit, key, resolution=resolution)
+def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: Any) -> Array:
+    """Render the background image of a unit, u8 (H, W, 3) RGB, with its markers and noise. `options` of `render`."""
+    return render(jnp.zeros((8, 8)), None, 1.0, sensor, unit, key, **options)
 
 
 def onto_picture(
-    maps: Array, *, pitch: Any, sensor: Sensor, unit: Unit, resolution: tuple[int, int], vectors: bool = False
-) -> Array:
+    maps: Array, *, pitch: Any, sensor: Sensor, unit: Unit, resolution: tuple[int, int], vectors: bool = False,
+    stretched: bool = False,
+) -> Array:  # fmt: skip
     """Resample maps (..., h, w, C) of the solve grid at the pixels of a unit's image of (height, width).
 
     With `vectors`, the two channels are x and y of a vector, which is mirrored with the image.
     """
-    ay, _, ax, _ = _resample(maps.shape[-3:-1], pitch, picture_view(sensor, unit, resolution))
+    ay, _, ax, _ = _resample(maps.shape[-3:-1], pitch, picture_view(sensor, unit, resolution, stretched=stretched))
     mapped = jnp.einsum("ih,...hwc,jw->...ijc", ay, maps, ax)
     return mapped * unit.mirror.reshape((1,) * (mapped.ndim - 1) + (2,)) if vectors else mapped
 
@@ -246,18 +255,19 @@ def _ink(
         x = x - ay @ tangential[..., 0] @ ax.T
         y = y - ay @ tangential[..., 1] @ ax.T
     soft = 1.5 * jnp.abs(place.x[1] - place.x[0]) + 2 * unit.focus
-    half = float(np.hypot(*sensor.field)) / 2
+    half = jnp.hypot(*sensor.field) / 2
     x, y = x / unit.marker_pitch, y / unit.marker_pitch
     return ink_coverage(ink, x, y, unit.marker_phase, unit.marker_size, soft, half)
 
 
-def ink_coverage(markers: Markers, x: Array, y: Array, phase: Array, size: Array, soft: Array, half: float) -> Array:
+def ink_coverage(markers: Markers, x: Array, y: Array, phase: Array, size: Array, soft: Array, half: Any) -> Array:
     """Return the share of ink (H, W), 0..1, at places with *undeformed* coordinates `x`, `y` (H, W) mm.
 
     Spots lie on a lattice and differ a little in size, as printed spots do. `phase` (2,) is in lattice steps, `size` a
     factor on the radius, `soft` mm the width of a spot's rim, `half` mm half the field's diagonal (for the lens).
     """
-    grow = 1.0 - markers.bend * (1.0 - (x**2 + y**2) / half**2) if markers.bend else 1.0
+    bends = is_traced(markers.bend) or markers.bend
+    grow = 1.0 - markers.bend * (1.0 - (x**2 + y**2) / half**2) if bends else 1.0
     column, row = x * grow / markers.pitch - phase[0], y * grow / markers.pitch - phase[1]
     i, j = jnp.floor(column + 0.5), jnp.floor(row + 0.5)
     dx, dy = (column - i) * (markers.pitch / markers.aspect), (row - j) * markers.pitch
@@ -265,6 +275,11 @@ def ink_coverage(markers: Markers, x: Array, y: Array, phase: Array, size: Array
     radius = markers.radius * size * (0.88 + 0.24 * (scatter - jnp.floor(scatter)))
     distance = jnp.sqrt(dx**2 + dy**2 + 1e-12)
     return jnp.clip((radius - distance) / soft + 0.5, 0.0, 1.0)
+
+
+def is_traced(value: Any) -> bool:
+    """Return whether a value is known only while a compiled program runs."""
+    return isinstance(value, jax.core.Tracer)
 
 
 def _noise(bits: Array) -> Array:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.mechanics import Gel
+from anytouch_jax.sim.draws import Rng, namespace_of
 
 Array = npt.NDArray[Any]
 RGB = tuple[float, float, float]
@@ -154,8 +155,9 @@ class Unit(NamedTuple):
     quality: Leaf  # of the JPEG files, 0 to 100
 
 
-def _unit(**values: object) -> Unit:
-    return Unit(**{name: np.asarray(value, np.float32) for name, value in values.items()})
+def _unit(**values: Any) -> Unit:
+    xp = jnp if any(isinstance(value, jax.Array) for value in values.values()) else np
+    return Unit(**{name: xp.asarray(value, xp.float32) for name, value in values.items()})
 
 
 def identity_unit(sensor: Sensor) -> Unit:
@@ -173,65 +175,70 @@ SPECKS = 6
 MOST_BASES = 16  # untouched gels of a sensor; so many weights are drawn for each
 
 
-def draw_unit(sensor: Sensor, rng: np.random.Generator) -> Unit:
-    """Return a unit of `sensor` drawn from `rng`.
+def draw_unit(sensor: Sensor, rng: Rng, real: Any = None) -> Unit:
+    """Return a unit of `sensor` drawn from `rng`. `real` (n, h, w, 3) replaces the untouched gels of `bases`.
 
     "Measured" is on real pictures scaled to 128 pixels: GelSight Mini with dots (8 gels, 39 recordings) and without (3
     units), DIGIT (3 units), 9DTact (3 units). The number of draws does not depend on the sensor, so several sensors can
     share a stream.
     """
+    xp = namespace_of(rng)
     share = sensor.markers.share if sensor.markers else 0.0
     # Measured: the dots of the 8 gels are 0.131 or 0.183 short sides apart, which is 1.85 mm at a zoom of 1 or 0.72.
     zoom = rng.uniform(0.68, 1.0)
-    room = (1 - zoom) / 2 * np.asarray(sensor.field[::-1])
+    room = (1 - zoom) / 2 * xp.asarray(sensor.field[::-1])
     dirt = rng.uniform(size=SPECKS) < rng.uniform(0, 0.6)  # measured: 0 to 4 specks or scratches a gel
     return _unit(
-        base=_draw_base(sensor, rng),
-        tint=np.exp(rng.normal(0, 0.09) + rng.normal(0, 0.05, 3)),  # measured: means differ by 9 %, colours by 5 %
-        gain=sensor.contrast * np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.15, 3)),
+        base=_draw_base(bases(sensor) if real is None else real, rng),
+        tint=xp.exp(rng.normal(0, 0.09) + rng.normal(0, 0.05, 3)),  # measured: means differ by 9 %, colours by 5 %
+        gain=sensor.contrast * xp.exp(rng.normal(0, 0.25) + rng.normal(0, 0.15, 3)),
         light_angle=rng.normal(0, np.deg2rad(10)),
-        lights=np.concatenate([rng.normal(0, 0.1, 2), rng.uniform(0.8, 1.05, 2)]),
+        lights=xp.concatenate([rng.normal(0, 0.1, 2), rng.uniform(0.8, 1.05, 2)]),
         uneven=rng.normal(0, 0.08, (5, 3)),  # on top of the measured ones in `base`
         focus=rng.uniform(0.02, 0.15),
-        specks=np.concatenate([
-            rng.uniform(-1, 1, (SPECKS, 2)), np.exp(rng.uniform(math.log(0.06), math.log(0.9), (SPECKS, 1))),
+        specks=xp.concatenate([
+            rng.uniform(-1, 1, (SPECKS, 2)), xp.exp(rng.uniform(math.log(0.06), math.log(0.9), (SPECKS, 1))),
             dirt[:, None] * (rng.normal(0.06, 0.12, (SPECKS, 1)) + rng.normal(0, 0.03, (SPECKS, 3)))], 1),
         # Measured: 0.5 to 2.5 levels of fine structure in an untouched picture.
-        grain=[np.exp(rng.uniform(math.log(0.3), math.log(2))), rng.integers(2**24)],
-        thickness=np.exp(rng.normal(0, 0.08)),
-        modulus=np.exp(rng.normal(0, 0.15)),
+        grain=[xp.exp(rng.uniform(math.log(0.3), math.log(2))), rng.integers(2**24)],
+        thickness=xp.exp(rng.normal(0, 0.08)),
+        modulus=xp.exp(rng.normal(0, 0.15)),
         marked=rng.uniform() < share,
         marker_pitch=rng.uniform(0.92, 1.08),
         marker_phase=rng.uniform(0, 1, 2),
         marker_size=rng.uniform(0.8, 1.25),  # measured: radii of 0.30 to 0.44 mm
         zoom=zoom,
         window=rng.uniform(-1, 1, 2) * room,
-        mirror=np.where(rng.uniform(size=2) < np.array([0.5, 0.0]), -1, 1),
+        mirror=xp.where(rng.uniform(size=2) < np.array([0.5, 0.0]), -1, 1),
         rotation=rng.normal(0, np.deg2rad(8)),
         offset=rng.normal(0, 0.4, 2),
-        noise=sensor.noise * np.exp(rng.normal(0, 0.5)),  # measured: 10 to 90 % of the recordings have 0.2 to 1.7
+        noise=sensor.noise * xp.exp(rng.normal(0, 0.5)),  # measured: 10 to 90 % of the recordings have 0.2 to 1.7
         quality=rng.integers(70, 97),
     )  # fmt: skip
 
 
-def _draw_base(sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
-    """Return an untouched gel: mostly one of the real ones, mixed with others, with faint blotches."""
-    real = bases(sensor)
-    weights = rng.gamma(0.3, size=MOST_BASES)[: len(real)] + 1e-9
+def _draw_base(real: Any, rng: Rng) -> Any:
+    """Return an untouched gel: mostly one of the `real` ones (n, h, w, 3), mixed with others, with faint blotches.
+
+    A picture that is black everywhere only fills an array and does not take part.
+    """
+    xp = namespace_of(rng)
+    weights = (rng.gamma(0.3, size=MOST_BASES)[: len(real)] + 1e-9) * (real.max((1, 2, 3)) > 0)
     blotches = rng.normal(0, rng.uniform(0, 0.03), (40, 40))[: real.shape[1], : real.shape[2], None]
-    return np.clip(np.tensordot(weights / weights.sum(), real, 1) * (1 + blotches), 0, 1)
+    return xp.clip(xp.tensordot(weights / xp.maximum(weights.sum(), 1e-9), real, 1) * (1 + blotches), 0, 1)
 
 
-def draw_drift(frames: int, rng: np.random.Generator) -> np.ndarray:
+def draw_drift(frames: int, rng: Rng) -> Any:
     """Return the relative change of light (frames, 3, 3) since the background image: at 1, u and v, for each colour.
 
     Measured on 42 recordings: deviations from the background of 1 to 2 % in each colour and 1 % across the image, and
     of 0.2 % from frame to frame. A tenth of the recordings drift four times as much, as when the exposure settles.
     """
-    often = 4.0 if rng.uniform() < 0.1 else 1.0
+    xp = namespace_of(rng)
+    often = xp.where(rng.uniform() < 0.1, 4.0, 1.0)
     since = rng.normal(0, 0.012, (3, 3)) + np.array([1.0, 0.0, 0.0])[:, None] * rng.normal(0, 0.012)
     steps = rng.normal(0, 0.002, (frames, 3, 3)) + rng.normal(0, 0.0015, (3, 3))
-    return (often * (since + np.cumsum(steps, 0))).astype(np.float32)
+    return (often * (since + xp.cumsum(steps, 0))).astype(xp.float32)
 
 
 def rotated(x: jax.Array, y: jax.Array, angle: Any) -> tuple[jax.Array, jax.Array]:

@@ -1,0 +1,111 @@
+"""Decoder of fields: depth, shear, contact and force from the states of the touch encoder and from its pixels.
+
+Every output is free of scale: lengths are shares of the picture's width, stresses shares of the gel's modulus. So a
+network that was trained on units of any zoom reads a sensor of any size.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jax import Array
+
+from anytouch_jax.config import ModelConfig
+from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, stored, table
+
+STATES = 3  # hidden states of the encoder that are read
+HALF = 2  # pixels of the picture for one of the fields, along each axis
+# Typical sizes of the outputs, so that the last layer works with numbers of order one.
+LENGTH, STRESS, FORCE, TORQUE = 0.02, 0.02, 0.01, 0.002
+
+
+class FieldOutput(NamedTuple):
+    """Fields (B, h, w) at half the picture's resolution. `*_log` are logarithms of Laplace deviations.
+
+    `depth`, `shear` (..., 2) along x and y of the picture, `pressure` over the gel's modulus. `contact` are logits.
+    `force` (B, 3): tangential x and y and normal, over modulus times width squared. `torque` (B,) over modulus times
+    width cubed. `slip` (B,) logits of the share of the contact that slides.
+    """
+
+    depth: Array
+    shear: Array
+    contact: Array
+    pressure: Array
+    depth_log: Array
+    shear_log: Array
+    force: Array
+    torque: Array
+    slip: Array
+    force_log: Array  # (B, 2): tangential, and of the logarithm of the normal force
+    torque_log: Array
+    slip_log: Array
+
+
+class Convolution(nnx.Module):
+    """A square convolution (B, H, W, C) with zeros around it, after a norm over the channels if `norm`."""
+
+    def __init__(self, inputs: int, outputs: int, side: int, model: ModelConfig, *, stride: int = 1, norm: bool = True):
+        self.norm = LayerNorm(inputs, model.norm_eps, model.dtype) if norm else None
+        self.kernel, self.bias = table(side * side * inputs, outputs), table(outputs)
+        self.shape, self.stride, self.dtype = (side, side, inputs, outputs), stride, jnp.dtype(model.dtype)
+
+    def __call__(self, x: Array) -> Array:
+        x = x if self.norm is None else gelu(self.norm(x))
+        dtype = stored(self.dtype)
+        kernel = self.kernel[...].reshape(self.shape).astype(dtype)
+        around = [((side - 1) // 2, (side - 1) // 2) for side in self.shape[:2]]
+        y = jax.lax.conv_general_dilated(
+            x.astype(dtype), kernel, (self.stride, self.stride), around, dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+        return y + self.bias[...].astype(dtype)
+
+
+class FieldDecoder(nnx.Module):
+    """Patch tokens of several blocks, and a shallow convolutional path from the pixels for sharp edges (after DPT)."""
+
+    def __init__(self, model: ModelConfig) -> None:
+        few, many, width = model.fields, 2 * model.fields, STATES * model.touch.width
+        self.read = Dense(width, many, model)
+        self.aspect = Dense(1, many, model)
+        self.stem = Convolution(6, few // 2, 5, model, stride=2, norm=False)
+        self.down = Convolution(few // 2, few, 3, model, stride=2)
+        self.middle1 = Convolution(many + few, many, 3, model)
+        self.middle2 = Convolution(many, many, 3, model)
+        self.fine1 = Convolution(many + few // 2, few, 3, model)
+        self.fine2 = Convolution(few, few, 3, model)
+        self.maps = Dense(few, 7, model)
+        self.whole = Mlp(width + many, 2 * many, model, gelu, outputs=8)
+        self.special, self.grid = 1 + model.sensor_tokens, model.image_size // model.patch
+
+    def __call__(self, states: Array, clip: Array, aspect: Array) -> FieldOutput:
+        """Decode `states` (B, 1 + S + N, STATES * D) of normalised `clip` (B, T, H, W, 3), fields of its last frame.
+
+        `aspect` (B,) is the logarithm of the height over the width that the picture shows.
+        """
+        batch, (height, width) = len(clip), clip.shape[2:4]
+        tokens = self.read(states[:, self.special :]) + self.aspect(aspect[:, None])[:, None]
+        pixels = jnp.concatenate([clip[:, -1], clip[:, -1] - clip[:, 0]], -1)
+        sharp = self.stem(pixels)
+        x = self.down(sharp)
+        coarse = tokens.reshape(batch, self.grid, self.grid, -1)
+        coarse = jax.image.resize(coarse, (*x.shape[:3], coarse.shape[-1]), "linear")
+        x = self.middle1(jnp.concatenate([coarse, x], -1))
+        x = x + self.middle2(x)
+        pooled = jnp.mean(x, (1, 2))
+        x = jax.image.resize(x, (batch, height // HALF, width // HALF, x.shape[-1]), "linear")
+        x = self.fine1(jnp.concatenate([x, sharp], -1))
+        x = x + self.fine2(x)
+        maps = self.maps(gelu(x)).astype(jnp.float32)
+        whole = self.whole(jnp.concatenate([states[:, 0], pooled.astype(states.dtype)], -1)).astype(jnp.float32)
+        contact = maps[..., 3]
+        pressure = STRESS * jax.nn.softplus(maps[..., 4]) * jax.nn.sigmoid(contact)
+        # The normal force is the integral of the pressure: there is none without contact.
+        normal = jnp.mean(pressure, (1, 2)) * jnp.exp(aspect)
+        force = jnp.concatenate([FORCE * whole[:, :2], normal[:, None]], -1)
+        return FieldOutput(
+            LENGTH * maps[..., 0], LENGTH * maps[..., 1:3], contact, pressure, maps[..., 5], maps[..., 6], force,
+            TORQUE * whole[:, 2], whole[:, 3], whole[:, 4:6], whole[:, 6], whole[:, 7],
+        )  # fmt: skip

@@ -1,0 +1,98 @@
+"""Random draws of the simulator: one description of a distribution serves numpy and JAX.
+
+A distribution is a function of an `Rng`. With a numpy generator it draws data sets on the host. With `Draws` it is a
+pure function of a JAX key, for touches that are made inside a compiled program.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import gamma as gamma_distribution
+
+
+class Draws:
+    """Draws from a JAX key, by those methods of `numpy.random.Generator` that the simulator uses.
+
+    All values are parts of one block of uniform and one of normal numbers: a program with a random call for each value
+    takes minutes to compile. A sequence of calls gives the same values for a key. Raises ValueError after `most` values
+    of a kind.
+    """
+
+    def __init__(self, key: jax.Array, most: int = 64) -> None:
+        uniform, normal = jax.random.split(key)
+        self._block = {"uniform": jax.random.uniform(uniform, (most,)), "normal": jax.random.normal(normal, (most,))}
+        self._used = dict.fromkeys(self._block, 0)
+
+    def _take(self, kind: str, shape: tuple[int, ...]) -> jax.Array:
+        first, count = self._used[kind], math.prod(shape)
+        self._used[kind] += count
+        if first + count > len(self._block[kind]):
+            raise ValueError(f"more than {len(self._block[kind])} {kind} values; ask for a larger block")
+        return self._block[kind][first : first + count].reshape(shape)
+
+    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> jax.Array:
+        """Return uniform values in low..high."""
+        low, high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
+        shape = np.broadcast_shapes(low.shape, high.shape) if size is None else _shape(size)
+        return low + (high - low) * self._take("uniform", shape)
+
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = ()) -> jax.Array:
+        """Return normal values of mean `loc` and standard deviation `scale`."""
+        return loc + scale * self._take("normal", _shape(size))
+
+    def standard_normal(self, size: Any = ()) -> jax.Array:
+        """Return normal values of mean 0 and standard deviation 1."""
+        return self.normal(size=size)
+
+    def gamma(self, shape: float, size: int) -> jax.Array:
+        """Return gamma values of this shape and scale 1, by the quantiles of the distribution."""
+        share, value = _gamma_quantiles(shape)
+        return jnp.exp(jnp.interp(self.uniform(size=size), share, value))
+
+    def random(self) -> jax.Array:
+        """Return a uniform value in 0..1."""
+        return self.uniform()
+
+    def integers(self, low: int, high: int | None = None) -> jax.Array:
+        """Return an integer from low to high - 1, or from 0 to low - 1. At most 2**23 values are distinct."""
+        low, high = (0, low) if high is None else (low, high)
+        return jnp.minimum(low + (self.uniform() * (high - low)).astype(jnp.int32), high - 1)
+
+    def choice(self, values: Any) -> jax.Array:
+        """Return one of the values."""
+        return jnp.asarray(values)[self.integers(len(values))]
+
+
+def _shape(size: Any) -> tuple[int, ...]:
+    return (size,) if isinstance(size, int) else tuple(size)
+
+
+@lru_cache(maxsize=4)
+def _gamma_quantiles(shape: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return shares in 0..1, dense at both ends, and the logarithms of the quantiles there."""
+    share = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 4096))
+    share = np.clip(share, 1e-7, 1 - 1e-7)
+    return share.astype(np.float32), np.log(gamma_distribution.ppf(share, shape)).astype(np.float32)
+
+
+Rng = np.random.Generator | Draws
+
+
+def namespace_of(rng: Rng) -> ModuleType:
+    """Return the array library of the draws, numpy or jax.numpy."""
+    return jnp if isinstance(rng, Draws) else np
+
+
+def either(rng: Rng, condition: Any, draw: Callable[[], Any], otherwise: Any) -> Any:
+    """Return `draw()` if the condition holds. numpy draws only then, and JAX always."""
+    if isinstance(rng, Draws):
+        return jnp.where(condition, draw(), otherwise)
+    return draw() if condition else otherwise

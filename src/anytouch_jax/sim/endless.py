@@ -1,0 +1,225 @@
+"""Endless touch: simulated touches as a pure function of a key, for training without a data set.
+
+A `World` holds what is drawn once: height maps, materials and the families of sensors. `sample` draws touches from it
+inside a compiled program, with the distributions of `scene` and `sensors`. All camera sensors share one program: they
+are solved on one square grid and shown at one size, as `encoder.preprocess` shows a real picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import permutations
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.contact.mechanics import Fidelity, Gel
+from anytouch_jax.sim.draws import Draws
+from anytouch_jax.sim.recorder import RELIEF, SPACING, ClipInput, View, simulate_clip, stack_trees
+from anytouch_jax.sim.scene import Scenes, draw_by_hand, draw_gesture, draw_place, moved, objects_and_splits
+from anytouch_jax.sim.sensing.optics import Photometry
+from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Sensor, bases, draw_drift, draw_unit, look
+from anytouch_jax.sim.world import shapes
+from anytouch_jax.sim.world.objects import Object, draw_object
+
+CAMERAS = tuple(name for name, sensor in SENSORS.items() if sensor.kind == "image")
+GRID = 84  # points of the solve grid's side, over the longer side of the field
+LEAST_DEPTH = 0.08  # mm of a touch that counts as contact
+CLIP_OF = 5  # a gesture is shown in so many steps between frames, of which a clip shows some
+_ORDERS = np.eye(3, dtype=np.float32)[list(permutations(range(3)))]  # (6, 3, 3) of colours
+_BASE = 40  # pixels of an untouched gel's side
+
+
+class Family(NamedTuple):
+    """The numbers of a family of sensors, as arrays: `sensors.Sensor`, its look and its untouched gels."""
+
+    field: Any  # (2,) mm
+    gel: Any  # (2,) modulus kPa, thickness mm
+    shade: Any  # (5,) skin mm, contrast, vignette, halo mm, noise
+    markers: Any  # (5,) pitch mm, radius mm, aspect, share, bend
+    ink: Any  # (3,)
+    photometry: Photometry
+    gels: Any  # (MOST_BASES, 40, 40, 3) untouched gels in 0..1, black where there are fewer
+
+
+class World(NamedTuple):
+    """Objects and sensors to draw from, as arrays on the device."""
+
+    relief: Any  # f16 (n, RELIEF, RELIEF) mm
+    material: Any  # f32 (n, 2) modulus kPa, friction
+    families: Family  # stacked over the sensors
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What to sample: clips of `frames` frames of `size` pixels, by `takes` sensors for each touch.
+
+    `coarse` is the share of touches at which every sensor touches as by hand, `free` the share of takes without
+    contact, and `wild` the share of takes by a sensor that mixes two families, with other lights and markers.
+    `fields` are those of `recorder.simulate_clip`, at `field_size` pixels, of the last frame.
+    """
+
+    frames: int = 1
+    takes: int = 1
+    size: int = 112
+    coarse: float = 0.3
+    free: float = 0.0
+    wild: float = 0.0
+    depth: tuple[float, float] = (0.15, 1.0)
+    fidelity: Fidelity = "fast"
+    fields: tuple[str, ...] = ()
+    field_size: int = 56
+
+
+class SimulatedTouches(NamedTuple):
+    """Touches of B places by M takes each, with T frames."""
+
+    clip: Any  # u8 (B, M, T, S, S, 3)
+    background: Any  # u8 (B, M, S, S, 3)
+    sensor: Any  # i32 (B, M), number of the family, or the number of families for a wild one
+    object: Any  # i32 (B,)
+    fields: Any  # f32 (B, M, h, w, channels) of the last frame, or None
+    width: Any  # f32 (B, M) mm that the picture's width shows
+    labels: dict[str, Any]  # f32 (B, M, T) each, see `recorder.ClipOutput`
+    inputs: ClipInput  # what `simulate_clip` got, with leading axes (B, M)
+
+
+def family(sensor: Sensor) -> Family:
+    """Return the numbers of a camera sensor. Raises UserError for a field sensor."""
+    photometry = look(sensor)
+    real = bases(sensor)[:MOST_BASES]
+    gels = np.zeros((MOST_BASES, _BASE, _BASE, 3), np.float32)
+    rows, columns = (np.rint(np.linspace(0, n - 1, _BASE)).astype(int) for n in real.shape[1:3])
+    gels[: len(real)] = np.maximum(real[:, rows][:, :, columns], 1e-3)
+    markers = sensor.markers or Markers(pitch=2.0, radius=0.3, share=0.0)
+    shade = (sensor.skin, sensor.contrast, sensor.vignette, sensor.halo, sensor.noise)
+    lattice = (markers.pitch, markers.radius, markers.aspect, markers.share, markers.bend)
+    widest = np.minimum(photometry.widest, 1e3)
+    numbers = (sensor.field, (sensor.gel.modulus, sensor.gel.thickness), shade, lattice, markers.ink)
+    return Family(
+        *(np.asarray(x, np.float32) for x in numbers),
+        jax.tree.map(lambda x: np.asarray(x, np.float32), photometry._replace(widest=widest)), gels,
+    )  # fmt: skip
+
+
+def as_sensor(numbers: Family) -> Sensor:
+    """Return a `Sensor` of these numbers, which may be traced."""
+    skin, contrast, vignette, halo, noise = numbers.shade
+    pitch, radius, aspect, share, bend = numbers.markers
+    gel = Gel(modulus=numbers.gel[0], poisson=0.48, thickness=numbers.gel[1])
+    markers = Markers(pitch, radius, aspect, share, tuple(numbers.ink), bend)
+    return Sensor(
+        "family", (numbers.field[0], numbers.field[1]), (0, 0), gel, markers, "image", skin, contrast, vignette, halo,
+        noise,
+    )  # fmt: skip
+
+
+def make_world(
+    scenes: Scenes, split: Literal["train", "val", "test"] = "train", *, sensors: Sequence[str] = CAMERAS,
+    variants: int = 1,
+) -> tuple[World, tuple[Object, ...]]:  # fmt: skip
+    """Return the world of the objects of a split of `scenes`, and these objects, by their number.
+
+    `variants` objects of each kind are drawn: other sizes, pitches and phases of the same primitive, texture and
+    material. So kinds that are held out never occur. Raises UserError for a split without objects.
+    """
+    things, splits = objects_and_splits(scenes)
+    own = [thing for thing, name in zip(things, splits, strict=True) if name == split]
+    if not own:
+        raise UserError(f"no object of {len(things)} is in split {split}; draw more objects, or hold out more")
+    for number in range(1, variants):
+        own += [
+            draw_object(thing.shape.primitive, thing.shape.texture, thing.material.name, thing.seed ^ (number << 20))
+            for thing in own[: len(own) // number]
+        ]
+    relief = np.stack([shapes.relief(thing.shape, RELIEF, SPACING).astype(np.float16) for thing in own])
+    material = np.array([(thing.material.modulus, thing.material.friction) for thing in own], np.float32)
+    return World(relief, material, stack_trees([family(SENSORS[name]) for name in sensors])), tuple(own)
+
+
+def sample(key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None) -> SimulatedTouches:
+    """Return `count` touches drawn from `key`. `sampling` and `count` are static under jit.
+
+    The second take is by the family `gallery`, if given. A key gives the same touches on one machine.
+    """
+    keys = jax.random.split(key, count)
+    sensor, thing, drawn, numbers = jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
+    simulate = jax.vmap(jax.vmap(partial(_simulate, sampling=sampling)))
+    out = simulate(drawn, numbers)
+    width = numbers.field[..., 1] * drawn.unit.zoom
+    fields = None if out.field is None else out.field[:, :, -1]
+    return SimulatedTouches(out.image, out.background, sensor, thing, fields, width, out.labels, drawn)
+
+
+def _simulate(clip: ClipInput, numbers: Family, sampling: Sampling) -> Any:
+    """Return the simulated clip of one take."""
+    side = (sampling.field_size, sampling.field_size)
+    pitch = jnp.max(numbers.field) / GRID
+    view = View((GRID, GRID), pitch, (sampling.size, sampling.size), numbers.photometry, True, side)
+    return simulate_clip(
+        clip, sensor=as_sensor(numbers), fidelity=sampling.fidelity, fields=sampling.fields, view=view
+    )
+
+
+def _draw(
+    key: Array, world: World, sampling: Sampling, gallery: Array | None
+) -> tuple[Array, Array, ClipInput, Family]:
+    """Return the sensors (M,), the object, and the inputs and families of all takes of one touch."""
+    rng = Draws(key)
+    thing = rng.integers(len(world.relief))
+    place, yaw = draw_place(rng)
+    gesture = draw_gesture(sampling.depth, rng)
+    by_hand = rng.uniform() < sampling.coarse
+    steps = sampling.frames - 1
+    relief = world.relief[thing].astype(jnp.float32)
+
+    def take(key: Array, number: Array) -> tuple[Array, ClipInput, Family]:
+        rng, families = Draws(key, 2048), len(world.families.gels)  # blotches are 1,600 values
+        sensor = rng.integers(families)
+        if gallery is not None:
+            sensor = jnp.where(number == 1, gallery, sensor)
+        numbers = jax.tree.map(lambda x: x[sensor], world.families)
+        if sampling.wild:
+            is_wild = rng.uniform() < sampling.wild
+            other = jax.tree.map(lambda x: x[rng.integers(families)], world.families)
+            numbers = jax.tree.map(partial(jnp.where, is_wild), wild(numbers, other, rng), numbers)
+            sensor = jnp.where(is_wild, families, sensor)
+        unit = draw_unit(as_sensor(numbers), rng, numbers.gels)
+        hand = draw_by_hand(sampling.depth, rng, gesture, yaw)
+        straight = (gesture, yaw, jnp.zeros(2), jnp.zeros(2))
+        own, turn, offset, tilt = jax.tree.map(partial(jnp.where, by_hand), hand, straight)
+        shown = own.shown * (steps / CLIP_OF if steps else rng.uniform(-0.5, 0.5) * 2)
+        times = own.middle + (shown * jnp.linspace(-0.5, 0.5, steps + 1) if steps else shown[None] / 2)
+        motion, depth = moved(own, times, 0.04, jnp)
+        if not steps:  # a still shows a touch
+            depth = jnp.where(depth < LEAST_DEPTH, own.depth, depth)
+        depth = jnp.where(rng.uniform() < sampling.free, -1.0, depth)
+        clip = ClipInput(
+            relief, place, jnp.stack([*offset, turn]), motion, depth, tilt, world.material[thing, 0],
+            world.material[thing, 1], unit, draw_drift(sampling.frames, rng), rng.integers(2**23).astype(jnp.uint32),
+        )  # fmt: skip
+        return sensor, clip, numbers
+
+    number = jnp.arange(sampling.takes)
+    keys = jax.vmap(lambda n: jax.random.fold_in(jax.random.fold_in(key, 0), n))(number)
+    sensor, clip, numbers = jax.vmap(take)(keys, number)
+    return sensor, thing, clip, numbers
+
+
+def wild(one: Family, other: Family, rng: Draws) -> Family:
+    """Return a family between two, with lights of other colours, and dots of another size, distance and ink."""
+    share = rng.uniform()
+    mixed: Family = jax.tree.map(lambda a, b: share * a + (1 - share) * b, one, other)
+    turn = jnp.asarray(_ORDERS)[rng.integers(len(_ORDERS))] * rng.choice([-1.0, 1.0])  # lights that change places, or a side
+    photometry = mixed.photometry._replace(normal=mixed.photometry.normal @ turn, halo=mixed.photometry.halo @ turn)
+    pitch = rng.uniform(0.9, 2.6)
+    radius = pitch * rng.uniform(0.08, 0.28)
+    markers = jnp.stack([pitch, radius, rng.uniform(0.7, 1.6), rng.uniform(0.2, 0.9), rng.uniform(0.0, 0.15)])
+    ink = rng.choice([0.1, 0.1, 0.9]) + rng.uniform(-0.1, 0.1, (3,))
+    return mixed._replace(photometry=photometry, markers=markers, ink=ink, gels=one.gels)

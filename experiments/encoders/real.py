@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import argparse
 import csv
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+
 Row = dict[str, str]
 SLIP = "incipient_slip-gelsight_mini_markers"
+SHORT = 144  # pixels
 TOUCHED = 5.0  # of label.contact_score in the second pack. The rows of the first are all presses.
 
 
@@ -31,12 +33,20 @@ def copy(pack: Path, out: Path, keep: Callable[[Row], bool], contact: Callable[[
         for name in ("path", "background_path", "image_path"):
             if row[name] and not (out / row[name]).exists():
                 (out / row[name]).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(pack / row[name], out / row[name])
+                _shrink(pack / row[name], out / row[name])
     with (out / "manifest.csv").open("w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, fieldnames=list(rows[0]))
         table.writeheader()
         table.writerows(rows)
     return out / "manifest.csv"
+
+
+def _shrink(source: Path, target: Path) -> None:
+    """Write a picture with a short side of SHORT pixels at most, so that all of them fit an upload."""
+    image = cv2.imread(str(source))
+    scale = min(1.0, SHORT / min(image.shape[:2]))
+    image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(target), image, [cv2.IMWRITE_JPEG_QUALITY, 88] if target.suffix == ".jpg" else [])
 
 
 def main() -> None:

@@ -1,103 +1,103 @@
-"""Training of the encoders in the package: stage 1, stage 2 in two parts, then the folder with its card.
+"""Training of the encoder in the package: stage 1, stage 2, then the folder with its card.
 
-    python -m experiments.encoders.train --corpus data/corpus --real a.csv b.csv --out runs/anytouch-tiny
+    python -m experiments.encoders.train --minutes 12 --real data/real/pack2/manifest.csv --out runs/anytouch-tiny
 
-The same command again continues. The recipe is the paper's two losses. The pictures lie in the memory of the device
-(`resident.py`). The first two parts are for a GPU, the last one fits a CPU: stills only, small batches. `--without
-SENSOR` leaves a sensor out of stage 2, to test what carries over to it.
+Each stage gets a share of the time, compilation included, and its schedule follows the time. The next call starts from
+the weights in OUT/state, on this machine or another, and trains stage 2 again for its whole time: a cycle. Touches are
+simulated in the training program. With a GPU the batches are large and the arithmetic has 16 bits.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
+import jax
 
-from anytouch_jax.cli import train
-from anytouch_jax.cli.app import main as anytouch
-from anytouch_jax.cli.output import log
-from anytouch_jax.files import atomic_path
-from anytouch_jax.pretrain import pretrain
-from experiments.encoders.resident import ResidentLoader
+from anytouch_jax.config import Config, Stack, preset
+from anytouch_jax.pretrain import CHECKPOINTS, pretrain
+from anytouch_jax.simulated import SIMULATED
+from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.progress import to_stderr as log
+from anytouch_jax.weights.load import load_model
+from anytouch_jax.weights.registry import PARTS, write_encoder
 
-DATA = [
-    "--preset", "tiny", "--data.background", "subtract", "--data.contact-only", "--data.jitter", "0", "0", "0", "0",
-    "--data.affine", "8", "0.04", "0.1", "--run.figure-every", "0",
-]  # fmt: skip
-CONV = [*DATA, "--model.patch-encoder", "convolutional"]
-SMALL = ("width=128", "depth=2", "heads=4", "mlp=512")  # the image tower: photographs are few and simple
-STAGE2 = [
-    "--optim.layer-decay", "0.75", "--model.match-head", "cosine", "--objective.match-weight", "8",
-    "--data.negatives", "same_sensor", "--model.text.stack.depth", "2",
-    *(word for part in SMALL for word in (f"--model.image.{part.partition('=')[0]}", part.partition("=")[2])),
-]  # fmt: skip
-
-
-def real_share(slip: int, press: int) -> list[str]:
-    """Return the options that say how often an epoch draws each real recording."""
-    return ["--data.weights", "incipient_slip-gelsight_mini_markers", str(slip), "gelslam-gelsight_mini", str(press)]
-
-
-WIDE1 = ["--batch", "256", "--optim.learning-rate", "1.5e-3", "--objective.norm-pix-loss"]
-WIDE2 = [
-    *STAGE2, "--batch", "256", "--optim.learning-rate", "1e-3", "--objective.match-keep", "0.75",
-    "--data.clip-share", "0.2",
-]  # fmt: skip
-LAST = [*STAGE2, "--optim.learning-rate", "5e-4", "--objective.match-keep", "0.5", "--data.clip-share", "0"]
-# Folder, stage, steps, steps after which it stops, options, draws of real recordings. Each starts from the one before.
-RECIPES = {
-    "anytouch-tiny": (
-        ("stage1", 1, 12666, None, [*DATA, *WIDE1], real_share(10, 20)),
-        ("stage2-wide", 2, 2109, 175, [*DATA, *WIDE2], real_share(8, 20)),
-        ("stage2", 2, 850, None, [*DATA, *LAST, "--batch", "64", "--optim.warmup", "30"], real_share(8, 20)),
-    ),
-    "anytouch-tiny-conv": (
-        ("stage1", 1, 12000, None, [*CONV, *WIDE1], real_share(5, 10)),
-        ("stage2-wide", 2, 12000, 3221, [*CONV, *WIDE2], real_share(5, 10)),
-        ("stage2", 2, 400, None,
-         [*CONV, *LAST, "--batch", "128", "--optim.warmup", "20", "--objective.alpha-tv", "0", "--objective.alpha-vl",
-          "0"], real_share(30, 75)),
-    ),
+SETTINGS: dict[str, Any] = {
+    "model.embed": 192, "model.fields": 32, "data.background": "either", "data.jitter": (0.0, 0.0, 0.0, 0.0),
+    "data.affine": (10.0, 0.05, 0.15), "run.figure_every": 0, "run.save_every": 2000, "run.keep": 1,
+    "run.steps": 10_000, "optim.warmup": 400, "simulated.wild": 0.25, "simulated.variants": 3,
 }  # fmt: skip
+STAGES: dict[int, dict[str, Any]] = {
+    1: {"optim.learning_rate": 1e-3, "objective.norm_pix_loss": True, "objective.field_weight": 0.1},
+    2: {
+        "optim.learning_rate": 8e-4, "model.match_head": "cosine", "objective.match_weight": 4.0,
+        "objective.field_weight": 0.2, "data.clip_share": 0.34,
+    },
+}  # fmt: skip
+IMAGE = Stack(width=128, depth=2, heads=4, mlp=512)  # photographs are few and simple
+# Device: touches of a batch of stage 1, pairs of stage 2, share of the patches that matching encodes, more settings.
+DEVICES: dict[str, tuple[int, int, float, dict[str, Any]]] = {
+    "gpu": (1024, 640, 0.6, {"model.dtype": "bfloat16"}),
+    "cpu": (32, 32, 0.5, {"simulated.reuse": 4}),
+}
+STATE = "state"
+ALL = (*PARTS, "decoder", "fields")
 
 
-def leave_out(manifest: Path, sensor: str) -> Path:
-    """Write the rows of the other sensors to a manifest next to this one, and return its path."""
-    table, path = pq.read_table(manifest), manifest.with_name(f"without_{sensor}.parquet")
-    with atomic_path(path) as part:
-        pq.write_table(table.filter(pc.not_equal(pc.cast(table["sensor"], "string"), sensor)), part)
-    return path
+def configure(stage: Literal[1, 2], real: Sequence[str], cycle: int, changes: Mapping[str, Any]) -> Config:
+    """Return the configuration of a stage of the recipe on this device."""
+    first, second, keep, more = DEVICES["cpu" if jax.default_backend() == "cpu" else "gpu"]
+    settings = SETTINGS | STAGES[stage] | more | {"run.seed": cycle, "data.manifests": (SIMULATED, *real)}
+    settings["data.batch_size"] = first if stage == 1 else second
+    if real:
+        settings |= {"data.contact_only": True, "data.weights": ((SIMULATED, 9.0 if stage == 1 else 6.0),)}
+    config = preset("tiny", stage=stage)
+    if stage == 2:
+        assert config.model.text is not None
+        text = replace(config.model.text, stack=replace(config.model.text.stack, depth=2))
+        settings |= {"objective.match_keep": keep, "model.image": IMAGE, "model.text": text}
+    return config.with_settings({**settings, **changes})
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--encoder", choices=RECIPES, default="anytouch-tiny", help="which encoder to train")
-    parser.add_argument("--corpus", type=Path, required=True)
-    parser.add_argument("--real", type=Path, nargs="*", default=[], help="manifests of real recordings")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--without", help="a simulated sensor that stage 2 does not see")
-    parser.add_argument("--processes", type=int, default=2, help="processes that read the pictures")
-    options = parser.parse_args()
-    shards = sorted(options.corpus.glob("*/manifest.parquet"))
-    init: list[str] = []
-    ResidentLoader.processes = options.processes
-    for folder, stage, steps, stop, recipe, share in RECIPES[options.encoder]:
-        if stage == 2 and options.without:
-            shards = [leave_out(path.with_name("manifest.parquet"), options.without) for path in shards]
-        data = [str(path) for path in (*shards, *options.real)]
-        run, more = str(options.out / folder), [*recipe, *(share if options.real else []), *init]
-        words = ["--stage", str(stage), "--data", *data, "--run", run, "--steps", str(steps), *more]
-        request = train.parse(train.TrainOptions, "train", words)
-        result = pretrain(
-            request.config, run, init=request.options.init, stop_after=stop, make_loader=ResidentLoader, log=log
-        )
+    parser.add_argument("--minutes", type=float, default=12.0, help="wall time of this call, compilation included")
+    parser.add_argument("--real", nargs="*", default=[], help="manifests of real recordings")
+    parser.add_argument("--out", type=Path, default=Path("runs/anytouch-tiny"))
+    parser.add_argument("--stage1-share", type=float, default=0.3, help="of the time of the first call")
+    parser.add_argument("--stages", type=int, nargs="+", default=[1, 2], help="stages to train in a first call")
+    parser.add_argument("--set", nargs="*", default=[], metavar="SECTION.FIELD=VALUE", help="other settings, as JSON")
+    given = parser.parse_args()
+    changes = {name: json.loads(value) for name, _, value in (word.partition("=") for word in given.set)}
+    begun = time.monotonic()
+    end, state = begun + 60 * given.minutes, given.out / STATE
+    enable_compilation_cache()
+    cycle = len(list(given.out.glob("cycle-*")))
+    init = state if state.exists() else None
+    stages = [2] if init else given.stages
+    for stage in stages:
+        run = given.out / f"cycle-{cycle:02d}" / f"stage{stage}"
+        until = end if stage == stages[-1] else begun + 60 * given.minutes * given.stage1_share
+        config = configure(stage, given.real, cycle, changes)
+        result = pretrain(config, run, init=init, log=log, until=until)
+        log(f"stage {stage}: {result.step} steps of {config.data.batch_size}, loss {result.metrics.get('loss')}")
         if result.interrupted:
             raise SystemExit(130)
-        init = ["--init", run]
-    notes = Path(__file__).with_name(f"{options.encoder}.md")
-    anytouch(["export", "--card", str(options.out / options.encoder), "--model", run, "--notes", str(notes)])
+        loaded = load_model(run)
+        tokenizer = run / "tokenizer.json"
+        write_encoder(state, loaded, parts=ALL, tokenizer=tokenizer if tokenizer.exists() else None)
+        shutil.copyfile(run / "metrics.jsonl", given.out / f"cycle-{cycle:02d}-stage{stage}.jsonl")
+        if stage == 2:
+            notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
+            write_encoder(given.out / "anytouch-tiny", loaded, notes, parts=(*PARTS, "fields"), tokenizer=tokenizer)
+        shutil.rmtree(run / CHECKPOINTS)  # the state is what goes on
+        init = state
 
 
 if __name__ == "__main__":

@@ -11,11 +11,32 @@ from typing import Any, NamedTuple
 Array = Any  # a numpy or a jax array
 
 
-class TouchBatch(NamedTuple):
-    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table."""
+class FieldBatch(NamedTuple):
+    """Touches with exact fields of their last frame (h, w), free of scale as in `nn.fields`.
+
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `aspect` f32 (B,) logarithm of height over width, `depth` (B, h, w) and
+    `shear` (B, h, w, 2) shares of the picture's width, `pressure` (B, h, w) over the gel's modulus, `force` (B, 3)
+    tangential x and y and normal over modulus times width squared, `torque` (B,) over modulus times width cubed, `slip`
+    (B,) share of the contact that slides.
+    """
 
     clip: Array
     sensor: Array
+    aspect: Array
+    depth: Array
+    shear: Array
+    pressure: Array
+    force: Array
+    torque: Array
+    slip: Array
+
+
+class TouchBatch(NamedTuple):
+    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table, and touches with fields or None."""
+
+    clip: Array
+    sensor: Array
+    fields: FieldBatch | None = None
 
 
 class AlignBatch(NamedTuple):
@@ -51,7 +72,8 @@ class MatchBatch(NamedTuple):
 
 
 class Stage2Batch(NamedTuple):
-    """One stage-2 step: both parts (recipe paper) or one of them (recipe release)."""
+    """One stage-2 step: both parts (recipe paper) or one of them (recipe release), and touches with fields or None."""
 
     align: AlignBatch | None
     match: MatchBatch | None
+    fields: FieldBatch | None = None

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.batch import AlignBatch, FieldBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
+from anytouch_jax.nn.fields import FORCE, LENGTH, STRESS, TORQUE
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.ops import losses, tokens
 
@@ -83,7 +84,67 @@ def stage1_loss(
     p_u, sensor = _draw_tokens(batch.sensor, key_universal, progress, net, config)
     clip = normalise_touch(batch.clip)
     loss, metrics = stage1_terms(params, clip, sensor, noise, net=net, config=config, decoder_sensor=batch.sensor)
-    return loss, metrics | {"p_u": p_u}
+    return _with_fields(params, batch.fields, loss, metrics | {"p_u": p_u}, key, progress, net, config)
+
+
+def _with_fields(
+    params: Params, batch: FieldBatch | None, loss: Array, metrics: Metrics, key: Array, progress: Array, net: Net,
+    config: Config,
+) -> tuple[Array, Metrics]:  # fmt: skip
+    """Add the loss of touches with fields, if the batch has some."""
+    if batch is None:
+        return loss, metrics
+    _, sensor = _draw_tokens(batch.sensor, jax.random.fold_in(key, 1), progress, net, config)
+    batch = batch._replace(clip=normalise_touch(batch.clip), sensor=sensor)
+    measured, terms = field_terms(params, batch, net=net)
+    return loss + config.objective.field_weight * measured, metrics | terms
+
+
+TOUCHED = 1e-3  # of the gel's modulus: a pressure that counts as contact
+LEAST_FORCE = 1e-3  # of modulus times width squared, some 0.05 N: smaller forces have no meaningful ratio
+
+
+def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, Metrics]:
+    """Return the loss of predicted fields and force, and errors in contact. Not in the paper.
+
+    Every error has a predicted Laplace deviation (Kendall and Gal 2017, "What uncertainties do we need"). Pixels in
+    contact weigh as much as all others together. `batch` has normalised pixels and drawn sensor rows.
+    """
+    out = net.measure(params, batch.clip, batch.sensor, batch.aspect)
+    touched = (batch.pressure > TOUCHED).astype(jnp.float32)
+    share = jnp.mean(touched)
+    weight = 0.5 * touched / jnp.maximum(share, 1e-2) + 0.5 * (1 - touched) / jnp.maximum(1 - share, 1e-2)
+
+    def over_pixels(values: Array) -> Array:
+        return jnp.mean(weight * values)
+
+    depth = (out.depth - batch.depth) / LENGTH
+    shear = (out.shear - batch.shear) / LENGTH
+    slopes = sum(jnp.mean(jnp.abs(jnp.diff(depth, axis=axis))) for axis in (1, 2))
+    pressure = jnp.abs(out.pressure - batch.pressure) / STRESS
+    ratio = jnp.log((out.force[:, 2] + LEAST_FORCE) / (batch.force[:, 2] + LEAST_FORCE))
+    sideways = (out.force[:, :2] - batch.force[:, :2]) / FORCE
+    pressed = (jnp.max(touched, (1, 2)) > 0).astype(jnp.float32)
+    slip = pressed * (jax.nn.sigmoid(out.slip) - batch.slip)
+    terms = {
+        "depth": over_pixels(losses.laplace_loss(depth, out.depth_log)),
+        "slopes": slopes,
+        "shear": over_pixels(jnp.mean(losses.laplace_loss(shear, out.shear_log[..., None]), -1)),
+        "contact": over_pixels(losses.binary_loss(out.contact, touched)),
+        "pressure": over_pixels(pressure),
+        "normal": jnp.mean(losses.laplace_loss(ratio, out.force_log[:, 1])),
+        "tangential": jnp.mean(losses.laplace_loss(sideways, out.force_log[:, :1])),
+        "torque": jnp.mean(losses.laplace_loss((out.torque - batch.torque) / TORQUE, out.torque_log)),
+        "slip": jnp.mean(losses.laplace_loss(slip, out.slip_log)),
+    }
+    seen = (out.contact > 0).astype(jnp.float32)
+    both, either = jnp.sum(seen * touched), jnp.sum(jnp.maximum(seen, touched))
+    metrics = {f"field_{name}": value for name, value in terms.items()} | {
+        "contact_iou": both / jnp.maximum(either, 1),
+        "depth_error": LENGTH * jnp.sum(jnp.abs(depth) * touched) / jnp.maximum(jnp.sum(touched), 1),
+        "force_error": jnp.sum(jnp.abs(ratio) * pressed) / jnp.maximum(jnp.sum(pressed), 1),
+    }
+    return sum(terms.values(), jnp.zeros(())), metrics
 
 
 def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tuple[str, bool], ...]:
@@ -91,7 +152,7 @@ def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tupl
 
     The first match decides. A parameter that is not trained has no gradient, and PyTorch's optimiser skips it.
     """
-    align, match = (None, None) if isinstance(batch, TouchBatch) else batch
+    align, match = (None, None) if isinstance(batch, TouchBatch) else batch[:2]
     pixels = batch if isinstance(batch, TouchBatch) else align if config.recipe == "release" else None
     frames = 0 if pixels is None else pixels.clip.shape[1]
     has_image = align is not None and align.image.shape[0] > 0
@@ -100,7 +161,8 @@ def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tupl
     embeds = has_image or has_text or match is not None
     return (
         ("^touch/post_norm/", embeds),
-        ("^touch/", embeds or frames > 0),
+        ("^touch/", embeds or frames > 0 or batch.fields is not None),
+        ("^fields/", batch.fields is not None),
         ("^decoder/still_head/", frames == 1),
         ("^decoder/clip_head/", frames > 1),
         ("^decoder/", frames > 0),
@@ -181,7 +243,7 @@ def stage2_terms(
     release recipe adds the stage-1 loss of the align batch, if `noise` (B, N) is given. `match_noise` (M, B, N) decides
     which patches the M touches of matching keep; None keeps all.
     """
-    (align, match), objective = batch, config.objective
+    (align, match, _), objective = batch, config.objective
     total, metrics = jnp.zeros(()), Metrics()
     aligned = [] if align is None else [(align.clip[:, : net.model.frames], align.sensor)]
     matched = [] if match is None else [(match.clip, match.sensor), (match.positive, match.positive_sensor)]
@@ -222,7 +284,7 @@ def stage2_loss(
 ) -> tuple[Array, Metrics]:
     """Return `stage2_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`; `progress` drives p_u."""
     key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
-    (align, match), patches = batch, net.model.patches
+    (align, match, fields), patches = batch, net.model.patches
     metrics, noise, own, match_noise = Metrics(), None, None, None
     if align is not None:
         own = align.sensor
@@ -238,7 +300,7 @@ def stage2_loss(
     loss, terms = stage2_terms(
         params, batch, noise, net=net, config=config, decoder_sensor=own, match_noise=match_noise
     )
-    return loss, terms | metrics
+    return _with_fields(params, fields, loss, terms | metrics, key, progress, net, config)
 
 
 def _draw_tokens(sensor: Array, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, Array]:

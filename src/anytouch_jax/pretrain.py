@@ -15,17 +15,19 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from anytouch_jax import objectives
+from anytouch_jax import objectives, simulated
 from anytouch_jax.batch import Stage2Batch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.data.images import encode
 from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.tokenizer import load_tokenizer
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import reconstruction
 from anytouch_jax.files import atomic_write
 from anytouch_jax.nn.functional import Net, build
+from anytouch_jax.simulated import SIMULATED, SimulatedLoader
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
 from anytouch_jax.train.metrics import alone_in, begun_with
@@ -41,7 +43,7 @@ SCRATCH_VOCABULARY, TOKENIZER, CHECKPOINTS = 2048, "tokenizer.json", "checkpoint
 def pretrain(
     config: Config, run: str | Path, *, init: str | Path | None = None, clip: str | Path | None = None,
     stop_after: int | None = None, log: Log = print, mesh: Mesh | None = None,
-    curve: bool = False, make_loader: Callable[..., Loader] = Loader,
+    curve: bool = False, until: float | None = None,
 ) -> FitResult:  # fmt: skip
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
@@ -49,15 +51,19 @@ def pretrain(
     also of an encoder of photographs (see `load_start`).
     `clip` is CLIP weights for the towers. Stage 1 starts the touch encoder from their image tower, as the paper does.
     A resumed run reads neither. `mesh` is the devices to train on, all of them if None. `curve` shows the loss of all
-    steps on a terminal. `make_loader` makes the loader. Raises UserError for a mistake in the settings, the data or the
+    steps on a terminal. `until` is as in `fit`. Raises UserError for a mistake in the settings, the data or the
     folder.
     """
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
     report, log = log, log if jax.process_index() == 0 else silent  # every process reads other samples
     resumes = bool(steps(run / CHECKPOINTS))
     _check(config, run, init, clip, resumes)
-    manifest = manifests.read(config.data.manifests)
-    config, tokenizer = _choose_tokenizer(config, run, manifest, clip, resumes)
+    real = tuple(name for name in config.data.manifests if name != SIMULATED)
+    simulates = len(real) < len(config.data.manifests)
+    if simulates and jax.process_count() > 1:
+        raise UserError("--data simulated is for one process; leave it out, or start one process")
+    manifest = manifests.read(real) if real or not simulates else None
+    config, tokenizer = _choose_tokenizer(config, run, manifest, clip, resumes, simulates)
     net = build(config.model)
     params = net.init(jax.random.key(config.run.seed))
     stored, sensors, notes = dict[str, Any](), tuple[str, ...](), list[str]()
@@ -68,7 +74,12 @@ def pretrain(
     else:
         params, notes, sensors = load_start(params, config, init=init, clip=clip)
     shard = (jax.process_index(), jax.process_count())
-    loader = make_loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard, log=report)
+    loader: Loader | SimulatedLoader
+    if simulates:
+        loader = SimulatedLoader(config, manifest, tokenizer=tokenizer, log=log)
+    else:
+        assert manifest is not None
+        loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard, log=report)
     for note in (*notes, *loader.notes):
         log(note)
     config = _with_warmup(config, run, loader)
@@ -81,7 +92,7 @@ def pretrain(
             "image": {"size": config.model.image_size, "mean": CLIP_MEAN, "std": CLIP_STD, "channels": "RGB"},
         },
         "source": stored.get("source", {"init": init and str(init), "clip": clip and str(clip)}),
-        "data": manifest.content_hash,
+        "data": _content(manifest),
     }
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
     with alone_in(run) if jax.process_index() == 0 else nullcontext():
@@ -91,7 +102,7 @@ def pretrain(
             config, params=params, loss_fn=partial(loss, net=net, config=config), batches=loader.stream, run_dir=run,
             trained=partial(objectives.trained_by, config=config), stop_after=stop_after, metadata=metadata,
             on_report=partial(_draw_reconstructions, run=run, net=net, config=config), log=log, mesh=mesh,
-            curve=curve,
+            curve=curve, until=until,
         )  # fmt: skip
 
 
@@ -128,11 +139,16 @@ def _check(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> No
         raise UserError(f"{run} has a run of stage {earlier.stage}; choose another --run for stage {config.stage}")
 
 
+def _content(manifest: manifests.Manifest | None) -> str:
+    """Return the hash of the rows that a run reads."""
+    return SIMULATED if manifest is None else manifest.content_hash
+
+
 def _check_resume(
-    run: Path, manifest: manifests.Manifest, stored: Mapping[str, Any], log: Log, **paths: str | Path | None
+    run: Path, manifest: manifests.Manifest | None, stored: Mapping[str, Any], log: Log, **paths: str | Path | None
 ) -> None:
     """Raise UserError if a run resumes on other rows; log weights that differ from those that it started from."""
-    if stored.get("data") not in (None, manifest.content_hash):
+    if stored.get("data") not in (None, _content(manifest)):
         raise UserError(
             f"the rows of the manifests have changed since {run} was started; restore them, or start another run "
             f"with --init {run}, whose touch encoder and decoder it starts from"
@@ -145,7 +161,7 @@ def _check_resume(
             log(f"{run} resumes and was started with {option} {before or '(nothing)'}: {path} is not read")
 
 
-def _with_warmup(config: Config, run: Path, loader: Loader) -> Config:
+def _with_warmup(config: Config, run: Path, loader: Loader | SimulatedLoader) -> Config:
     """Return the config with a warm-up of one epoch (appendix "Implementation details"), or less in a short run."""
     earlier = begun_with(run)
     if config.optim.warmup is not None or (earlier is not None and earlier.optim.warmup is None):
@@ -153,7 +169,9 @@ def _with_warmup(config: Config, run: Path, loader: Loader) -> Config:
     return config.with_settings({"optim.warmup": min(loader.steps_per_epoch, config.warmup)})
 
 
-def _choose_tokenizer(config: Config, run: Path, manifest: Any, clip: Any, resumes: bool) -> tuple[Config, Any]:
+def _choose_tokenizer(
+    config: Config, run: Path, manifest: Any, clip: Any, resumes: bool, simulates: bool
+) -> tuple[Config, Any]:
     """Return the config and the tokenizer of stage 2: the run's, the option's, CLIP's, or one trained on captions."""
     if config.model.text is None:
         return config, None
@@ -162,6 +180,11 @@ def _choose_tokenizer(config: Config, run: Path, manifest: Any, clip: Any, resum
         file = run / TOKENIZER
     elif config.data.tokenizer is None and config.towers == "pretrained":
         file = (Path(clip) if Path(clip).is_dir() else Path(clip).parent) / TOKENIZER
+    if simulates:
+        tokenizer = simulated.choose_tokenizer(config, manifest) if file is None else load_tokenizer(file)
+        if config.towers == "pretrained":
+            return config, tokenizer
+        return config.with_settings({"model.text": replace(config.model.text, vocab=tokenizer.vocab_size)}), tokenizer
     rows, most = manifest.rows_of(config.data.split), min(SCRATCH_VOCABULARY, config.model.text.vocab)
     tokenizer, _ = pools.choose_tokenizer(manifest, rows, config, file=file, vocabulary=most)
     if tokenizer is None or config.towers == "pretrained":

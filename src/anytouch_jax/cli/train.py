@@ -20,6 +20,7 @@ from anytouch_jax.config import (
     OptimConfig,
     PresetName,
     RunConfig,
+    SimulatedConfig,
     preset,
     presets,
 )
@@ -73,6 +74,7 @@ class Sections:
     objective: LossConfig  # Weights and choices of the losses.
     optim: OptimConfig  # AdamW and its schedule.
     data: DataConfig  # Reading and augmentation of the data.
+    simulated: SimulatedConfig  # Simulated touches (--data simulated).
     run: RunConfig  # Course of the run.
 
 

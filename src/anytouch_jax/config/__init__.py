@@ -26,6 +26,7 @@ from anytouch_jax.config.train import (
     PresetName,
     Recipe,
     RunConfig,
+    SimulatedConfig,
     Towers,
     from_json,
     to_json,

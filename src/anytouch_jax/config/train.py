@@ -38,6 +38,7 @@ class LossConfig:
     match_weight: NotNegative[float] = 0.1  # Weight of cross-sensor matching relative to alignment (lambda, Eq. 9).
     match_keep: Annotated[float, Range(math.ulp(0.0), 1, "above 0, and 1 at most")] = 1.0
     """Share of the patches that matching encodes. Not in the paper (after FLIP)."""
+    field_weight: NotNegative[float] = 0.1  # Weight of depth, shear, contact and force (--model.fields). Not in the paper.
     groups: Count[int] = 1  # Parts of the batch within which negatives stay. 1 uses the whole batch.
     center_embeddings: bool = False  # Subtract the batch mean from embeddings, against collapse of untrained towers.
     universal_start: Share = 0.0  # Probability of the universal tokens at the first step (p_u, Sec. 3.5).
@@ -108,6 +109,27 @@ class DataConfig:
 
 
 @dataclass(frozen=True)
+class SimulatedConfig:
+    """Simulated touches that training draws from (--data simulated). No data set is written."""
+
+    objects: Count[int] = 480  # Objects of the catalogue, before a part of them is held out.
+    variants: Count[int] = 1  # Objects of each kind, with other sizes and phases.
+    seed: NotNegative[int] = 41  # Seed of the objects and of the kinds that are held out.
+    sensors: tuple[str, ...] = ("gelsight_mini", "digit", "gelsight", "gelslim", "duragel", "9dtact")
+    """Sensors that are simulated."""
+    coarse: Share = 0.4  # Share of touches at which each sensor touches as by hand.
+    wild: Share = 0.0  # Share of touches by sensors that mix two others, for the universal tokens.
+    depth: tuple[float, float] = (0.15, 1.0)  # Range of the deepest press, mm.
+    vision: Share = 0.4  # Share of touches with a photograph.
+    text: Share = 0.7  # Share of touches with a caption.
+    places: Count[int] = 4  # Photographed places of each object.
+    reuse: Count[int] = 1  # Steps that draw from the same simulated touches, with new masks and augmentations.
+
+    def __post_init__(self) -> None:
+        check(self, "--simulated.")
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """Course of one training run."""
 
@@ -136,6 +158,7 @@ class Config:
     objective: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     data: DataConfig = field(default_factory=DataConfig)
+    simulated: SimulatedConfig = field(default_factory=SimulatedConfig)
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:

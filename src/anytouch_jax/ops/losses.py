@@ -154,3 +154,18 @@ def matching_loss(positive_logit: Array, negative_logit: Array) -> Array:
     """Return the binary cross-entropy of matching from logits (B,), each kind averaged over the batch (Eq. 6)."""
     positive, negative = _wide(positive_logit), _wide(negative_logit)
     return jnp.mean(jax.nn.softplus(-positive)) + jnp.mean(jax.nn.softplus(negative))
+
+
+def laplace_loss(error: Array, log_scale: Array) -> Array:
+    """Return the negative log likelihood of errors under Laplace deviations exp(`log_scale`), element-wise.
+
+    The logarithm is bent smoothly into -5..5, so that no deviation vanishes or explodes.
+    """
+    log_scale = 5.0 * jnp.tanh(_wide(log_scale) / 5.0)
+    return jnp.abs(_wide(error)) * jnp.exp(-log_scale) + log_scale
+
+
+def binary_loss(logit: Array, share: Array) -> Array:
+    """Return the cross-entropy between logits and shares in 0..1, element-wise."""
+    logit = _wide(logit)
+    return jnp.maximum(logit, 0) - logit * share + jnp.log1p(jnp.exp(-jnp.abs(logit)))

@@ -7,10 +7,13 @@ are solved on one square grid and shown at one size, as `encoder.preprocess` sho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from itertools import permutations
+from multiprocessing import get_context
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -21,7 +24,7 @@ from jax import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel
 from anytouch_jax.sim.draws import Draws
-from anytouch_jax.sim.recorder import RELIEF, SPACING, ClipInput, View, simulate_clip, stack_trees
+from anytouch_jax.sim.recorder import RELIEF, SPACING, ClipInput, ClipOutput, View, simulate_clip, stack_trees
 from anytouch_jax.sim.scene import Scenes, draw_by_hand, draw_gesture, draw_place, moved, objects_and_splits
 from anytouch_jax.sim.sensing.optics import Photometry
 from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Sensor, bases, draw_drift, draw_unit, look
@@ -33,6 +36,7 @@ GRID = 84  # points of the solve grid's side, over the longer side of the field
 LEAST_DEPTH = 0.08  # mm of a touch that counts as contact
 CLIP_OF = 5  # a gesture is shown in so many steps between frames, of which a clip shows some
 _ORDERS = np.eye(3, dtype=np.float32)[list(permutations(range(3)))]  # (6, 3, 3) of colours
+_PLACES = 7  # tag of the random stream of photographed places
 _BASE = 40  # pixels of an untouched gel's side
 
 
@@ -54,6 +58,7 @@ class World(NamedTuple):
     relief: Any  # f16 (n, RELIEF, RELIEF) mm
     material: Any  # f32 (n, 2) modulus kPa, friction
     families: Family  # stacked over the sensors
+    places: Any  # f32 (n, P, 2) mm, places of each object of which there is a photograph
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,7 @@ class Sampling:
     """What to sample: clips of `frames` frames of `size` pixels, by `takes` sensors for each touch.
 
     `coarse` is the share of touches at which every sensor touches as by hand, `free` the share of takes without
-    contact, and `wild` the share of takes by a sensor that mixes two families, with other lights and markers.
+    contact, `vision` the share of touches at a place of which there is a photograph, and `wild` the share of takes by a sensor that mixes two families, with other lights and markers.
     `fields` are those of `recorder.simulate_clip`, at `field_size` pixels, of the last frame.
     """
 
@@ -70,6 +75,7 @@ class Sampling:
     size: int = 112
     coarse: float = 0.3
     free: float = 0.0
+    vision: float = 0.0
     wild: float = 0.0
     depth: tuple[float, float] = (0.15, 1.0)
     fidelity: Fidelity = "fast"
@@ -84,10 +90,13 @@ class SimulatedTouches(NamedTuple):
     background: Any  # u8 (B, M, S, S, 3)
     sensor: Any  # i32 (B, M), number of the family, or the number of families for a wild one
     object: Any  # i32 (B,)
+    photo: Any  # i32 (B,), number of the photographed place, or -1
     fields: Any  # f32 (B, M, h, w, channels) of the last frame, or None
     width: Any  # f32 (B, M) mm that the picture's width shows
+    aspect: Any  # f32 (B, M) logarithm of the height over the width that the picture shows
+    modulus: Any  # f32 (B, M) kPa of the family's gel
     labels: dict[str, Any]  # f32 (B, M, T) each, see `recorder.ClipOutput`
-    inputs: ClipInput  # what `simulate_clip` got, with leading axes (B, M)
+    inputs: tuple[ClipInput, Family, Any]  # clip, family and pitch mm that were simulated, with leading axes (B, M)
 
 
 def family(sensor: Sensor) -> Family:
@@ -120,27 +129,40 @@ def as_sensor(numbers: Family) -> Sensor:
     )  # fmt: skip
 
 
-def make_world(
-    scenes: Scenes, split: Literal["train", "val", "test"] = "train", *, sensors: Sequence[str] = CAMERAS,
-    variants: int = 1,
-) -> tuple[World, tuple[Object, ...]]:  # fmt: skip
-    """Return the world of the objects of a split of `scenes`, and these objects, by their number.
+def objects_of(
+    scenes: Scenes, split: Literal["train", "val", "test"] = "train", *, variants: int = 1
+) -> tuple[Object, ...]:
+    """Return the objects of a split of `scenes`, and `variants` - 1 more of each kind, with other sizes and phases.
 
-    `variants` objects of each kind are drawn: other sizes, pitches and phases of the same primitive, texture and
-    material. So kinds that are held out never occur. Raises UserError for a split without objects.
+    So kinds that are held out never occur in another split. Raises UserError for a split without objects.
     """
     things, splits = objects_and_splits(scenes)
     own = [thing for thing, name in zip(things, splits, strict=True) if name == split]
     if not own:
         raise UserError(f"no object of {len(things)} is in split {split}; draw more objects, or hold out more")
-    for number in range(1, variants):
-        own += [
-            draw_object(thing.shape.primitive, thing.shape.texture, thing.material.name, thing.seed ^ (number << 20))
-            for thing in own[: len(own) // number]
-        ]
-    relief = np.stack([shapes.relief(thing.shape, RELIEF, SPACING).astype(np.float16) for thing in own])
-    material = np.array([(thing.material.modulus, thing.material.friction) for thing in own], np.float32)
-    return World(relief, material, stack_trees([family(SENSORS[name]) for name in sensors])), tuple(own)
+    return (*own, *(
+        draw_object(thing.shape.primitive, thing.shape.texture, thing.material.name, thing.seed ^ (number << 20))
+        for number in range(1, variants) for thing in own
+    ))  # fmt: skip
+
+
+def make_world(things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, places: int = 1, seed: int = 0) -> World:
+    """Return the world of these objects and sensors, as numpy arrays. `places` of each object can be photographed."""
+    reliefs = over_cores(partial(shapes.relief, pixels=RELIEF, pitch=SPACING), [thing.shape for thing in things])
+    relief = np.stack([np.asarray(one, np.float16) for one in reliefs])
+    material = np.array([(thing.material.modulus, thing.material.friction) for thing in things], np.float32)
+    rng = np.random.default_rng([seed, _PLACES])
+    spots = np.stack([[draw_place(rng)[0] for _ in range(places)] for _ in things]).astype(np.float32)
+    return World(relief, material, stack_trees([family(SENSORS[name]) for name in sensors]), spots)
+
+
+def over_cores(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """Return `work` of every item, by processes on all cores where there are many items."""
+    cores = len(os.sched_getaffinity(0))
+    if len(items) < 100 or cores < 2:
+        return [work(item) for item in items]
+    with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
+        return list(pool.map(work, items, chunksize=16))
 
 
 def sample(key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None) -> SimulatedTouches:
@@ -149,18 +171,19 @@ def sample(key: Array, world: World, sampling: Sampling, count: int, gallery: Ar
     The second take is by the family `gallery`, if given. A key gives the same touches on one machine.
     """
     keys = jax.random.split(key, count)
-    sensor, thing, drawn, numbers = jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
-    simulate = jax.vmap(jax.vmap(partial(_simulate, sampling=sampling)))
-    out = simulate(drawn, numbers)
-    width = numbers.field[..., 1] * drawn.unit.zoom
+    sensor, thing, photo, inputs = jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
+    out = jax.vmap(jax.vmap(partial(simulate, sampling=sampling)))(*inputs)
+    field = inputs[1].field
     fields = None if out.field is None else out.field[:, :, -1]
-    return SimulatedTouches(out.image, out.background, sensor, thing, fields, width, out.labels, drawn)
+    return SimulatedTouches(
+        out.image, out.background, sensor, thing, photo, fields, field[..., 1] * inputs[0].unit.zoom,
+        jnp.log(field[..., 0] / field[..., 1]), inputs[1].gel[..., 0], out.labels, inputs,
+    )  # fmt: skip
 
 
-def _simulate(clip: ClipInput, numbers: Family, sampling: Sampling) -> Any:
-    """Return the simulated clip of one take."""
+def simulate(clip: ClipInput, numbers: Family, pitch: Array, sampling: Sampling) -> ClipOutput:
+    """Return the simulated clip of one take by a sensor of these numbers, on a grid of `pitch` mm."""
     side = (sampling.field_size, sampling.field_size)
-    pitch = jnp.max(numbers.field) / GRID
     view = View((GRID, GRID), pitch, (sampling.size, sampling.size), numbers.photometry, True, side)
     return simulate_clip(
         clip, sensor=as_sensor(numbers), fidelity=sampling.fidelity, fields=sampling.fields, view=view
@@ -169,17 +192,22 @@ def _simulate(clip: ClipInput, numbers: Family, sampling: Sampling) -> Any:
 
 def _draw(
     key: Array, world: World, sampling: Sampling, gallery: Array | None
-) -> tuple[Array, Array, ClipInput, Family]:
-    """Return the sensors (M,), the object, and the inputs and families of all takes of one touch."""
+) -> tuple[Array, Array, Array, tuple[ClipInput, Family, Array]]:
+    """Return the sensors (M,), the object, its photograph, and what is simulated for all takes of one touch."""
     rng = Draws(key)
     thing = rng.integers(len(world.relief))
     place, yaw = draw_place(rng)
+    photo = jnp.int32(-1)
+    if sampling.vision:
+        number = rng.integers(world.places.shape[1])
+        photo = jnp.where(rng.uniform() < sampling.vision, number, -1)
+        place = jnp.where(photo >= 0, world.places[thing, number], place)
     gesture = draw_gesture(sampling.depth, rng)
     by_hand = rng.uniform() < sampling.coarse
     steps = sampling.frames - 1
     relief = world.relief[thing].astype(jnp.float32)
 
-    def take(key: Array, number: Array) -> tuple[Array, ClipInput, Family]:
+    def take(key: Array, number: Array) -> tuple[Array, tuple[ClipInput, Family, Array]]:
         rng, families = Draws(key, 2048), len(world.families.gels)  # blotches are 1,600 values
         sensor = rng.integers(families)
         if gallery is not None:
@@ -190,7 +218,10 @@ def _draw(
             other = jax.tree.map(lambda x: x[rng.integers(families)], world.families)
             numbers = jax.tree.map(partial(jnp.where, is_wild), wild(numbers, other, rng), numbers)
             sensor = jnp.where(is_wild, families, sensor)
+        pitch = jnp.max(numbers.field) / GRID
+        numbers = numbers._replace(field=numbers.field * _cropped(rng))
         unit = draw_unit(as_sensor(numbers), rng, numbers.gels)
+        unit = unit._replace(mirror=unit.mirror * jnp.stack([jnp.float32(1), rng.choice([-1.0, 1.0])]))  # upside down
         hand = draw_by_hand(sampling.depth, rng, gesture, yaw)
         straight = (gesture, yaw, jnp.zeros(2), jnp.zeros(2))
         own, turn, offset, tilt = jax.tree.map(partial(jnp.where, by_hand), hand, straight)
@@ -204,12 +235,18 @@ def _draw(
             relief, place, jnp.stack([*offset, turn]), motion, depth, tilt, world.material[thing, 0],
             world.material[thing, 1], unit, draw_drift(sampling.frames, rng), rng.integers(2**23).astype(jnp.uint32),
         )  # fmt: skip
-        return sensor, clip, numbers
+        return sensor, (clip, numbers, pitch)
 
     number = jnp.arange(sampling.takes)
     keys = jax.vmap(lambda n: jax.random.fold_in(jax.random.fold_in(key, 0), n))(number)
-    sensor, clip, numbers = jax.vmap(take)(keys, number)
-    return sensor, thing, clip, numbers
+    sensor, inputs = jax.vmap(take)(keys, number)
+    return sensor, thing, photo, inputs
+
+
+def _cropped(rng: Draws) -> Array:
+    """Return the share (2,) of the field's height and width that is shown: a camera may cut one side."""
+    share = jnp.where(rng.uniform() < 0.5, rng.uniform(0.7, 1.0), 1.0)
+    return jnp.where(rng.uniform() < 0.5, jnp.stack([share, jnp.ones_like(share)]), jnp.stack([jnp.ones_like(share), share]))
 
 
 def wild(one: Family, other: Family, rng: Draws) -> Family:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
 from anytouch_jax.config import Config, to_json
@@ -73,13 +74,15 @@ def fit(
     log: Log | None = None,
     mesh: Mesh | None = None,
     curve: bool = False,
+    until: float | None = None,
 ) -> FitResult:
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
     `params` are the first parameters. When a run continues, only their shapes matter. `loss_fn` and `trained` are those
     of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
     `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
-    SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal, all stop a step
+    `until` ends the run at that time of `time.monotonic`: the schedule then follows the time that has passed since the
+    first step, in place of `run.steps`. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal, all stop a step
     later. Raises UserError for settings that changed since the start, too many skipped steps in a row, a full disk, an
     unreadable checkpoint, and a folder that some process cannot see.
     """
@@ -109,7 +112,7 @@ def fit(
         record = Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead)
         stack.enter_context(contextlib.closing(record))
         advance = stack.enter_context(progress(start, stop, log, curve=curve))
-        loop = _Loop(config, mesh, checkpoints, record, log, advance, on_report)
+        loop = _Loop(config, mesh, checkpoints, record, log, advance, on_report, until)
         interrupt = stack.enter_context(signals())
         return loop.run(state, start, stop, batches, loss_fn, trained, interrupt)
 
@@ -125,6 +128,8 @@ class _Loop:
     log: Log
     advance: Callable[[Mapping[str, Any]], None]
     on_report: Report | None
+    until: float | None = None
+    begun: float | None = None  # when the first step had ended, in a run for a time
     pending: tuple[int, dict[str, jax.Array], dict[str, Any]] | None = None
     row: dict[str, Any] = field(default_factory=dict)
     losses: list[float] = field(default_factory=list)  # since the last checkpoint: their mean decides which is the best
@@ -155,7 +160,7 @@ class _Loop:
         with contextlib.closing(self.awaited(batches, start, stop)) as feed:
             for step, batch, info in feed:
                 placed = put_batch(batch, sharding)
-                state, metrics = step_fn(state, placed, seed_key)
+                state, metrics = step_fn(state, placed, seed_key, *self.progress())
                 if self.ballot:
                     votes = self.ballot.cast(int(interrupt[0]) if interrupt else 0, int(info.get(_SKIPPED, 0)))
                     metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), votes, strict=True))
@@ -164,11 +169,16 @@ class _Loop:
                 samples = jax.tree.leaves(batch)[0].shape[0] * jax.process_count()
                 self.pending = (step, metrics, {"samples": samples} | dict(info))
                 done = step + 1
+                if self.until is not None and self.begun is None:  # compiled
+                    jax.block_until_ready(metrics)
+                    self.begun = time.monotonic()
                 if every > 0 and done % every == 0:
                     saved = self.save(done, state, done - saved)
                 if figures > 0 and done % figures == 0:
                     reported = self.report(done, state, placed)
                 if self.shared_signal if self.ballot else interrupt:
+                    break
+                if self.until is not None and time.monotonic() >= self.until:
                     break
         if saved < done:
             self.save(done, state, done - saved)
@@ -179,6 +189,14 @@ class _Loop:
         if signalled:
             self.log(f"stopped by {signalled.name} after step {done} and saved, the same command continues from here")
         return FitResult(state, done, self.row, self.traces, start, signalled)
+
+    def progress(self) -> tuple[np.float32, ...]:
+        """Return the share of the time that has passed, nothing in a run of a given number of steps."""
+        if self.until is None:
+            return ()
+        if self.begun is None:
+            return (np.float32(0),)
+        return (np.float32(min((time.monotonic() - self.begun) / max(self.until - self.begun, 1e-3), 1.0)),)
 
     def awaited(self, batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
         """Yield the batches of steps `start` to `stop`, check their order, and close their source in the end.

@@ -22,7 +22,7 @@ LossAndMetrics = tuple[Array, dict[str, Array]]
 LossFn = Callable[[Tree, Any, Array, Array], LossAndMetrics]
 # batch -> rules (regex over parameter names, trained?)
 TrainedFn = Callable[[Any], Sequence[tuple[str, bool]]]
-StepFn = Callable[["TrainState", Any, Array], tuple["TrainState", dict[str, Array]]]
+StepFn = Callable[..., tuple["TrainState", dict[str, Array]]]
 
 
 class TrainState(NamedTuple):
@@ -71,7 +71,8 @@ def make_step(
 ) -> StepFn:
     """Return `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
 
-    The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. Only trainable parameters are
+    The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. A run for a time passes the share
+    of its time as `progress`, which then decides the learning rate too. Only trainable parameters are
     differentiated. Those that a batch does not train by the rules of `trained` (`objectives.trained_by`) are skipped,
     as in PyTorch (golden H_mixed). If the loss or the gradient norm is not finite, the update is not applied, `step`
     advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm, param_norm (before the
@@ -83,9 +84,13 @@ def make_step(
     """
     tx = optax.with_extra_args_support(tx)
 
-    def step(state: TrainState, batch: Any, seed_key: Array) -> tuple[TrainState, dict[str, Array]]:
+    def step(
+        state: TrainState, batch: Any, seed_key: Array, progress: Array | None = None
+    ) -> tuple[TrainState, dict[str, Array]]:
         key = jax.random.fold_in(seed_key, state.step)
-        progress = state.step.astype(jnp.float32) / total_steps
+        at = state.step if progress is None else progress * total_steps
+        if progress is None:
+            progress = state.step.astype(jnp.float32) / total_steps
 
         def loss(trainable: Tree, frozen: Tree, part: Any, key: Array, progress: Array) -> LossAndMetrics:
             value, metrics = loss_fn(merge(trainable, frozen), part, key, progress)
@@ -100,7 +105,7 @@ def make_step(
             return value, metrics, grads
 
         value, metrics, grads = gradients(parts, key) if accumulate == 1 else _mean_over(gradients, parts, key)
-        updates, opt_state = tx.update(grads, state.opt_state, state.trainable, used=used, step=state.step)
+        updates, opt_state = tx.update(grads, state.opt_state, state.trainable, used=used, step=at)
         return _finish(state, value, metrics, grads, updates, opt_state)
 
     return step

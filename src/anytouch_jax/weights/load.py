@@ -208,7 +208,7 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     has_decoder = "decoder" in loaded.params
     if config.reconstructs and not has_decoder:
         notes.append(f"{path} has no decoder, so the decoder starts untrained")
-    if dropped := sorted((fresh_parts & set(loaded.params)) - {"touch", "decoder"}):
+    if dropped := sorted((fresh_parts & set(loaded.params)) - {*_STARTS}):
         notes.append(
             f"{path} gives the touch encoder{' and the decoder' * has_decoder}; {', '.join(dropped)} start untrained"
         )
@@ -228,12 +228,20 @@ def check_finite(path: str | Path, arrays: Mapping[str, Any]) -> None:
         )
 
 
+_STARTS = ("touch", "decoder", "fields")  # parts that a run takes from the weights it starts from
+
+
 def _fit(loaded: Loaded, config: Config) -> Params:
     """Return the touch encoder and decoder with this run's positions and sensor rows."""
-    parts: Params = {name: loaded.params[name] for name in ("touch", "decoder") if name in loaded.params}
+    parts: Params = {name: loaded.params[name] for name in _STARTS if name in loaded.params}
     rows = config.model.patches + 1
     if loaded.config.model.patches + 1 != rows:
-        parts = {n: p | {"position": resize_position(np.asarray(p["position"]), rows)} for n, p in parts.items()}
+        parts |= {
+            name: parts[name] | {"position": resize_position(np.asarray(parts[name]["position"]), rows)}
+            for name in ("touch", "decoder") if name in parts
+        }  # fmt: skip
+    if loaded.config.model.fields != config.model.fields:
+        parts.pop("fields", None)
     stored, wanted = loaded.config.model.sensors, config.model.sensors
     touch = map_sensors(parts["touch"], config.model, lambda table: match_sensors(table, stored, wanted))
     return parts | {"touch": touch}
@@ -258,7 +266,7 @@ def first_params(
         towers = to_params(clip, model)
         merged = _replace(merged, {part: towers[part] for part in ("image", "text", "logit_scale") if part in towers})
     if stage1 is not None:
-        merged = _replace(merged, {part: stage1[part] for part in ("touch", "decoder") if part in stage1})
+        merged = _replace(merged, {part: stage1[part] for part in _STARTS if part in stage1 and part in merged})
     return merged
 
 

@@ -221,7 +221,7 @@ def _usable_rows(manifest: Manifest, config: Config) -> tuple[_Usable, list[str]
             notes.append(f"left out {len(missing)} rows without background_path, which data.background needs")
             sensor, rows = sensor.copy(), np.setdiff1d(rows, missing)
             sensor[missing] = -1
-    weights, note = _weights(manifest, config, rows)
+    weights, note = epoch_weights(manifest, config, rows)
     notes += note
     if weights is not None:
         rows, sensor = rows[weights[rows] > 0], np.where(weights > 0, sensor, -1)
@@ -256,11 +256,13 @@ def _required(
     return allowed, [f"{count} of {len(rows)} rows have {words}; only they are drawn ({option})"]
 
 
-def _weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
+def epoch_weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
     """Return how often an epoch draws each row of the manifest, f64 (rows,), None if each comes once; and notes."""
     column, split = manifest.column("dataset"), config.data.split
     datasets = pc.unique(column.take(rows)).drop_null().to_pylist()
     wanted = config.data.weights
+    if wanted is not None:  # simulated touches are no rows
+        wanted = tuple(pair for pair in wanted if pair[0] != "simulated")
     if wanted is None:
         released = config.recipe == "release" and config.stage == 2  # its stage 1 draws every row once
         wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in datasets) if released else ()

@@ -31,7 +31,7 @@ from anytouch_jax.weights.registry import PARTS, write_encoder
 SETTINGS: dict[str, Any] = {
     "model.embed": 192, "model.fields": 32, "data.background": "either", "data.jitter": (0.0, 0.0, 0.0, 0.0),
     "data.affine": (10.0, 0.05, 0.15), "run.figure_every": 0, "run.save_every": 2000, "run.keep": 1,
-    "run.steps": 10_000, "optim.warmup": 400, "simulated.wild": 0.25, "simulated.variants": 3,
+    "run.steps": 10_000, "optim.warmup": 400, "optim.grad_clip": 10.0, "simulated.wild": 0.25, "simulated.variants": 3,
 }  # fmt: skip
 STAGES: dict[int, dict[str, Any]] = {
     1: {"optim.learning_rate": 1e-3, "objective.norm_pix_loss": True, "objective.field_weight": 0.1},

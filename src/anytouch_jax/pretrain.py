@@ -102,7 +102,7 @@ def pretrain(
             config, params=params, loss_fn=partial(loss, net=net, config=config), batches=loader.stream, run_dir=run,
             trained=partial(objectives.trained_by, config=config), stop_after=stop_after, metadata=metadata,
             on_report=partial(_draw_reconstructions, run=run, net=net, config=config), log=log, mesh=mesh,
-            curve=curve, until=until,
+            curve=curve, until=until, examples=getattr(loader, "examples", ()),
         )  # fmt: skip
 
 

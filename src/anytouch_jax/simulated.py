@@ -138,7 +138,8 @@ class SimulatedLoader:
         """Return the simulated touches that a step draws from, on the device."""
         config, frames = self.config, self.frames(step)
         number = step // config.simulated.reuse
-        if self._pool is None or self._pool[:2] != (number, frames):
+        pool = self._pool
+        if pool is None or pool[:2] != (number, frames):
             simulated = config.simulated
             sampling = Sampling(
                 frames=frames, takes=config.stage, size=config.model.image_size, coarse=simulated.coarse,
@@ -150,8 +151,14 @@ class SimulatedLoader:
             key = jax.random.fold_in(jax.random.fold_in(self._key, 1), number)
             gallery = jax.random.randint(jax.random.fold_in(key, frames), (), 0, len(simulated.sensors))
             touches = self._sample(key, self._world, sampling, self._count, gallery)
-            self._pool = (number, frames, touches)
-        return self._pool[2]
+            pool = self._pool = (number, frames, touches)
+        return pool[2]
+
+    @property
+    def examples(self) -> list[Callable[[], Batch]]:
+        """Functions that make a batch of stills and one of clips, if the run has both."""
+        first = {self.frames(step): step for step in range(20, -1, -1)}
+        return [partial(self.batch, step) for step in first.values()]
 
     def stream(self, start: int, stop: int) -> Iterator[tuple[int, Batch, Info]]:
         """Yield (step, batch on the device, info) for steps start .. stop - 1."""

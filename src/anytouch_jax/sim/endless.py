@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import permutations
-from multiprocessing import get_context
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -157,12 +156,9 @@ def make_world(things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, pl
 
 
 def over_cores(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Return `work` of every item, by processes on all cores where there are many items."""
-    cores = len(os.sched_getaffinity(0))
-    if len(items) < 100 or cores < 2:
-        return [work(item) for item in items]
-    with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
-        return list(pool.map(work, items, chunksize=16))
+    """Return `work` of every item, by threads: numpy and OpenCV leave the interpreter free for most of the time."""
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(work, items))
 
 
 def sample(key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None) -> SimulatedTouches:
@@ -228,8 +224,7 @@ def _draw(
         shown = own.shown * (steps / CLIP_OF if steps else rng.uniform(-0.5, 0.5) * 2)
         times = own.middle + (shown * jnp.linspace(-0.5, 0.5, steps + 1) if steps else shown[None] / 2)
         motion, depth = moved(own, times, 0.04, jnp)
-        if not steps:  # a still shows a touch
-            depth = jnp.where(depth < LEAST_DEPTH, own.depth, depth)
+        depth = jnp.where(jnp.max(depth) < LEAST_DEPTH, own.depth, depth)  # something is touched
         depth = jnp.where(rng.uniform() < sampling.free, -1.0, depth)
         clip = ClipInput(
             relief, place, jnp.stack([*offset, turn]), motion, depth, tilt, world.material[thing, 0],

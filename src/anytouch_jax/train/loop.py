@@ -7,7 +7,8 @@ import functools
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -75,6 +76,7 @@ def fit(
     mesh: Mesh | None = None,
     curve: bool = False,
     until: float | None = None,
+    examples: Sequence[Callable[[], Any]] = (),
 ) -> FitResult:
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
@@ -82,7 +84,8 @@ def fit(
     of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
     `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
     `until` ends the run at that time of `time.monotonic`: the schedule then follows the time that has passed since the
-    first step, in place of `run.steps`. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal, all stop a step
+    first step, in place of `run.steps`. `examples` make a batch of each structure, for which the step is compiled before
+    the first one, side by side. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal, all stop a step
     later. Raises UserError for settings that changed since the start, too many skipped steps in a row, a full disk, an
     unreadable checkpoint, and a folder that some process cannot see.
     """
@@ -114,7 +117,7 @@ def fit(
         advance = stack.enter_context(progress(start, stop, log, curve=curve))
         loop = _Loop(config, mesh, checkpoints, record, log, advance, on_report, until)
         interrupt = stack.enter_context(signals())
-        return loop.run(state, start, stop, batches, loss_fn, trained, interrupt)
+        return loop.run(state, start, stop, batches, loss_fn, trained, interrupt, examples)
 
 
 @dataclass
@@ -150,12 +153,14 @@ class _Loop:
         loss_fn: LossFn,
         trained: TrainedFn | None,
         interrupt: list[signal.Signals],
+        examples: Sequence[Callable[[], Any]] = (),
     ) -> FitResult:
         """Run steps `start` to `stop`, or until a signal arrives."""
         every, figures = self.config.run.save_every, self.config.run.figure_every
         step_fn, sharding = self.compile(state, loss_fn, trained), batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
+        step_fn = self.ahead(step_fn, [lambda one=one: (state, put_batch(one(), sharding), seed_key) for one in examples])
         done, saved, reported, placed = start, start, start, None
         with contextlib.closing(self.awaited(batches, start, stop)) as feed:
             for step, batch, info in feed:
@@ -189,6 +194,22 @@ class _Loop:
         if signalled:
             self.log(f"stopped by {signalled.name} after step {done} and saved, the same command continues from here")
         return FitResult(state, done, self.row, self.traces, start, signalled)
+
+    def ahead(self, step_fn: Any, examples: Sequence[Callable[[], tuple[Any, ...]]]) -> Callable[..., Any]:
+        """Return the step, compiled for the arguments of each example at the same time. Others compile when they come."""
+
+        def form(batch: Any) -> Any:
+            return jax.tree.structure(batch), tuple((x.shape, x.dtype) for x in jax.tree.leaves(batch))
+
+        def build(example: Callable[[], tuple[Any, ...]]) -> tuple[Any, Any]:
+            arguments = example()
+            return form(arguments[1]), step_fn.lower(*arguments, *self.progress()).compile()
+
+        if len(examples) < 2:
+            return step_fn
+        with ThreadPoolExecutor(len(examples)) as pool:
+            programs = dict(pool.map(build, examples))
+        return lambda state, batch, *rest: programs.get(form(batch), step_fn)(state, batch, *rest)
 
     def progress(self) -> tuple[np.float32, ...]:
         """Return the share of the time that has passed, nothing in a run of a given number of steps."""

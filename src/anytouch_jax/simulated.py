@@ -39,7 +39,7 @@ FREE = (0.06, 0.02)  # share of the touches of stage 1 and 2 that show an untouc
 TRIES = 8  # draws in which a partner by another unit is looked for
 MOST_PIXELS = 4_000_000_000  # bytes of real frames that are kept on the device
 FIELD_SHARE = 0.5  # of a batch's touches: those whose fields are learned
-_FIELDS = ("displacement", "shear", "pressure")
+FIELDS = ("displacement", "shear", "pressure")
 Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 
@@ -145,7 +145,7 @@ class SimulatedLoader:
                 frames=frames, takes=config.stage, size=config.model.image_size, coarse=simulated.coarse,
                 free=FREE[config.stage - 1] if config.model.fields else 0.0,
                 vision=simulated.vision if self._photos is not None else 0.0, wild=simulated.wild,
-                depth=simulated.depth, fields=_FIELDS if config.model.fields else (),
+                depth=simulated.depth, fields=FIELDS if config.model.fields else (),
                 field_size=config.model.image_size // 2,
             )  # fmt: skip
             key = jax.random.fold_in(jax.random.fold_in(self._key, 1), number)
@@ -301,7 +301,9 @@ def _assemble(
         _Touches(_prepared(keys[m], touches.clip[:, m], touches.background[:, m], config), sensor[:, m])
         for m in range(touches.clip.shape[1])
     ]
-    fields = _field_batch(keys[2], touches, sensor, config) if touches.fields is not None else None
+    fields = None
+    if touches.fields is not None:
+        fields = field_batch(keys[2], touches, sensor, config, max(1, int(count * FIELD_SHARE)))
     kind = STILL if touches.clip.shape[2] == 1 else CLIP
     if config.stage == 1:
         one = takes[0]
@@ -424,9 +426,8 @@ def _prepared(key: Array, clip: Array, background: Array, config: Config, *, jit
 SUBTRACTED = 0.7  # share of touches whose background is subtracted with --data.background either
 
 
-def _field_batch(key: Array, touches: SimulatedTouches, sensor: Array, config: Config) -> FieldBatch:
-    """Return the touches of the last take with their fields, free of scale."""
-    count = max(1, int(len(touches.object) * FIELD_SHARE))
+def field_batch(key: Array, touches: SimulatedTouches, sensor: Array, config: Config, count: int) -> FieldBatch:
+    """Return the first `count` touches of the last take with their fields, free of scale. `sensor` (B, M) are rows."""
     clip = touches.clip[:count, -1, -config.model.frames :]
     width, labels = touches.width[:count, -1], {name: x[:count, -1, -1] for name, x in touches.labels.items()}
     fields = touches.fields[:count, -1]

@@ -1,0 +1,247 @@
+"""Training and errors of the decoder that reads depth, shear, contact and force from a frozen encoder.
+
+    python -m experiments.encoders.measure train anytouch-tiny --minutes 60 --out runs/fields
+    python -m experiments.encoders.measure test runs/fields/anytouch-tiny
+
+Touches are simulated in the training program and never repeat. `train` continues from OUT, calibrates the deviations
+on objects of the validation split, and writes the encoder with its decoder. `test` measures errors on objects of the
+test split, by sensor, and writes `measure.jsonl`. Both see new units of the sensors only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from anytouch_jax.batch import FieldBatch
+from anytouch_jax.config import Config, SimulatedConfig, preset
+from anytouch_jax.nn.fields import FORCE, LENGTH, TORQUE
+from anytouch_jax.nn.functional import build
+from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
+from anytouch_jax.sim import endless, scene
+from anytouch_jax.simulated import FIELDS, field_batch
+from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.progress import to_stderr as log
+from anytouch_jax.weights.load import load_model
+from anytouch_jax.weights.registry import PARTS, locate, write_encoder
+from anytouch_jax.weights.safetensors import read_safetensors, write_safetensors
+from anytouch_jax.weights.tree import flatten, nest
+from experiments.benchmarks import machine
+from experiments.records import write_record
+
+CHANNELS = 32
+BATCH = {"cpu": 32, "gpu": 512}
+RATE, WARMUP = 2e-3, 0.03
+UNIVERSAL = 0.25  # share of the touches that get the universal tokens
+QUANTITIES = ("depth", "shear", "normal", "tangential", "torque", "slip")
+
+
+def sampling(frames: int, *, wild: float, free: float) -> endless.Sampling:
+    """Return what is simulated for a batch of stills or clips."""
+    return endless.Sampling(frames=frames, wild=wild, free=free, fields=FIELDS)
+
+
+def world_of(split: Any, variants: int = 1) -> endless.World:
+    """Return the world of the objects of a split, with those kinds held out that training of the encoder held out."""
+    settings = SimulatedConfig()
+    scenes = scene.Scenes(objects=settings.objects, seed=settings.seed, depth=settings.depth)
+    return jax.device_put(endless.make_world(endless.objects_of(scenes, split, variants=variants), settings.sensors))
+
+
+def batches(world: endless.World, config: Config, count: int, seed: int, **options: float) -> Iterator[FieldBatch]:
+    """Yield batches of stills and of clips in turn, with normalised pixels and sensor rows."""
+    rows = np.array([config.model.sensor_row(name) for name in SimulatedConfig().sensors] + [config.model.universal_row])
+
+    @partial(jax.jit, static_argnums=(2,))
+    def make(key: jax.Array, world: endless.World, frames: int) -> FieldBatch:
+        draw, prepare, toss = jax.random.split(key, 3)
+        touches = endless.sample(draw, world, sampling(frames, **options), count)
+        batch = field_batch(prepare, touches, jnp.asarray(rows)[touches.sensor], config, count)
+        own = jax.random.uniform(toss, (count,)) >= UNIVERSAL
+        sensor = jnp.where(own, batch.sensor, config.model.universal_row)
+        return batch._replace(clip=normalise_touch(batch.clip), sensor=sensor)
+
+    number = 0
+    while True:
+        yield make(jax.random.fold_in(jax.random.key(seed), number), world, (1, config.model.frames)[number % 2])
+        number += 1
+
+
+def train(model: str, minutes: float, out: Path) -> None:
+    """Train the decoder for a time, and write the encoder with it."""
+    end = time.monotonic() + 60 * minutes
+    loaded = load_model(locate(model))
+    config = loaded.config.with_settings({"model.fields": CHANNELS, "model.text": None, "model.image": None})
+    net, weights = build(config.model), out / "fields.safetensors"
+    fields = net.init(jax.random.key(0))["fields"]
+    seed = 1
+    if weights.exists():
+        arrays, about = read_safetensors(weights)
+        fields, seed = nest(arrays), int(about["seed"]) + 1
+    touch = jax.device_put(loaded.params["touch"])
+    tx = optax.chain(optax.clip_by_global_norm(5.0), optax.scale_by_adam(b2=0.99))
+    state = tx.init(fields)
+
+    @jax.jit
+    def step(fields: Any, state: Any, batch: FieldBatch, rate: jax.Array) -> tuple[Any, Any, dict[str, jax.Array]]:
+        def loss(fields: Any) -> Any:
+            return field_terms({"touch": touch, "fields": fields}, batch, net=net)
+
+        (_, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(fields)
+        updates, state = tx.update(gradient, state)
+        return jax.tree.map(lambda p, u: p - rate * u, fields, updates), state, metrics
+
+    begun, number, saved = None, 0, time.monotonic()
+    count = BATCH["cpu" if jax.default_backend() == "cpu" else "gpu"]
+    sums: dict[str, float] = {}
+    for batch in batches(world_of("train", 2), config, count, seed, wild=0.2, free=0.06):
+        share = 0.0 if begun is None else min((time.monotonic() - begun) / max(end - begun, 1e-3), 1.0)
+        rate = RATE * min(share / WARMUP, 1.0) * (0.5 + 0.5 * np.cos(np.pi * share))
+        fields, state, metrics = step(fields, state, batch, jnp.float32(rate))
+        number += 1
+        if number == 2:
+            jax.block_until_ready(metrics)
+            begun = time.monotonic()
+        for name, value in metrics.items():
+            sums[name] = 0.98 * sums.get(name, float(value)) + 0.02 * float(value)
+        if number % 50 == 0:
+            log(f"{number * count} touches, " + ", ".join(f"{name} {value:.3f}" for name, value in sums.items()))
+        if time.monotonic() - saved > 120 or time.monotonic() >= end:
+            write_safetensors(weights, flatten(jax.device_get(fields)), {"seed": str(seed)})
+            saved = time.monotonic()
+        if time.monotonic() >= end:
+            break
+    finish(loaded, config, out, Path(model).name)
+
+
+def finish(loaded: Any, config: Config, out: Path, name: str) -> None:
+    """Calibrate the deviations, and write the folder of the encoder with its decoder."""
+    arrays, _ = read_safetensors(out / "fields.safetensors")
+    params = {"touch": loaded.params["touch"], "fields": nest(arrays)}
+    errors = collect(params, config, "val", 24)
+    factors = {
+        name: float(np.quantile(np.abs(values["error"]) / values["deviation"], 0.68)) for name, values in errors.items()
+    }
+    log(f"deviations are multiplied by {factors}")
+    whole = dataclasses.replace(loaded.config, model=dataclasses.replace(loaded.config.model, fields=CHANNELS))
+    metadata = {**loaded.metadata, "fields": factors}
+    full = dataclasses.replace(loaded, config=whole, params={**loaded.params, **params}, metadata=metadata)
+    tokenizer = loaded.path.parent / "tokenizer.json"
+    notes = (loaded.path.parent / "README.md").read_text(encoding="utf-8").partition("## Data")[2]
+    write_encoder(out / name, full, "## Data" + notes, parts=(*PARTS, "fields"), tokenizer=tokenizer)
+
+
+def collect(params: Any, config: Config, split: str, count: int, size: int = 32) -> dict[str, dict[str, np.ndarray]]:
+    """Return errors and predicted deviations of every quantity, in units of the outputs, over new touches of a split."""
+    net = build(config.model)
+    measure = jax.jit(net.measure)
+    errors: dict[str, dict[str, list[np.ndarray]]] = {name: {"error": [], "deviation": []} for name in QUANTITIES}
+    source = batches(world_of(split), config, size, 7, wild=0.0, free=0.0)
+    for _ in range(count):
+        batch = next(source)
+        out = jax.device_get(measure(params, batch.clip, batch.sensor, batch.aspect))
+        batch = jax.device_get(batch)
+        touched = batch.pressure > TOUCHED
+        normal = np.log((out.force[:, 2] + LEAST_FORCE) / (batch.force[:, 2] + LEAST_FORCE))
+        slip = 1 / (1 + np.exp(-out.slip)) - batch.slip
+        pairs = {
+            "depth": ((out.depth - batch.depth)[touched] / LENGTH, out.depth_log[touched]),
+            "shear": ((out.shear - batch.shear)[touched] / LENGTH, out.shear_log[touched][:, None].repeat(2, 1)),
+            "normal": (normal, out.force_log[:, 1]),
+            "tangential": ((out.force - batch.force)[:, :2] / FORCE, out.force_log[:, :1].repeat(2, 1)),
+            "torque": ((out.torque - batch.torque) / TORQUE, out.torque_log), "slip": (slip, out.slip_log),
+        }  # fmt: skip
+        for name, (error, log_scale) in pairs.items():
+            errors[name]["error"].append(error.ravel())
+            errors[name]["deviation"].append(np.sqrt(2) * np.exp(5 * np.tanh(log_scale / 5)).ravel())
+    return {name: {part: np.concatenate(rows) for part, rows in both.items()} for name, both in errors.items()}
+
+
+def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], touches: int = 192) -> dict[str, float]:
+    """Return the errors of one sensor on new units and objects of the test split, stills and clips together."""
+    settings = SimulatedConfig()
+    scenes = scene.Scenes(objects=settings.objects, seed=settings.seed, depth=settings.depth)
+    world = jax.device_put(endless.make_world(endless.objects_of(scenes, "test"), (sensor,)))
+    row, size, measure = config.model.sensor_row(sensor), 32, jax.jit(build(config.model).measure)
+    rows: dict[str, list[np.ndarray]] = {}
+    for number in range(touches // size):
+        frames = (1, config.model.frames)[number % 2]
+        key = jax.random.fold_in(jax.random.key(11), number)
+        touch = jax.jit(endless.sample, static_argnums=(2, 3))(key, world, sampling(frames, wild=0, free=0), size)
+        batch = field_batch(key, touch, jnp.full((size, 1), row), config, size)
+        out = jax.device_get(measure(params, normalise_touch(batch.clip), batch.sensor, batch.aspect))
+        batch, width, stiff = jax.device_get((batch, touch.width[:, -1], touch.modulus[:, -1]))
+        touched, pixels = batch.pressure > TOUCHED, (slice(None), None, None)
+        depth, true = out.depth * width[pixels], batch.depth * width[pixels]
+        seen = out.contact > 0
+        enough = touched.sum((1, 2)) >= 8
+        share = (np.abs(depth - true) * touched).sum((1, 2)) / np.maximum(touched.sum((1, 2)), 1)
+        either = (seen | touched).sum((1, 2))
+        moved = touched & (np.linalg.norm(batch.shear, axis=-1) * width[pixels] > 0.1)
+        angle = np.degrees(np.abs(_angle(out.shear, batch.shear)))
+        scale = stiff * width**2 * 1e-3
+        force, real = out.force[:, 2] * scale, batch.force[:, 2] * scale
+        deviation = np.sqrt(2) * np.exp(5 * np.tanh(out.depth_log / 5)) * LENGTH * factors["depth"]
+        inside = np.abs(out.depth - batch.depth)[touched] < deviation[touched]
+        values = {
+            "depth": share[enough], "relative": (share / np.maximum(true.max((1, 2)), 1e-3))[enough],
+            "iou": ((seen & touched).sum((1, 2)) / np.maximum(either, 1))[enough], "inside": inside,
+            "force": (np.abs(force - real) / np.maximum(real, 0.05))[enough],
+        }  # fmt: skip
+        if frames > 1:
+            values["shear"] = angle[moved] < 20
+        for name, value in values.items():
+            rows.setdefault(name, []).append(np.asarray(value, np.float64).ravel())
+    joined = {name: np.concatenate(parts) for name, parts in rows.items()}
+    medians = ("force",)
+    return {name: float(np.median(v) if name in medians else v.mean()) for name, v in joined.items()}
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return np.arctan2(cross, (a * b).sum(-1))
+
+
+def test(model: Path, out: Path) -> None:
+    """Write the errors of an encoder that measures, sensor by sensor."""
+    loaded = load_model(locate(str(model)))
+    config = loaded.config
+    params = {"touch": loaded.params["touch"], "fields": loaded.params["fields"]}
+    factors = loaded.metadata.get("fields", dict.fromkeys(QUANTITIES, 1.0))
+    for sensor in SimulatedConfig().sensors:
+        record = {"machine": dataclasses.asdict(machine.describe())} | scores(params, config, sensor, factors)
+        write_record(out, sensor, record)
+        print(sensor, {name: round(value, 3) for name, value in record.items() if isinstance(value, float)}, flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    first = commands.add_parser("train", help="train the decoder of an encoder")
+    first.add_argument("model")
+    first.add_argument("--minutes", type=float, default=60.0)
+    first.add_argument("--out", type=Path, default=Path("runs/fields"))
+    second = commands.add_parser("test", help="measure errors on objects that training never touched")
+    second.add_argument("model", type=Path)
+    second.add_argument("--out", type=Path, default=Path("experiments/results/measure.jsonl"))
+    given = parser.parse_args()
+    enable_compilation_cache()
+    if given.command == "train":
+        given.out.mkdir(parents=True, exist_ok=True)
+        train(given.model, given.minutes, given.out)
+    else:
+        test(given.model, given.out)
+
+
+if __name__ == "__main__":
+    main()

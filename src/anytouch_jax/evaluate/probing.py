@@ -15,12 +15,14 @@ import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from anytouch_jax.bars import tracked
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder import novelty
@@ -326,19 +328,22 @@ def probe_label(
     """
     if save is not None and len(models) != 1:
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
-    table = manifests.read([str(path) for path in data])
+    table, opened = manifests.read([str(path) for path in data]), feature_cache.opened(models)
+    gels = UnitGels(table)
     rows, subsets = label_rows(
-        table, label, group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames
-    )
+        table, label, group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames,
+        among=partial(feature_cache.with_gel, gels=gels, models=opened),
+    )  # fmt: skip
     log(f"{len(rows.rows)} of {len(table)} rows take part")
+    log(gels.report(rows.rows[:, 0]))
     for note in rows.notes:
         log(note)
     if leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")
     splits.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
-    results, encoding = list[ProbeResult](), dict[str, Any](least=frames, pooling=pooling, join=join)
-    for source in feature_cache.sources(table, models, features, controls, cache, {frames: rows.rows}, **encoding):
+    results, encoding = list[ProbeResult](), dict[str, Any](least=frames, pooling=pooling, join=join, gels=gels)
+    for source in feature_cache.sources(table, opened, features, controls, cache, {frames: rows.rows}, **encoding):
         pixels = source.name == RAW
         x = feature_cache.pixel_components(source.store, rows) if pixels else source.store.get(rows.rows, frames)
         results += probe_rows(x, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds,
@@ -348,6 +353,8 @@ def probe_label(
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
             assert tested.fitted is not None
             head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
+            if source.encoder.subtracts:
+                head = replace(head, gels=gels.pictures(rows.rows[:, 0]))
             head = _calibrated(
                 head, x, rows, results[0].penalty or 1.0, log, coverage=coverage, false_alarms=false_alarms
             )
@@ -378,10 +385,14 @@ def _calibrated(head: LinearHead, x: Array, rows: TaskRows, penalty: float, log:
 def label_rows(
     table: Manifest, label: str, *, group: str = "", leave_out: str | None = None,
     where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
+    among: Callable[[TaskRows], TaskRows] = lambda rows: rows,
 ) -> tuple[TaskRows, dict[str, Array]]:  # fmt: skip
-    """Return the rows of `probe_label`, and masks of those whose class (held-out object) alignment may have named."""
+    """Return the rows of `probe_label`, and masks of those whose class (held-out object) alignment may have named.
+
+    `among` chooses some of the rows.
+    """
     task = tasks.label_task(table, label, group=leave_out or group, where=where, sensor=sensor)
-    rows = tasks.select(table, task, frames)
+    rows = among(tasks.select(table, task, frames))
     column, name = (task.label, "classes") if leave_out is None else (task.groups[0], f"{leave_out}s")
     return rows, tasks.described_subsets(table, column, rows.rows[:, 0], name)
 
@@ -438,13 +449,17 @@ def probe_tasks(
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
     table = data if isinstance(data, Manifest) else manifests.read([str(path) for path in data])
-    plans, left_out = _plan_tasks(table, tasks, frames, sides, max_rows, log)
+    opened, gels = feature_cache.opened(models), UnitGels(table)
+    among = partial(feature_cache.with_gel, gels=gels, models=opened)
+    plans, left_out = _plan_tasks(table, tasks, frames, sides, max_rows, log, among)
     if order != "right" and (features or all(plan.frames == 1 for plan in plans)):
         raise UserError("--order has no effect on stills or on --features. Leave it out, or give --frames.")
     lengths = sorted({plan.frames for plan in plans})  # one pass computes the features of all tasks
     rows = {n: np.concatenate([plan.rows.rows.ravel() for plan in plans if plan.frames == n]) for n in lengths}
+    log(gels.report(np.unique(np.concatenate(list(rows.values())))))
     encoding: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
-    sources = feature_cache.sources(table, models, features, controls, cache, rows, least=frames or 1, **encoding)
+    encoding["gels"] = gels
+    sources = feature_cache.sources(table, opened, features, controls, cache, rows, least=frames or 1, **encoding)
     if join != "mean" and any(s.encoder and (frames or 1) <= s.encoder.config.model.frames for s in sources):
         raise UserError("--join has no effect without --frames longer than a clip of the model.")
     protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else (protocol,)
@@ -489,7 +504,7 @@ def probe_benchmark(models: Models, data: Paths | Manifest, benchmark: str, **op
 
 def _plan_tasks(
     table: Manifest, names: Sequence[str | Task], frames: int | None, sides: dict[str, Names], max_rows: int | None,
-    log: Log,
+    log: Log, among: Callable[[TaskRows], TaskRows],
 ) -> tuple[list[_Plan], dict[str, str]]:  # fmt: skip
     """Return the plans of the tasks that can be probed, and why the others cannot. Raises UserError if none can."""
     plans, left_out = list[_Plan](), dict[str, str]()
@@ -501,7 +516,7 @@ def _plan_tasks(
     errors = []
     for task in map(tasks.find_task, names):
         try:
-            plans.append(_plan(table, task, frames, sides, max_rows))
+            plans.append(_plan(table, task, frames, sides, max_rows, among))
         except UserError as error:
             left_out[task.name] = str(error).removeprefix(f"Task {task.name}: ")
             errors.append(f"Task {task.name}: {left_out[task.name]}")
@@ -512,14 +527,17 @@ def _plan_tasks(
     return plans, left_out
 
 
-def _plan(table: Manifest, task: Task, frames: int | None, sides: dict[str, Names], max_rows: int | None) -> _Plan:
+def _plan(
+    table: Manifest, task: Task, frames: int | None, sides: dict[str, Names], max_rows: int | None,
+    among: Callable[[TaskRows], TaskRows],
+) -> _Plan:  # fmt: skip
     """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them. Raises UserError."""
     for name, count in (("max_rows", max_rows), ("frames", frames)):
         if count is not None and count < 1:
             raise UserError(f"{name} must be at least 1, not {count}.")
     if unknown := sides.keys() - set(SIDES):
         raise TypeError(f"Unknown options {', '.join(sorted(unknown))}.")
-    rows = tasks.select(table, task, frames)
+    rows = among(tasks.select(table, task, frames))
     roles, _ = splits.assign_roles(task, rows, sides)
     used = np.flatnonzero(splits.split_scheme(roles)[1] & (roles.may_fit | roles.may_test))
     rows = rows.take(splits.subsample(used, max_rows or len(used)))

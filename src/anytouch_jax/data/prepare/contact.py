@@ -17,9 +17,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -41,6 +42,9 @@ from anytouch_jax.data.prepare.untouched_gel import (
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
+
+if TYPE_CHECKING:
+    from anytouch_jax.data.gels import UnitGels
 
 _MAX_FRAMES, _MAX_RECORDINGS = 48, 48  # of a recording, and of a unit, from which the untouched gel is estimated
 _MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
@@ -151,11 +155,12 @@ class ContactQuality:
 
 def contact_scores(
     manifest: Manifest, rows: np.ndarray | None = None, *, backgrounds: Mapping[str, UntouchedGel] | None = None,
-    workers: int = 2,
+    gels: UnitGels | None = None, workers: int = 2,
 ) -> ContactScores:  # fmt: skip
     """Return the score of every row, or of `rows` only. Frames are read by `workers` threads.
 
-    `backgrounds` are pictures from `read_backgrounds` for rows without one. A frame or background that cannot be read,
+    `backgrounds` are pictures from `read_backgrounds` for rows without one. With `gels`, the pictures of the rule in
+    `data.gels` serve all rows. A frame or background that cannot be read,
     or an untouched gel that cannot be decided, gives the score NaN and a reason. It raises nothing.
     """
     if workers < 1:
@@ -165,7 +170,7 @@ def contact_scores(
     reasons = np.full(len(manifest), "not asked for", dtype=object)
     has_background = manifest.present("background_path")[rows]
     recordings = decided = 0
-    gels: list[tuple[np.ndarray, UntouchedGel]] = []
+    found: list[tuple[np.ndarray, UntouchedGel]] = []
     faults: dict[int, str] = {}
     with ThreadPoolExecutor(workers) as pool:
         pictures = partial(_pictures, manifest, pool, faults)
@@ -175,13 +180,26 @@ def contact_scores(
                 for row, value, reason in pool.map(score_row, some[start : start + 1024].tolist()):
                     score[row], reasons[row] = value, reason
 
-        cached = lru_cache(256)(lambda path: UntouchedGel(decode(path)))
-        score_given = partial(_score_row, manifest, faults, lambda row: cached(manifest.file(row, "background_path")))
-        assign(partial(score_given, "given"), rows[has_background])
-        for group in _groups(manifest, rows[~has_background]):
+        kept: dict[Any, UntouchedGel] = {}  # many rows share one
+
+        def gel_of_row(row: int) -> UntouchedGel:
+            key = manifest.file(row, "background_path") if gels is None else gels.key(row)
+            if key not in kept:
+                picture = None if gels is None else gels(row)
+                gel = UntouchedGel(decode(manifest.file(row, "background_path")) if picture is None else picture)
+                if len(kept) >= 256:
+                    kept.clear()
+                return kept.setdefault(key, gel)
+            return kept[key]
+
+        if gels is not None:
+            has_background = gels.has(rows)
+            reasons[rows[~has_background]] = "none: no picture of the untouched gel"
+        assign(partial(_score_row, manifest, faults, gel_of_row, "given"), rows[has_background])
+        for group in _groups(manifest, rows[~has_background]) if gels is None else ():
             gel, source = _gel_of_group(manifest, group, pictures, backgrounds or {})
             if gel is not None:
-                gels.append((group, gel))
+                found.append((group, gel))
                 assign(partial(_score_row, manifest, faults, gel, source), group)
                 continue
             for recording, gel, source in _estimates(manifest, group, pictures):
@@ -190,10 +208,10 @@ def contact_scores(
                 if gel is None:
                     reasons[recording] = f"none: {source}"
                 else:
-                    gels.append((recording, gel))
+                    found.append((recording, gel))
                     assign(partial(_score_row, manifest, faults, gel, source), recording)
     sentences = tuple(f"{manifest.where(row)}: {faults[row]}" for row in sorted(faults)[: EXAMPLES + 1])
-    return ContactScores(score, reasons, recordings, decided, tuple(gels), sentences)
+    return ContactScores(score, reasons, recordings, decided, tuple(found), sentences)
 
 
 def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -> Manifest:

@@ -103,14 +103,19 @@ def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel
 
     `pictures` u8 (h, w, 3) are frames from `scale_picture`, all of one size.
     """
+    group, reason = free_frames(pictures)
+    return (None, reason) if group is None else (UntouchedGel(_median([pictures[i] for i in group])), "estimated")
+
+
+def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]:
+    """Return the numbers of the frames that show the untouched gel, or None, and the reason; `pictures` as above."""
     reason = ""
     for marked in (False, True):
         frames = [close_dots(picture) for picture in pictures] if marked else list(pictures)
         group, reason = _least_structured_group(frames)
         if group is not None:
-            gel = UntouchedGel(_median([pictures[frame] for frame in group]))
-            if gel.has_dots == marked:
-                return gel, "estimated"
+            if has_dots(_median([pictures[i] for i in group])) == marked:
+                return group, ""
             reason = "free and pressed gel look alike"
     return None, reason
 

@@ -26,6 +26,7 @@ def serve(embedded: Iterable[Any], path: str) -> None:
                 clients[-1].setblocking(False)
             contact = None if frame.contact != frame.contact else bool(frame.contact)  # NaN is unknown
             line = {"frame": frame.number, "time": frame.time, "contact": contact, "features": frame.values.tolist()}
+            line |= {"background": "estimated"} if frame.estimated else {}
             for client in list(clients):
                 try:
                     client.sendall(json.dumps(line).encode() + b"\n")
@@ -46,5 +47,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(given.camera)
     background, row = given.background and decode(given.background), encoder.sensor_row(given.sensor)
-    preprocess, gate = at.Preprocess(encoder, background), ContactGate(background, given.sensor)
+    preprocess = at.Preprocess(encoder, background)  # without a picture it estimates one from the frames
+    gate = ContactGate(preprocess, given.sensor)
     serve(stream(encoder, source, preprocess, live=live, sensor=row, contact=gate), given.address)

@@ -1,11 +1,12 @@
 """The picture of the untouched gel: one rule for manifests, folders, films, pictures and live sources.
 
-In this order: the picture that the user names; the picture of the same unit that a head or an index was fitted with;
-the median of many recordings of the unit; its stored picture; the median of fewer frames. A live source has a running
-estimate. A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one unit.
+In this order: the picture that the user names; the picture of the same unit that a head or an index was fitted with; a
+stored picture (`background_path`, rows of split `background`, background.png of a folder); the median of the unit's
+frames. A live source has a running estimate. A unit is the column `unit` of one dataset and sensor, or else the sensor.
+A folder or a film is one unit.
 
-The median is over frames of split train, if the unit has any. Pressed or not, they may all take part: presses are at
-changing places. `experiments/results/backgrounds.md` compares the forms.
+The median is over frames of split train, if the unit has any. Pressed or not, they may all take part, as presses are at
+changing places. `experiments/results/backgrounds.md` compares it with stored pictures.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import threading
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,9 +32,8 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import check_array
 
 Array = npt.NDArray[Any]
-FRAMES = 100  # frames of a median: 30 to all of them score alike
+FRAMES = 100  # frames of a median: 10 of them to all of them score alike
 FEWEST = 5  # frames of a median: fewer show the press itself
-MANY = 10  # recordings from which the median is better than a stored picture, whose light has drifted since
 SIDE = 320  # pixels of the long side of a median
 SETTLED = 300  # frames after which a running estimate stays
 TINT = 8.0  # grey levels: frames of one unit differ by less in most places, units of one product by more
@@ -172,11 +173,12 @@ def other_unit(why: str) -> str:
 
 
 class _Unit(NamedTuple):
-    """The picture of a unit, None for that of each row or for none, and what it is, from how many frames."""
+    """The picture of a unit, None if there is none, what it is, from how many frames, and whether a head has it."""
 
-    picture: Array | None
-    source: str
+    picture: Array | None = None
+    source: str = "none"
     frames: int = 0
+    fitted: bool = False
 
 
 class UnitGels:
@@ -199,111 +201,100 @@ class UnitGels:
 
     def __call__(self, row: int) -> Array | None:
         """Return the picture RGB u8 (h, w, 3) of a row's unit; None if that of the row counts, or there is none."""
-        return self._of(int(self._unit[row])).picture
-
-    def key(self, row: int) -> tuple[int, Path | None] | None:
-        """Return what rows of one picture share, None for a row without one."""
-        unit = int(self._unit[row])
-        if self._of(unit).picture is not None:
-            return unit, None
-        return (unit, self._manifest.file(row, "background_path")) if self._stored[row] else None
+        return self._of(row).picture
 
     def read(self, row: int) -> Array | None:
         """Return the untouched gel of a row, its own picture where that counts. Raises UserError if it is broken."""
         picture = self(row)
         return decode(self._manifest.file(row, "background_path")) if picture is None and self._stored[row] else picture
 
+    def key(self, row: int) -> tuple[int, Path | None] | None:
+        """Return what the rows of one picture share, None for a row without one."""
+        unit = int(self._unit[row])
+        if self(row) is not None:
+            return unit, None
+        return (unit, self._manifest.file(row, "background_path")) if self._stored[row] else None
+
     def has(self, rows: Array) -> Array:
         """Return which rows have one, bool (rows,)."""
-        known = {unit: self._of(unit).picture is not None for unit in np.unique(self._unit[rows]).tolist()}
-        return self._stored[rows] | np.array([known[unit] for unit in self._unit[rows].tolist()], bool)
+        return np.array([self._stored[row] or self(row) is not None for row in rows.tolist()], bool)
 
     def report(self, rows: Array) -> str:
         """Return a line on what is used for rows."""
-        count, frames, units = Counter[str](), Counter[str](), Counter[str]()
-        own = np.unique(self._unit[rows], return_counts=True)
-        for unit, size in zip(*(part.tolist() for part in own), strict=True):
-            one = self._of(unit)
-            stored = 0 if one.picture is not None else int(self._stored[rows[self._unit[rows] == unit]].sum())
-            for source, some in ((one.source, size - stored), ("a stored picture", stored)):
-                count[source] += some
-                if some and source == one.source:
-                    frames[source], units[source] = frames[source] + one.frames, units[source] + 1
+        count, units = Counter[str](), dict[str, dict[int, int]]()
+        for row in rows.tolist():
+            one = self._of(row)
+            count[one.source] += 1
+            units.setdefault(one.source, {})[int(self._unit[row])] = one.frames
         parts = []
         for source, some in count.items():
-            of = f" of {frames[source]:,} frames of {units[source]} units" if frames[source] else ""
-            parts += [f"{source}{of} for {some:,} rows"] if some else []
+            frames, of = sum(units[source].values()), len(units[source])
+            about = f" of {frames:,} frames of {of} unit{'s' * (of > 1)}" if frames else ""
+            parts.append(f"{source}{about} for {some:,} rows")
         return f"untouched gel: {'; '.join(parts)}"
 
     def pictures(self, rows: Array) -> dict[str, Array]:
         """Return the pictures of the units of rows by name, those of the STORED units with most rows."""
-        units, counts = np.unique(self._unit[rows], return_counts=True)
-        found = {}
-        for unit in units[np.argsort(-counts, kind="stable")][:STORED].tolist():
-            row = next(iter(rows[(self._unit[rows] == unit) & self.has(rows)].tolist()), None)
-            picture = None if row is None else self.read(row)
-            if picture is not None:
-                found[self._name(unit)] = reduced(picture)
+        rows, found = rows[self.has(rows)], {}
+        units, first, counts = np.unique(self._unit[rows], return_index=True, return_counts=True)
+        for place in np.argsort(-counts, kind="stable")[:STORED].tolist():
+            picture, row = self.read(int(rows[first[place]])), int(self._first[units[place]])
+            cells = (self._manifest.value(row, name) for name in ("dataset", "sensor", "unit"))
+            assert picture is not None
+            found[" ".join(str(cell) for cell in cells if cell)] = reduced(picture)
         return found
 
     def digest(self) -> str:
         """Return what decides the pictures that are not stored ones, as text."""
-        ones = [self._of(unit).picture for unit in range(len(self._first))]
-        return f"{zlib.crc32(b''.join(b'-' if one is None else one.tobytes() for one in ones)):08x}"
+        digest = 0
+        for row in np.unique(np.where(self._stored, -1, self._first[self._unit]))[1 if self._stored.any() else 0 :]:
+            picture = self._find_once(int(self._unit[row])).picture
+            digest = zlib.crc32(b"-" if picture is None else picture.tobytes(), digest)
+        return f"{digest:08x}"
 
-    def _name(self, unit: int) -> str:
-        cells = (self._manifest.value(int(self._first[unit]), name) for name in ("dataset", "sensor", "unit"))
-        return " ".join(str(cell) for cell in cells if cell)
+    def _of(self, row: int) -> _Unit:
+        if not self._stored[row]:
+            return self._find_once(int(self._unit[row]))
+        one = self._find_once(int(self._unit[row])) if self._known else _Unit()
+        return one if one.fitted else _Unit(None, "a stored picture")
 
-    def _of(self, unit: int) -> _Unit:
+    def _find_once(self, unit: int) -> _Unit:
         with self._lock:
             if unit not in self._units:
                 self._units[unit] = self._find(unit)
             return self._units[unit]
 
     def _find(self, unit: int) -> _Unit:
+        """Return the median of a unit's frames, or the picture of the same unit among the known ones."""
         rows = np.flatnonzero((self._unit == unit) & self._has_image)
-        free, rows = rows[self._split[rows] == "background"], rows[self._split[rows] != "background"]
-        if not len(rows):
-            return _Unit(None, "none")
-        train = rows[self._split[rows] == "train"]
-        train = train if len(train) else rows
-        stored = self._stored[rows].any()
-        pictures = len(np.unique(self._manifest.codes("background_path", own=True)[rows[self._stored[rows]]]))
-        many = len(train) >= FRAMES and len(np.unique(self._manifest.codes("sequence", own=True)[train])) >= MANY
-        if stored and not self._known and not (many and pictures == 1):
-            return _Unit(None, "none")
-        found = _Unit(None, "none") if many else self._median(free, 1, "the unit's rows of split background")
-        if found.picture is None and (many or not stored):
-            found = self._median(train, FEWEST, "the median")
-        if found.picture is None and not stored:  # a unit of few frames is taken for one of its sensor
-            like = self._unit_of_sensor(unit)
-            found = self._median(like, FEWEST, "the median of its sensor") if len(like) > len(train) else found
-        return self._same(found, rows) if self._known else found
-
-    def _unit_of_sensor(self, unit: int) -> Array:
-        sensor, first = self._manifest.codes("sensor"), int(self._first[unit])
-        rows = np.flatnonzero((sensor == sensor[first]) & (self._split != "background"))
-        train = rows[self._split[rows] == "train"]
-        return train if len(train) else rows
-
-    def _median(self, rows: Array, fewest: int, source: str) -> _Unit:
-        frames = []
-        for row in rows[np.unique(np.linspace(0, len(rows) - 1, FRAMES).astype(int))].tolist() if len(rows) else ():
-            try:
-                frames.append(reduced(decode(self._manifest.file(row))))
-            except UserError:
-                continue  # its own reading reports it
-        usual = alike(frames)
-        return _Unit(None, "none") if len(usual) < fewest else _Unit(median(usual), source, len(usual))
-
-    def _same(self, found: _Unit, rows: Array) -> _Unit:
+        found = self._median(rows[self._split[rows] == "background"], 1, "rows of split background")
+        if found.picture is None:
+            found = self._median(self._fitted(rows), FEWEST, "the median")
+        if found.picture is None:  # a unit of few frames is taken for another one of its sensor
+            sensor = self._manifest.codes("sensor")
+            alike = np.flatnonzero((sensor == sensor[self._first[unit]]) & self._has_image)
+            found = self._median(self._fitted(alike), FEWEST, "the median of its sensor")
+        if not self._known:
+            return found
         look = found.picture if found.picture is not None else self._median(rows, 1, "").picture
         gel, why = (None, "") if look is None else same_unit(self._known, look)
         if why and self._log is not None:
             self._log(other_unit(why))
             self._log = None  # once
-        return found if why or gel is None else _Unit(gel, "the picture that the head was fitted with")
+        return found if gel is None or why else _Unit(gel, "the picture that the head was fitted with", 0, True)
+
+    def _fitted(self, rows: Array) -> Array:
+        """Return the rows of split train, or else all but those of split background."""
+        train = rows[self._split[rows] == "train"]
+        return train if len(train) else rows[self._split[rows] != "background"]
+
+    def _median(self, rows: Array, fewest: int, source: str) -> _Unit:
+        frames = []
+        for row in rows[np.unique(np.linspace(0, len(rows) - 1, FRAMES).astype(int))].tolist() if len(rows) else ():
+            with suppress(UserError):  # reading the row itself reports it
+                frames.append(reduced(decode(self._manifest.file(row))))
+        usual = alike(frames)
+        return _Unit() if len(usual) < fewest else _Unit(median(usual), source, len(usual))
 
 
 def gel_arrays(pictures: Mapping[str, Array]) -> dict[str, Array]:

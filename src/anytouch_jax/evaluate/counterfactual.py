@@ -55,7 +55,7 @@ def probe_counterfactual(
             real = runs[REAL, task, head, protocol]
             measured = real[0].sums.shape[1] > 2
             entry = {"task": task, "head": head, "protocol": protocol, "control": name}
-            gains.append(entry | paired_gain(real, several, measured))
+            gains.append(entry | statistics.paired_gain(real, several, measured))
     return results, gains
 
 
@@ -122,19 +122,6 @@ def _background_features(
         return embed_rows(encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding)[1]
 
     return compute
-
-
-def paired_gain(real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool) -> dict[str, float | None]:
-    """Return by how much the score of `real` is above that of `other` on the same rows, with its 95 % interval."""
-    metric = statistics.r2_of if measured else statistics.mean_of
-    width = real[0].sums.shape[1]
-
-    def gain(sums: Array) -> Array:
-        return metric(sums[..., :width]) - metric(sums[..., width:])
-
-    both = [GroupSums(a.groups, np.concatenate([a.sums, b.sums], 1)) for a, b in zip(real, other, strict=True)]
-    low, high = statistics.bootstrap_interval(both, gain)
-    return {"difference": float(np.mean([gain(run.sums.sum(0)) for run in both])), "low": low, "high": high}
 
 
 def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:

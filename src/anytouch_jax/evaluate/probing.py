@@ -247,15 +247,48 @@ def probe_json(results: Sequence[ProbeResult]) -> str:
     return json.dumps(records, indent=2, allow_nan=False)
 
 
-def probe_table(results: Sequence[ProbeResult | Mapping[str, Any]], paper: float | None = None) -> str:
+def verdict(name: str, gain: Mapping[str, float | None], task: str = "") -> str:
+    """Return a sentence on features against raw pixels, from a `statistics.paired_gain`."""
+    points, low, high = (100 * (gain[key] or 0.0) for key in ("difference", "low", "high"))
+    of = f"{task}: " if task else ""
+    if gain["low"] is None:
+        return f"{of}{name} is {points:+.0f} points from raw pixels, by too few test recordings to be sure."
+    interval = f"({low:.0f} to {high:.0f})"
+    if low > 0:
+        return f"{of}{name} is {points:.0f} points above raw pixels {interval}."
+    return (
+        f"{of}{name} is no better than raw pixels: {points:+.0f} points {interval}. Try --pooling both, more "
+        "recordings, or another encoder, and look at the untouched gel with `anytouch view`."
+    )
+
+
+def label_verdicts(results: Sequence[ProbeResult]) -> list[str]:
+    """Return a sentence on each source of features of `probe_label` against raw pixels, by its first head."""
+    first: dict[str, ProbeResult] = {}
+    for result in results:
+        first.setdefault(result.probe.partition(": ")[0], result)
+    sums = {
+        name: statistics.classification_sums(one.outcome.correct, one.outcome.groups)
+        for name, one in first.items() if one.outcome is not None and ": " in one.probe
+    }  # fmt: skip
+    raw = sums.pop(RAW, None)
+    sums.pop(RANDOM, None)
+    return [] if raw is None else [
+        verdict(name, statistics.paired_gain([one], [raw], False)) for name, one in sums.items()
+    ]  # fmt: skip
+
+
+def probe_table(
+    results: Sequence[ProbeResult | Mapping[str, Any]], paper: float | None = None, *, details: bool = False
+) -> str:
     """Return results, or results of `probe_tasks`, as one Markdown table, with the notes below.
 
-    `paper`: the accuracy of AnyTouch in the paper.
+    `paper`: the accuracy of AnyTouch in the paper. `details`: also a row for each part of the test rows.
     """
     lines, notes = list[dict[str, str]](), list[str]()
     for result in results:
         if isinstance(result, ProbeResult):
-            lines += _result_lines(result)
+            lines += _result_lines(result)[: None if details else 1]
             notes += [f"- {result.probe} ({result.protocol}): {note}" for note in result.notes]
         else:
             names = {name: result.get(name, "") for name in ("features", "task", "head", "protocol")}
@@ -463,7 +496,7 @@ def probe_tasks(
     if join != "mean" and any(s.encoder and (frames or 1) <= s.encoder.config.model.frames for s in sources):
         raise UserError("--join has no effect without --frames longer than a clip of the model.")
     protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else (protocol,)
-    results = []
+    results, keep = [], {} if keep is None else keep
     for source in sources:
         for length, ids in rows.items():
             source.store.add(ids, length)
@@ -475,15 +508,19 @@ def probe_tasks(
                 head = ProbeHead(name, source.scaling, recipe=recipe or GradientRecipe())
                 scored, runs = _score(labelled, plan, head, each, seeds)
                 names = {"features": source.name, "task": plan.task.name, "head": name, "protocol": each}
-                if keep is not None:
-                    keep[tuple(names.values())] = runs
+                keep[tuple(names.values())] = runs
                 results.append(names | scored | about | {"notes": notes + scored["notes"]})
         log(f"probed {source.name}")
+    kinds = {plan.task.name: plan.roles.measured for plan in plans}
+    verdicts = [
+        verdict(name, statistics.paired_gain(runs, keep[RAW, *others], kinds[others[0]]), f"{others[0]}, {others[1]}")
+        for (name, *others), runs in keep.items() if name not in (RAW, RANDOM) and (RAW, *others) in keep
+    ]  # fmt: skip
     report = {
         "manifest": table.content_hash, "data": [str(path) for path in table.files], "paper": paper, "seeds": seeds,
         "sides": {name: list(sides.get(name) or ()) or None for name in SIDES},
         "runs": {source.name: dataclasses.asdict(source.encoder.config) for source in sources if source.encoder},
-        "left_out": left_out, "results": results,
+        "left_out": left_out, "verdicts": verdicts, "results": results,
     }  # fmt: skip
     if out is not None:
         atomic_write(out, json.dumps(report, indent=2, allow_nan=False))

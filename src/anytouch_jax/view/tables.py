@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import parse_json
+from anytouch_jax.data.gels import FRAMES, UnitGels, recording_gel
 from anytouch_jax.data.images import QUIET, count_frames, decode, list_images, open_video, to_rgb
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -44,7 +45,7 @@ class Table:
     def __init__(self, manifest: Manifest, name: str, film: Path | None = None) -> None:
         self.manifest, self.name = manifest, name
         self._film = None if film is None else _Film(film)
-        self._background = lru_cache(32)(self._read_background)
+        self._gels, self._kept = UnitGels(manifest), dict[Any, tuple[Array, UntouchedGel]]()
         self._chosen = lru_cache(8)(self._choose)
 
     def about(self) -> dict[str, Any]:
@@ -87,21 +88,26 @@ class Table:
         return decode(self.manifest.file(row, "image_path"))
 
     def panels(self, row: int) -> tuple[Array, float]:
-        """Return the panels of a row (see `touch_panels`) and its contact score, NaN without a background."""
-        frame, gel = self.frame(row), None
-        first = self._rows(int(np.searchsorted(self._order[1], self._position(row), "right")) - 1)[0]
-        path = self.manifest.value(row, "background_path")
-        if path is not None or first != row:
-            gel = self._background(row if path is not None else int(first), path)
-        return touch_panels(frame, gel, self.threshold(row))
+        """Return the panels of a row (see `touch_panels`) and its contact score, NaN without an untouched gel."""
+        return touch_panels(self.frame(row), self._untouched(row), self.threshold(row))
 
     def threshold(self, row: int) -> float:
         """Return the contact score above which a frame of the row's sensor shows contact."""
         return THRESHOLDS.get(self.manifest.value(row, "sensor"), DEFAULT_THRESHOLD)
 
-    def _read_background(self, row: int, path: str | None) -> tuple[Array, UntouchedGel]:
-        picture = self.frame(row) if path is None else decode(self.manifest.file(row, "background_path"))
-        return scale_down(picture), UntouchedGel(picture)
+    def _untouched(self, row: int) -> tuple[Array, UntouchedGel] | None:
+        """Return the untouched gel of a row, None if it is unknown."""
+        film = self._film
+        key = self._gels.key(row) if film is None else 0
+        if key is not None and key not in self._kept:
+            count = len(self.manifest)
+            some = range(0, count, -(-count // FRAMES))
+            picture = self._gels.read(row) if film is None else recording_gel(map(film.read, some))[0]
+            assert picture is not None
+            if len(self._kept) >= 32:
+                self._kept.clear()
+            self._kept[key] = scale_down(picture), UntouchedGel(picture)
+        return self._kept.get(key)
 
     def _check(self, row: int) -> None:
         if not 0 <= row < len(self.manifest):

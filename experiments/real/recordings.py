@@ -17,7 +17,7 @@ from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select
 from anytouch_jax.data.prepare.contact import contact_scores, spread
 
 SET = "incipient_slip-gelsight_mini_markers"
-Background = Literal["own", "rule", "median", "all", "ten", "half", "recordings", "estimated", "first"]
+Background = Literal["rule", "median", "ten", "half", "recordings", "all", "own", "first", "estimated"]
 
 
 @dataclass(frozen=True)

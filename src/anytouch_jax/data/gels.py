@@ -16,8 +16,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -32,6 +31,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import check_array
 
 Array = npt.NDArray[Any]
+T = TypeVar("T")
 FRAMES = 100  # frames of a median: 10 of them to all of them score alike
 FEWEST = 5  # frames of a median: fewer show the press itself
 SIDE = 320  # pixels of the long side of a median
@@ -77,7 +77,8 @@ def untouched_gel(frames: Iterable[npt.ArrayLike]) -> Array:
 def median(frames: Sequence[Array]) -> Array:
     """Return the per-pixel median u8 (h, w, 3) of frames of one size."""
     stack = np.stack(frames)
-    return np.partition(stack, len(stack) // 2, axis=0)[len(stack) // 2]
+    middle = (len(stack) - 1) // 2
+    return np.partition(stack, middle, axis=0)[middle]
 
 
 def estimate(frames: Sequence[Array]) -> tuple[Array, bool]:
@@ -120,8 +121,8 @@ def alike(frames: Sequence[Array]) -> list[Array]:
 class RunningGel:
     """The untouched gel of a live source, from its frames so far.
 
-    `picture` is the newest estimate, None before the first frame. It stays once it is `settled`: two estimates in turn
-    find the same free gel, or SETTLED frames have come.
+    `picture` is the newest estimate, None before the first frame. It stays once it is `settled`: after FRAMES frames two
+    estimates in turn find the same free gel, or SETTLED frames have come.
     """
 
     def __init__(self) -> None:
@@ -140,7 +141,7 @@ class RunningGel:
         self._due = max(2 * count, 2)
         before, (picture, sure) = self.picture, estimate(self._spread.items)
         again = sure and self._sure and before is not None and UntouchedGel(before).score(picture) < TINT / 2
-        self.picture, self._sure, self.settled = picture, sure, again or count >= SETTLED
+        self.picture, self._sure, self.settled = picture, sure, (again and count >= FRAMES) or count >= SETTLED
 
 
 def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
@@ -206,14 +207,29 @@ class UnitGels:
     def read(self, row: int) -> Array | None:
         """Return the untouched gel of a row, its own picture where that counts. Raises UserError if it is broken."""
         picture = self(row)
-        return decode(self._manifest.file(row, "background_path")) if picture is None and self._stored[row] else picture
+        if picture is not None or not self._stored[row]:
+            return picture
+        try:
+            return decode(self._manifest.file(row, "background_path"))
+        except UserError as error:
+            raise UserError(f"{self._manifest.where(row)}, column 'background_path': {error}") from None
 
-    def key(self, row: int) -> tuple[int, Path | None] | None:
-        """Return what the rows of one picture share, None for a row without one."""
-        unit = int(self._unit[row])
-        if self(row) is not None:
-            return unit, None
-        return (unit, self._manifest.file(row, "background_path")) if self._stored[row] else None
+    def shared(self, make: Callable[[Array], T], most: int = 256) -> Callable[[int], T | None]:
+        """Return a function from a row to `make` of its untouched gel, made once for all rows that share it, or None."""
+        made = dict[Any, T]()
+
+        def of_row(row: int) -> T | None:
+            key: Any = int(self._unit[row])
+            if self(row) is None:
+                key = self._manifest.file(row, "background_path") if self._stored[row] else None
+            if key is not None and key not in made:
+                one = make(self.read(row))  # type: ignore[arg-type]
+                if len(made) >= most:
+                    made.clear()
+                return made.setdefault(key, one)
+            return made.get(key)
+
+        return of_row
 
     def has(self, rows: Array) -> Array:
         """Return which rows have one, bool (rows,)."""

@@ -110,13 +110,10 @@ def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
 def _background_features(
     table: Manifest, encoder: Encoder, gels: UnitGels, **encoding: Any
 ) -> Callable[[Array, int], Array]:
-    def gel(row: int) -> Array:
-        picture = gels.read(row)
-        assert picture is not None
-        return encoder.prepare(picture, picture if encoder.subtracts else None)
+    gel = gels.shared(lambda picture: encoder.prepare(picture, picture if encoder.subtracts else None))
 
     def empty(clips: Array, rows: Array) -> Array:
-        return np.broadcast_to(np.stack([gel(row) for row in rows.tolist()])[:, None], clips.shape)
+        return np.broadcast_to(np.stack([np.asarray(gel(row)) for row in rows.tolist()])[:, None], clips.shape)
 
     def compute(rows: Array, frames: int) -> Array:
         return embed_rows(encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding)[1]

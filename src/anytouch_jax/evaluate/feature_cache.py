@@ -225,18 +225,8 @@ def raw_pixels(frame: Array, background: Array | None) -> Array:
 
 def _pair_reader(table: Manifest, gels: UnitGels, prepare: Callable[[Array], Any]) -> Callable[[int], tuple[Any, Any]]:
     """Return a function from a row to its prepared frame and untouched gel, None without one."""
-    kept: dict[Any, Any] = {}  # many rows share one
-
-    def read(row: int) -> tuple[Any, Any]:
-        frame, key = prepare(read_image(table, row)), gels.key(row)
-        if key is not None and key not in kept:
-            if len(kept) >= 256:  # 230 kB each
-                kept.clear()
-            picture = gels(row)
-            kept[key] = prepare(read_image(table, row, "background_path") if picture is None else picture)
-        return frame, kept.get(key)
-
-    return read
+    gel = gels.shared(prepare)
+    return lambda row: (prepare(read_image(table, row)), gel(row))
 
 
 def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = None) -> Array:

@@ -7,6 +7,7 @@ by itself. Pictures are read when they are shown.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,6 @@ class Table:
     def __init__(self, manifest: Manifest, name: str, film: Path | None = None) -> None:
         self.manifest, self.name = manifest, name
         self._film = None if film is None else _Film(film)
-        self._gels, self._kept = UnitGels(manifest), dict[Any, tuple[Array, UntouchedGel]]()
         self._chosen = lru_cache(8)(self._choose)
 
     def about(self) -> dict[str, Any]:
@@ -95,19 +95,18 @@ class Table:
         """Return the contact score above which a frame of the row's sensor shows contact."""
         return THRESHOLDS.get(self.manifest.value(row, "sensor"), DEFAULT_THRESHOLD)
 
-    def _untouched(self, row: int) -> tuple[Array, UntouchedGel] | None:
-        """Return the untouched gel of a row, None if it is unknown."""
-        film = self._film
-        key = self._gels.key(row) if film is None else 0
-        if key is not None and key not in self._kept:
-            count = len(self.manifest)
-            some = range(0, count, -(-count // FRAMES))
-            picture = self._gels.read(row) if film is None else recording_gel(map(film.read, some))[0]
-            assert picture is not None
-            if len(self._kept) >= 32:
-                self._kept.clear()
-            self._kept[key] = scale_down(picture), UntouchedGel(picture)
-        return self._kept.get(key)
+    @cached_property
+    def _untouched(self) -> Callable[[int], tuple[Array, UntouchedGel] | None]:
+        """A function from a row to its untouched gel, scaled down and to compare, None if it is unknown."""
+
+        def made(picture: Array) -> tuple[Array, UntouchedGel]:
+            return scale_down(picture), UntouchedGel(picture)
+
+        if self._film is None:
+            return UnitGels(self.manifest).shared(made, 32)
+        count = len(self.manifest)
+        of_film = made(recording_gel(map(self._film.read, range(0, count, -(-count // FRAMES))))[0])
+        return lambda _: of_film
 
     def _check(self, row: int) -> None:
         if not 0 <= row < len(self.manifest):

@@ -7,7 +7,8 @@ scaled to 160 on its long side, so thresholds do not depend on the camera's reso
 
 The untouched gel of a row is its `background_path`, the rows of split `background` of its unit (or else sequence), or a
 picture that the user names. Otherwise it is estimated from the frames of its recording, and compared with the estimates
-of other recordings of the unit (see `untouched_gel`). Where it cannot be decided, the score stays empty.
+of other recordings of the unit (see `untouched_gel`). Where these are undecided, it is the median of the unit's frames,
+unless that is clearly pressed: then the score stays empty.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.images import ImageError, decode, encode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_column, select_rows
 from anytouch_jax.data.manifest.schema import shown
@@ -38,15 +40,14 @@ from anytouch_jax.data.prepare.untouched_gel import (
     UntouchedGel,
     estimate_untouched_gel,
     gel_of_unit,
+    median_gel,
     scale_picture,
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
-if TYPE_CHECKING:
-    from anytouch_jax.data.gels import UnitGels
-
 _MAX_FRAMES, _MAX_RECORDINGS = 48, 48  # of a recording, and of a unit, from which the untouched gel is estimated
+_MANY = 3  # recordings of a unit whose median shows where nothing presses
 _MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
 _Scored = tuple[int, float, str]  # row, score, reason
 _Pictures = Callable[[np.ndarray], list[np.ndarray]]  # some frames of rows
@@ -180,21 +181,10 @@ def contact_scores(
                 for row, value, reason in pool.map(score_row, some[start : start + 1024].tolist()):
                     score[row], reasons[row] = value, reason
 
-        kept: dict[Any, UntouchedGel] = {}  # many rows share one
-
-        def gel_of_row(row: int) -> UntouchedGel:
-            key = manifest.file(row, "background_path") if gels is None else gels.key(row)
-            if key not in kept:
-                picture = None if gels is None else gels(row)
-                gel = UntouchedGel(decode(manifest.file(row, "background_path")) if picture is None else picture)
-                if len(kept) >= 256:
-                    kept.clear()
-                return kept.setdefault(key, gel)
-            return kept[key]
-
         if gels is not None:
             has_background = gels.has(rows)
             reasons[rows[~has_background]] = "none: no picture of the untouched gel"
+        gel_of_row: Any = (gels or UnitGels(manifest)).shared(UntouchedGel)
         assign(partial(_score_row, manifest, faults, gel_of_row, "given"), rows[has_background])
         for group in _groups(manifest, rows[~has_background]) if gels is None else ():
             gel, source = _gel_of_group(manifest, group, pictures, backgrounds or {})
@@ -313,6 +303,7 @@ def _estimates(
     for gel, _, shape in estimates.values():
         by_shape.setdefault(shape, []).extend([] if gel is None else [gel])
     common = {shape: gel_of_unit(gels) for shape, gels in by_shape.items()}
+    usual = median_gel(pictures(group)) if len(recordings) >= _MANY else None
     for place, recording in enumerate(recordings):
         gel, reason, shape = estimates.get(place) or estimate(recording)
         agreed = common.get(shape)
@@ -321,6 +312,8 @@ def _estimates(
             yield recording, agreed, "estimated from other recordings of the unit"
         elif gel is not None and any(rival.score(gel.picture) >= DIFFERENT for rival in rivals):
             yield recording, None, "recordings of its unit show different untouched gels"
+        elif gel is None and usual is not None and usual.picture.shape == shape:
+            yield recording, usual, "the median of the unit"
         else:
             yield recording, gel, reason
 

@@ -120,6 +120,18 @@ def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]
     return None, reason
 
 
+def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
+    """Return the per-pixel median of frames of one unit, pressed or not; None if it shows a press itself.
+
+    None, too, for frames that are all alike: they may always be pressed. `pictures` as for `estimate_untouched_gel`.
+    """
+    free = _median(pictures) if len(pictures) else np.zeros(0)
+    others = [picture for picture in pictures if _distance(free, picture) >= DIFFERENT]
+    if not others or np.median([_press_of(free, other) for other in others]) >= ALIKE:
+        return None
+    return UntouchedGel(free)
+
+
 def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:
     """Return the untouched gel that most estimates of one unit agree on, all of one size.
 

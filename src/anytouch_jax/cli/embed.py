@@ -86,9 +86,9 @@ def run(options: EmbedOptions) -> int:
     encoder, pooling, head = load_inputs(options)
     about: dict[str, str] = {}
     if is_manifest:
-        features = _embed_manifest(encoder, options, pooling, {} if head is None else head.gels)
+        features = _embed_manifest(encoder, options, pooling, encoder.gels if head is None else head.gels)
     else:
-        row, preprocess, gate, about = frames_input(encoder, options, data, {} if head is None else head.gels)
+        row, preprocess, gate, about = frames_input(encoder, options, data, encoder.gels if head is None else head.gels)
         features = _embed_frames(encoder, options, pooling, row, preprocess, gate)
         features.gels.update(gels_of(preprocess, options))
         log_universal(encoder, options)

@@ -52,7 +52,8 @@ def run(options: StreamOptions) -> int:
 
     source, live = stream.open_source(data)
     encoder = on_engine(encoder, options.engine, options.frames, pooling)
-    row, preprocess, gate, about = embed.frames_input(encoder, options, data, {} if head is None else head.gels)
+    known = encoder.gels if head is None else head.gels
+    row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
     embedded = stream.stream(
         encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,
         pooling=pooling, join=options.join, log=log, contact=gate, reuse=options.reuse,

@@ -1,9 +1,14 @@
 """The picture of the untouched gel: one rule for manifests, folders, films, pictures and live sources.
 
-In this order: the picture that the user names; the picture of the same unit that a head or an index was fitted with; a
-stored picture (`background_path`, rows of split `background`, background.png of a folder); the median of the unit's
-frames. A live source has a running estimate. A unit is the column `unit` of one dataset and sensor, or else the sensor.
-A folder or a film is one unit.
+The first of these counts:
+
+* the picture that the user names
+* the picture of the same unit that a head or an index was fitted with
+* a stored picture: `background_path`, rows of split `background`, background.png of a folder
+* the median of the unit's frames
+* for a live source, a running estimate
+
+A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one unit.
 
 The median is over frames of split train, if the unit has any. Pressed or not, they may all take part, as presses are at
 changing places. `experiments/results/backgrounds.md` compares it with stored pictures.
@@ -121,8 +126,8 @@ def alike(frames: Sequence[Array]) -> list[Array]:
 class RunningGel:
     """The untouched gel of a live source, from its frames so far.
 
-    `picture` is the newest estimate, None before the first frame. It stays once it is `settled`: after FRAMES frames two
-    estimates in turn find the same free gel, or SETTLED frames have come.
+    `picture` is the newest estimate, None before the first frame. It stays once it is `settled`: two estimates in turn
+    find the same free gel after FRAMES frames, or SETTLED frames have come.
     """
 
     def __init__(self) -> None:
@@ -215,7 +220,7 @@ class UnitGels:
             raise UserError(f"{self._manifest.where(row)}, column 'background_path': {error}") from None
 
     def shared(self, make: Callable[[Array], T], most: int = 256) -> Callable[[int], T | None]:
-        """Return a function from a row to `make` of its untouched gel, made once for all rows that share it, or None."""
+        """Return a function from a row to `make` of its untouched gel (or None), made once for all rows of it."""
         made = dict[Any, T]()
 
         def of_row(row: int) -> T | None:

@@ -92,6 +92,11 @@ class Encoder:
         """Whether it was trained on background-subtracted touches only."""
         return self.config.data.background == "subtract"
 
+    @property
+    def gels(self) -> dict[str, np.ndarray]:
+        """Pictures of the untouched gel by unit, of an exported encoder that stores some."""
+        return {}
+
     @cached_property
     def fingerprint(self) -> str:
         """CRC-32 of the touch encoder's parameters, in hexadecimal."""

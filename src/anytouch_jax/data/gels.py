@@ -30,7 +30,7 @@ import numpy.typing as npt
 from anytouch_jax.config import FIELD_SENSORS
 from anytouch_jax.data.images import decode, to_rgb
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.prepare.untouched_gel import UntouchedGel, free_frames, scale_picture
+from anytouch_jax.data.prepare.untouched_gel import EDGE, free_frames, scale_picture
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import check_array
@@ -47,19 +47,18 @@ ADVICE = "Give one of the gel with nothing on it: --background, or background.pn
 
 
 class Spread:
-    """At most `most` evenly spaced items of a sequence of unknown length."""
+    """`make` of at most FRAMES evenly spaced items of a sequence of unknown length."""
 
-    def __init__(self, most: int = FRAMES) -> None:
-        self.items, self.count = list[Any](), 0
-        self._most, self._step = most, 1
+    def __init__(self, make: Callable[[Any], Array]) -> None:
+        self.items, self.count = list[Array](), 0
+        self._make, self._step = make, 1
 
-    def add(self, make: Callable[[], Any]) -> None:
-        """Count one item more, and make it if it is kept."""
+    def add(self, item: Any) -> None:
+        """Count one item more, and keep it if its turn has come."""
+        if self.count % self._step == 0 and len(self.items) == FRAMES:
+            self.items, self._step = self.items[::2], 2 * self._step
         if self.count % self._step == 0:
-            if len(self.items) == self._most:
-                self.items, self._step = self.items[::2], 2 * self._step
-            if self.count % self._step == 0:
-                self.items.append(make())
+            self.items.append(self._make(item))
         self.count += 1
 
 
@@ -69,9 +68,9 @@ def untouched_gel(frames: Iterable[npt.ArrayLike]) -> Array:
     The frames may be pressed, at changing places. At most FRAMES of them are used, evenly spread. Raises UserError for
     fewer than FEWEST frames, and for frames of several sizes.
     """
-    spread = Spread()
+    spread = Spread(lambda frame: to_rgb(np.asarray(frame), "a frame"))
     for frame in frames:
-        spread.add(lambda frame=frame: to_rgb(np.asarray(frame), "a frame"))  # type: ignore[misc]
+        spread.add(frame)
     if spread.count < FEWEST:
         raise UserError(f"{spread.count} frames are too few for a picture of the untouched gel. Give {FEWEST} or more.")
     if len(shapes := {frame.shape for frame in spread.items}) > 1:
@@ -81,26 +80,22 @@ def untouched_gel(frames: Iterable[npt.ArrayLike]) -> Array:
 
 def median(frames: Sequence[Array]) -> Array:
     """Return the per-pixel median u8 (h, w, 3) of frames of one size."""
-    stack = np.stack(frames)
-    middle = (len(stack) - 1) // 2
-    return np.partition(stack, middle, axis=0)[middle]
+    middle = (len(frames) - 1) // 2
+    return np.partition(np.stack(frames), middle, axis=0)[middle]
 
 
-def estimate(frames: Sequence[Array]) -> tuple[Array, bool]:
-    """Return the untouched gel in the frames of one recording, and whether some of them show it for sure.
-
-    Otherwise it is their median, which may show a press that lasts.
-    """
-    if len(frames) < FEWEST:
-        return median(frames), False
+def estimate(frames: Sequence[Array]) -> Array:
+    """Return the untouched gel of one recording: the median of its free frames if these stand out, else of all."""
     some = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 24).astype(int))]
-    group, _ = free_frames([scale_picture(frame) for frame in some])
-    return (median(frames), False) if group is None else (median([some[i] for i in group]), True)
+    small = [scale_picture(frame) for frame in some]
+    decides = len(some) >= FEWEST and min(small[0].shape[:2]) > 2 * EDGE + 2
+    group = free_frames(small)[0] if decides else None
+    return median(frames if group is None else [some[i] for i in group])
 
 
 def reduced(frame: Array) -> Array:
-    """Return a frame whose long side has at most SIDE pixels."""
-    return frame if max(frame.shape[:2]) <= SIDE else scale_picture(frame, SIDE)
+    """Return a copy of a frame, whose long side has at most SIDE pixels."""
+    return frame.copy() if max(frame.shape[:2]) <= SIDE else scale_picture(frame, SIDE)
 
 
 def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
@@ -108,13 +103,13 @@ def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
 
     With fewer than FEWEST it shows the press itself.
     """
-    spread = Spread()
+    spread = Spread(reduced)
     for frame in frames:
-        spread.add(lambda frame=frame: reduced(frame))  # type: ignore[misc]
-    usual = alike(spread.items)
-    if not usual:
+        spread.add(frame)
+    if not spread.items:
         raise UserError("no frame can be read, so the untouched gel is unknown. Check the pictures.")
-    return estimate(usual)[0], len(usual)
+    usual = alike(spread.items)
+    return estimate(usual), len(usual)
 
 
 def alike(frames: Sequence[Array]) -> list[Array]:
@@ -124,29 +119,24 @@ def alike(frames: Sequence[Array]) -> list[Array]:
 
 
 class RunningGel:
-    """The untouched gel of a live source, from its frames so far.
+    """The untouched gel of a live source: `picture`, None before its first frame, from the frames so far.
 
-    `picture` is the newest estimate, None before the first frame. It stays once it is `settled`: two estimates in turn
-    find the same free gel after FRAMES frames, or SETTLED frames have come.
+    It is estimated whenever their number has doubled, and `settled` after SETTLED of them.
     """
 
     def __init__(self) -> None:
         self.picture: Array | None = None
-        self.settled = False
-        self._spread, self._due, self._sure = Spread(), 1, False
+        self.settled, self._spread, self._due = False, Spread(reduced), 1
 
     def add(self, frame: Array) -> None:
-        """Take one frame more, RGB u8 (h, w, 3). The estimate is made again whenever their number has doubled."""
+        """Take one frame more, RGB u8 (h, w, 3)."""
         if self.settled:
             return
-        self._spread.add(lambda: reduced(frame).copy())
+        self._spread.add(frame)
         count = self._spread.count
-        if count < min(self._due, SETTLED):
-            return
-        self._due = max(2 * count, 2)
-        before, (picture, sure) = self.picture, estimate(self._spread.items)
-        again = sure and self._sure and before is not None and UntouchedGel(before).score(picture) < TINT / 2
-        self.picture, self._sure, self.settled = picture, sure, (again and count >= FRAMES) or count >= SETTLED
+        if count >= self._due:
+            self._due, self.settled = min(2 * count, SETTLED), count >= SETTLED
+            self.picture = estimate(self._spread.items)
 
 
 def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:

@@ -431,9 +431,12 @@ def test_a_table_of_classes_and_numbers() -> None:
 
 @pytest.mark.parametrize(
     ("low", "high", "words"),
-    [(0.03, 0.21, "ours is 12 points above raw pixels (3 to 21)."),
-     (-0.02, 0.26, "no better than raw pixels: +12 points"), (None, None, "ours is +12 points from raw pixels, by too few test recordings to be sure.")],
-)  # fmt: skip
+    [
+        (0.03, 0.21, "ours is 12 points above raw pixels (3 to 21)."),
+        (-0.02, 0.26, "no better than raw pixels: +12 points"),
+        (None, None, "ours is +12 points from raw pixels, by too few test recordings to be sure."),
+    ],
+)
 def test_a_verdict_is_a_paired_interval(low: float | None, high: float | None, words: str) -> None:
     assert words in verdict("ours", {"difference": 0.12, "low": low, "high": high})
 

@@ -12,7 +12,7 @@ from touch_world import make_touches
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import DataConfig, preset
-from anytouch_jax.data.gels import UnitGels
+from anytouch_jax.data.gels import SETTLED, UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError, SampleReader, evaluation
@@ -21,6 +21,8 @@ from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
+from anytouch_jax.encoder.novelty import ContactGate
+from anytouch_jax.encoder.stream import stream
 from anytouch_jax.errors import UserError
 from anytouch_jax.pretrain import pretrain
 from experiments.pouring import policy
@@ -283,3 +285,35 @@ def test_an_encoder_of_either_kind_works_with_and_without_a_background(encoder):
     assert either.subtracts and not either.needs_background
     camera = Preprocess(either)
     assert (camera(gel) == 90).all() and (camera(gel) == 90).all()
+
+
+class Source:
+    """A camera or a film in memory, as stream reads it."""
+
+    def __init__(self, frames):
+        self.frames, self.at = frames, -1
+
+    def grab(self):
+        self.at += 1
+        return self.at < len(self.frames)
+
+    def retrieve(self):
+        return True, self.frames[self.at][..., ::-1]
+
+    def get(self, _):
+        return 0.0
+
+    def release(self):
+        pass
+
+
+def test_a_stream_is_marked_until_its_untouched_gel_is_settled_or_captured(encoder):
+    frames = [GEL] * (SETTLED + 2)
+    frames[0] = np.clip(GEL.astype(int) + 60, 0, 255).astype(np.uint8)  # it begins with a press
+    for background, marked in ((None, SETTLED - 1), (GEL, 0)):
+        preprocess = Preprocess(encoder, background)
+        gate = ContactGate(preprocess, "digit")
+        arrived = list(stream(encoder, Source(frames), preprocess, live=False, sensor=0, contact=gate))
+        assert [one.estimated for one in arrived] == [True] * marked + [False] * (len(frames) - marked)
+        np.testing.assert_array_equal(preprocess.background, GEL)
+        assert not any(one.contact for one in arrived[4:])

@@ -121,7 +121,7 @@ def run_label(options: LabelOptions) -> int:
     settings = _settings(options)
     details = settings.pop("details")
     results = probe_label(**settings, log=log)
-    print("\n".join([*label_verdicts(results), ""]))
+    print("".join(f"{line}\n" for line in label_verdicts(results)))
     print_table(probe_table(results, details=details))
     log_default((*options.model, *options.features))
     return 0
@@ -140,7 +140,7 @@ def run_tasks(options: TasksOptions) -> int:
     if settings.pop("counterfactual"):
         return _run_counterfactual(options, settings)
     results = probe_tasks(**settings, log=log)
-    print("\n".join([*results["verdicts"], ""]))
+    print("".join(f"{line}\n" for line in results["verdicts"]))
     print_table(probe_table(results["results"], results["paper"]))
     log_default((*options.model, *options.features))
     return 0
@@ -171,7 +171,7 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     from anytouch_jax.evaluate.probing import probe_benchmark, probe_table
 
     results = probe_benchmark(**_settings(options), log=log)
-    print("\n".join([*results["verdicts"], ""]))
+    print("".join(f"{line}\n" for line in results["verdicts"]))
     print_table(probe_table(results["results"], results["paper"]))
     log_default((*options.model, *options.features))
     return 0

@@ -249,11 +249,14 @@ class UnitGels:
         rows, found = rows[self.has(rows)], {}
         units, first, counts = np.unique(self._unit[rows], return_index=True, return_counts=True)
         for place in np.argsort(-counts, kind="stable")[:STORED].tolist():
-            picture, row = self.read(int(rows[first[place]])), int(self._first[units[place]])
-            cells = (self._manifest.value(row, name) for name in ("dataset", "sensor", "unit"))
+            picture = self.read(int(rows[first[place]]))
             assert picture is not None
-            found[" ".join(str(cell) for cell in cells if cell)] = reduced(picture)
+            found[self._name(int(units[place]))] = reduced(picture)
         return found
+
+    def _name(self, unit: int) -> str:
+        cells = (self._manifest.value(int(self._first[unit]), name) for name in ("dataset", "sensor", "unit"))
+        return " ".join(str(cell) for cell in cells if cell)
 
     def digest(self) -> str:
         """Return what decides the pictures that are not stored ones, as text."""
@@ -288,7 +291,9 @@ class UnitGels:
         if not self._known:
             return found
         look = found.picture if found.picture is not None else self._median(rows, 1, "").picture
-        gel, why = (None, "") if look is None else same_unit(self._known, look)
+        name = self._name(unit)
+        known = {name: self._known[name]} if name in self._known else self._known
+        gel, why = (None, "") if look is None else same_unit(known, look)
         if why and self._log is not None:
             self._log(other_unit(why))
             self._log = None  # once

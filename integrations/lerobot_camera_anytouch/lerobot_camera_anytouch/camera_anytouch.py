@@ -48,6 +48,7 @@ class AnyTouchCamera(Camera):
         self._gel = RunningGel()
         if self.config.background:
             self._gel.picture, self._gel.settled = decode(self.config.background), True
+        self._gel.add(np.array(self._camera.read()))
 
     def disconnect(self) -> None:
         """Close the camera."""

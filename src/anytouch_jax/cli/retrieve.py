@@ -92,12 +92,12 @@ def run(options: RetrieveOptions) -> int:
     rows = retrieval.deepest_rows(table, rows, frames=options.frames)
     for encoder in encoders.values():
         rows = embedding.rows_with_gel(encoder, gels, rows, log)
-    log(gels.report(rows))
     settings: dict[str, Any] = {
         "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
         "seeds": options.seeds,
     }  # fmt: skip
     retrieval.cross_sensor_retrieval(table, {}, rows, **settings)  # raises for an impossible gallery, before the work
+    log(gels.report(rows))
     values: dict[str, Any] = {}
     for name, encoder in encoders.items():
         kept, values[name] = embedding.embed_rows(

@@ -56,11 +56,11 @@ class AnyTouchCamera(Camera):
 
     def read(self, *settings: Any) -> np.ndarray:
         """Return the next picture."""
-        return self._prepared(self._camera.read(*settings))
+        return self._prepared(self._new(self._camera.read(*settings)))
 
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
         """Return the newest picture that was not read yet. Raises TimeoutError."""
-        return self._prepared(self._camera.async_read(timeout_ms=timeout_ms))
+        return self._prepared(self._new(self._camera.async_read(timeout_ms=timeout_ms)))
 
     def read_latest(self, max_age_ms: int = 500) -> np.ndarray:
         """Return the newest picture at once. Raises TimeoutError if it is older."""
@@ -68,8 +68,8 @@ class AnyTouchCamera(Camera):
 
     def features(self, max_age_ms: int = 500) -> np.ndarray:
         """Return the features f32 (E,) of the newest picture. The encoder is loaded at the first call."""
-        raw = self._camera.read_latest(max_age_ms=max_age_ms)
-        frame, gel = self._oriented(raw), self._untouched(raw) if self._encoder.subtracts else None
+        frame = self._oriented(self._camera.read_latest(max_age_ms=max_age_ms))
+        gel = self._untouched() if self._encoder.subtracts else None
         return np.asarray(self._encoder.encode_touch(self._encoder.preprocess(frame, gel), self.config.sensor)[0])
 
     @cached_property
@@ -79,11 +79,14 @@ class AnyTouchCamera(Camera):
     def _oriented(self, frame: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(orient_frame(frame, self.config.rotate, self.config.flip))  # type: ignore[arg-type]
 
-    def _untouched(self, frame: np.ndarray) -> np.ndarray:
+    def _new(self, frame: np.ndarray) -> np.ndarray:
         self._gel.add(frame)
+        return frame
+
+    def _untouched(self) -> np.ndarray:
         assert self._gel.picture is not None
         return self._oriented(self._gel.picture)
 
     def _prepared(self, frame: np.ndarray) -> np.ndarray:
-        gel, upright = self._untouched(frame), self._oriented(frame)
-        return subtract_background([upright], gel)[0] if self.config.subtract else upright
+        upright = self._oriented(frame)
+        return subtract_background([upright], self._untouched())[0] if self.config.subtract else upright

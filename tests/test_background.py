@@ -12,6 +12,7 @@ from touch_world import make_touches
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import DataConfig, preset
+from anytouch_jax.data.gels import SETTLED, UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError, SampleReader, evaluation
@@ -20,6 +21,8 @@ from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
+from anytouch_jax.encoder.novelty import ContactGate
+from anytouch_jax.encoder.stream import stream
 from anytouch_jax.errors import UserError
 from anytouch_jax.pretrain import pretrain
 from experiments.pouring import policy
@@ -91,44 +94,66 @@ def test_another_light_or_place_leaves_the_untouched_gel_grey(touches, change):
     assert all(np.abs(a - b).max() > 5 for a, b in zip(seen, plain, strict=True))  # and the contact is changed
 
 
-def test_a_row_without_a_background_is_named_or_skipped(touches):
-    table = manifests.read(touches)
+def without_backgrounds(table, rows, file):
+    """The same manifest, in which `rows` have no background_path."""
     columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
-    columns["background_path"][table.rows_of("test")[1]] = None
-    holed = manifests.from_columns(columns, touches.parent / "holed.parquet")
-    rows = holed.rows_of("test")[:3]
-    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*--data.background keep"):
-        list(evaluation(holed, rows, settings(touches)))
-    ((ids, _),) = evaluation(holed, rows, settings(touches, on_bad_sample="skip"))
-    assert ids.tolist() == [rows[0], rows[2]]
-    assert len(list(evaluation(holed, rows, settings(touches, "keep")))) == 1
+    for row in rows.tolist():
+        columns["background_path"][row] = None
+    return manifests.from_columns(columns, file)
 
 
-def test_the_first_frame_of_a_recording_stands_in_for_a_missing_background(encoder, touches):
+def test_rows_without_a_picture_of_the_gel_get_the_median_of_their_unit(encoder, touches):
     table = manifests.read(touches)
-    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
     rows = table.rows_of("test")
-    sequence = table.codes("sequence", own=True)
-    number = np.array(columns["frame_index"])
-    first = [min(np.flatnonzero(sequence == sequence[row]), key=lambda at: number[at]) for row in rows]
-    bare = manifests.from_columns(columns | {"background_path": [None] * len(table)}, touches.parent / "bare.parquet")
-    stated = [columns["path"][dict(zip(rows.tolist(), first, strict=True)).get(row, row)] for row in range(len(table))]
-    given = manifests.from_columns(columns | {"background_path": stated}, touches.parent / "stated.parquet")
+    bare = without_backgrounds(table, np.arange(len(table)), touches.parent / "bare.parquet")
     said: list[str] = []
     ids, values = embed_rows(encoder, bare, rows, log=said.append)
-    np.testing.assert_array_equal(values, embed_rows(encoder, given, rows, log=said.append)[1])
-    assert ids.tolist() == rows.tolist() and any("`anytouch data contact MANIFEST`" in words for words in said)
-    alone = manifests.select_rows(bare, rows[:1])
-    with pytest.raises(UserError, match=r"row \d+ of .* are stills and have no background_path"):
-        embed_rows(encoder, alone, np.array([0]))
+    assert ids.tolist() == rows.tolist() and any("untouched gel: the median" in words for words in said)
+    gels = UnitGels(bare)
+    (_, batch), *_ = evaluation(bare, rows, settings(touches, batch_size=len(rows)), unknown="universal")
+    for clip, row in zip(batch.clip, rows.tolist(), strict=True):
+        np.testing.assert_array_equal(clip[0], subtract_background([decode(bare.file(row))], gels(row))[0])
+    whole = embed_rows(encoder, table, rows, log=said.append)[1]
+    assert np.abs(values - whole).max() > 1e-3 and f"untouched gel: a stored picture for {len(rows)} rows" in said
 
 
-def test_a_sight_takes_its_first_frame_for_the_background_unless_told(encoder):
+def test_rows_that_are_too_few_for_a_median_are_left_out_and_counted(encoder, touches):
+    table = manifests.read(touches)
+    few = table.rows_of("test")[:3]
+    alone = without_backgrounds(manifests.select_rows(table, few), few[:0], touches.parent / "few.parquet")
+    columns = {name: alone.column(name).to_pylist() for name in alone.table.column_names}
+    columns["background_path"][1] = None
+    columns["dataset"], columns["unit"] = ["mine"] * 3, ["u", "v", "u"]
+    alone, said = manifests.from_columns(columns, touches.parent / "few.parquet"), list[str]()
+    ids, _ = embed_rows(encoder, alone, np.arange(3), log=said.append)
+    assert ids.tolist() == [0, 2] and "1 of 3 rows have no picture of the untouched gel, and are left out" in said
+    with pytest.raises(UserError, match=r"too few frames to estimate it.*--background"):
+        embed_rows(encoder, alone, np.array([1]), log=said.append)
+    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*--data.background keep"):
+        list(evaluation(alone, np.arange(3), settings(touches)))
+    ((ids, _),) = evaluation(alone, np.arange(3), settings(touches, on_bad_sample="skip"))
+    assert ids.tolist() == [0, 2]
+    assert len(list(evaluation(alone, np.arange(3), settings(touches, "keep")))) == 1
+
+
+def test_a_picture_frames_or_a_head_decide_what_a_camera_subtracts(encoder):
     frames = [GEL, np.clip(GEL + 20, 0, 255).astype(np.uint8)]
-    see = Preprocess(encoder)
-    assert [int(np.median(see(one))) for one in frames] == [128, 148]
+    see = Preprocess(encoder)  # a running estimate
+    assert [int(np.median(see(one))) for one in frames] == [128, 148] and see.estimated
     told = Preprocess(encoder, frames[1])
-    assert [int(np.median(told(one))) for one in frames] == [108, 128]
+    assert [int(np.median(told(one))) for one in frames] == [108, 128] and not told.estimated
+    of_frames = Preprocess(encoder, frames=[frames[1]] * 6)
+    assert (of_frames(frames[1]) == 128).all() and not of_frames.estimated
+    said: list[str] = []
+    fitted = Preprocess(encoder, known={"a": frames[1], "b": 255 - GEL}, log=said.append)
+    assert int(np.median(fitted(frames[1]))) == 128 and not fitted.estimated and not said
+    other = Preprocess(encoder, known={"b": 255 - GEL}, log=said.append)
+    assert [int(np.median(other(one))) for one in frames] == [128, 148] and other.estimated
+    assert len(said) == 1 and "in tint" in said[0]
+    with pytest.raises(UserError, match="not both"):
+        Preprocess(encoder, GEL, frames=frames)
+    with pytest.raises(UserError, match=r"at\.untouched_gel\(frames\).*at\.Preprocess\(encoder, frames=frames\)"):
+        encoder.preprocess(GEL)
     plain = Preprocess(replace(encoder, config=replace(encoder.config, data=DataConfig())))
     np.testing.assert_array_equal(plain(GEL), GEL)
     lying = Preprocess(encoder, np.rot90(GEL), rotate=90)  # the background lies on its side as the frames do
@@ -151,11 +176,16 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     assert "first frame" not in capsys.readouterr().err
     said: list[str] = []
     _, wanted = embed_rows(encoder, table, np.array([row]), log=said.append)
-    assert all("sensor 'gelslim' was not in training" in words for words in said)
+    assert all("'gelslim' was not in training" in words or "untouched gel" in words for words in said)
     np.testing.assert_allclose(np.load(tmp_path / "a.npz")["features"], wanted, atol=1e-5)
+    assert main([*words, "--out", str(tmp_path / "b.npz")]) == 2  # one picture, less itself, is nothing
+    assert "too few frames to estimate the untouched gel" in capsys.readouterr().err
+    for number in range(1, 7):
+        cv2.imwrite(str(frames / f"{number}.png"), shot)
     assert main([*words, "--out", str(tmp_path / "b.npz")]) == 0
-    assert "the first frame is the background (see --background)" in capsys.readouterr().err
-    assert np.abs(np.load(tmp_path / "b.npz")["features"] - wanted).max() > 1e-3
+    assert "untouched gel: estimated from 7 frames" in capsys.readouterr().err
+    with np.load(tmp_path / "b.npz") as written:
+        assert np.abs(written["features"] - wanted).max() > 1e-3 and len(written["gels"]) == 1
 
 
 def test_training_says_at_once_which_rows_have_no_background(touches):
@@ -255,3 +285,35 @@ def test_an_encoder_of_either_kind_works_with_and_without_a_background(encoder):
     assert either.subtracts and not either.needs_background
     camera = Preprocess(either)
     assert (camera(gel) == 90).all() and (camera(gel) == 90).all()
+
+
+class Source:
+    """A camera or a film in memory, as stream reads it."""
+
+    def __init__(self, frames):
+        self.frames, self.at = frames, -1
+
+    def grab(self):
+        self.at += 1
+        return self.at < len(self.frames)
+
+    def retrieve(self):
+        return True, self.frames[self.at][..., ::-1]
+
+    def get(self, _):
+        return 0.0
+
+    def release(self):
+        pass
+
+
+def test_a_stream_is_marked_until_its_untouched_gel_is_settled_or_captured(encoder):
+    frames = [GEL] * (SETTLED + 2)
+    frames[0] = np.clip(GEL.astype(int) + 60, 0, 255).astype(np.uint8)  # it begins with a press
+    for background, marked in ((None, SETTLED - 1), (GEL, 0)):
+        preprocess = Preprocess(encoder, background)
+        gate = ContactGate(preprocess, "digit")
+        arrived = list(stream(encoder, Source(frames), preprocess, live=False, sensor=0, contact=gate))
+        assert [one.estimated for one in arrived] == [True] * marked + [False] * (len(frames) - marked)
+        np.testing.assert_array_equal(preprocess.background, GEL)
+        assert not any(one.contact for one in arrived[4:])

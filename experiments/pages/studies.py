@@ -349,8 +349,15 @@ def backgrounds(folder: Path) -> Page:
     records, rows, findings = records_of(path), [], []
     words = {
         "own": "the unit's own picture",
+        "rule": "the rule: its own picture, else the median of 100 frames",
+        "median": "the median of 100 training frames of the unit",
+        "all": "the median of all training frames of the unit",
+        "ten": "the median of 10 training frames of the unit",
+        "half": "the median of the 50 flattest of 100 frames",
+        "recordings": "the median of the medians of its recordings",
         "estimated": "an estimate by `anytouch data contact`",
         "first": "the first frame of the recording",
+        "pixels": "raw pixels, with the median of 100 frames",
     }
     for task in TASKS:
         for head in HEADS:
@@ -358,13 +365,16 @@ def backgrounds(folder: Path) -> Page:
             for kind, score in scores.items():
                 change = None if kind == "own" else _minus(score, scores["own"])
                 rows.append((task, head, words[kind], Value(score.share, *score.interval()).times(100), change))
-                if change is not None and head == "linear":
+                if change is not None and head == "linear" and kind in ("rule", "median", "first"):
                     findings.append(compare(words[kind], "the unit's own picture", change, task))
+            if head == "linear" and "pixels" in scores:
+                change = _minus(scores["median"], scores["pixels"])
+                findings.append(compare("the encoder, with the median of 100 frames,", "raw pixels", change, task))
     return Page(
         "backgrounds", "What if there is no picture of the untouched gel?",
         f"The features are those of `{next(iter(records.values()))['encoder']}`, which subtracts the untouched gel. "
         "The recordings begin in contact or near it, so the first frame is a hard case. "
-        "The first frame also stands in where no picture fits, or where no estimate is sure. "
+        "It was the rule before, and it stands in where a unit has no picture, or no estimate is sure. "
         "Scores are as on the page of real recordings.",
         ("task", "head", "subtracted", Measure("right, %"), Measure("minus own picture", "+.1f")),
         rows, findings, (path.name,), "python -m experiments.real.run anytouch-tiny --backgrounds",

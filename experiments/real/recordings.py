@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,12 +11,13 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from anytouch_jax.data.gels import FRAMES, median
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
-from anytouch_jax.data.prepare.contact import contact_scores
+from anytouch_jax.data.prepare.contact import contact_scores, spread
 
 SET = "incipient_slip-gelsight_mini_markers"
-Background = Literal["own", "estimated", "first"]
+Background = Literal["rule", "median", "ten", "half", "recordings", "all", "own", "first", "estimated"]
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,10 @@ class Recordings:
 def read(path: str | Path, background: Background = "own") -> Recordings:
     """Read all frames of the gripper from the manifest of the pack. Raises UserError.
 
-    `background`: what is taken for the untouched gel. It is the unit's own picture, what `anytouch data contact`
-    estimates without that picture, or the first frame of the recording. The first frame stands in where the others are
-    missing, as in `embed`.
+    `background`: what is taken for the untouched gel. "own" is the unit's own picture, and "rule" the same with the
+    median of the unit's frames where it is missing, as in the package. "median" is this median everywhere. "all",
+    "ten", "half" and "recordings" are other forms of it (`_medians`). "estimated" is what `anytouch data contact`
+    finds in the recording alone, and "first" its first frame, which stands in where a picture is missing.
     """
     manifest = manifests.read(path)
     columns = {name: np.array(manifest.column(name).to_pylist(), object) for name in (
@@ -65,7 +68,12 @@ def read(path: str | Path, background: Background = "own") -> Recordings:
     sequence = np.unique(take["sequence"].astype(str), return_inverse=True)[1]
     names = [f"frame {order[np.searchsorted(sequence[order], number)]}" for number in sequence]
     pictures = {name: frames[int(name.split()[1])] for name in names}
-    if background == "own":
+    if background not in ("own", "estimated", "first"):
+        for number, (some, gel) in enumerate(_medians(manifest, rows, frames, background)):
+            pictures[f"median {number}"] = gel
+            for row in some:
+                names[row] = f"median {number}"
+    if background in ("own", "rule"):
         names = [own or name for own, name in zip(take["background_path"], names, strict=True)]
         pictures |= {name: picture(name) for name in set(names) - set(pictures)}
     elif background == "estimated":
@@ -80,6 +88,28 @@ def read(path: str | Path, background: Background = "own") -> Recordings:
         take["split"].astype(str), take["object_fold"].astype(int), take["label.object"].astype(str),
         take["label.slip"].astype(int), manifest.content_hash,
     )  # fmt: skip
+
+
+def _medians(
+    manifest: Manifest, rows: np.ndarray, frames: np.ndarray, form: str
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield row numbers within `rows` of each unit, and the median of its training frames.
+
+    It is of 100 frames, or of "all", of "ten", of the "half" of 100 with least detail, or of the medians of all
+    "recordings".
+    """
+    units, split, sequence = (manifest.text_column(name)[rows] for name in ("unit", "split", "sequence"))
+    for unit in np.unique(units):
+        own = np.flatnonzero(units == unit)
+        train = own[split[own] == "train"]
+        some = spread(train, {"all": len(train), "recordings": len(train), "ten": 10}.get(form, FRAMES))
+        pictures = list(frames[some])
+        if form == "half":
+            detail = [cv2.Laplacian(cv2.GaussianBlur(one, (0, 0), 1.5), cv2.CV_32F).std() for one in pictures]
+            pictures = [pictures[i] for i in np.argsort(detail)[: len(pictures) // 2]]
+        elif form == "recordings":
+            pictures = [median(frames[train[sequence[train] == name]]) for name in np.unique(sequence[train])]
+        yield own, median(pictures)
 
 
 def _estimated(manifest: Manifest, rows: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -92,8 +92,14 @@ def background_records(word: str, path: Path, out: Path) -> None:
     for kind in get_args(recordings.Background):
         data = recordings.read(path, kind)
         about = {"data": data.content_hash, "encoder": name, "fingerprint": encoder.fingerprint, "kind": kind}
-        write_record(out, kind, record_of(features.encoder_features(encoder, data), data, about))
-        print(kind, flush=True)
+        values = {kind: features.encoder_features(encoder, data)}
+        if kind == "median":
+            values["pixels"] = features.pixel_values(data)
+        for title, x in values.items():
+            tasks = {task: task_record(row[""]) for task, row in scores.table({"": x}, data).items()}
+            machine_used = {"machine": dataclasses.asdict(machine.describe())}
+            write_record(out, title, about | {"tasks": tasks} | machine_used)
+            print(title, flush=True)
 
 
 def main() -> None:

@@ -25,8 +25,8 @@ def main() -> None:
     contact = node.create_publisher(Bool, "touch/contact", 1)
     encoder, (source, live) = at.load_encoder(values["model"]), open_source(values["camera"])
     gel = decode(values["background"]) if values["background"] else None
-    preprocess, gate = at.Preprocess(encoder, gel), ContactGate(gel, values["sensor"])
-    row = encoder.sensor_row(values["sensor"])
+    preprocess = at.Preprocess(encoder, gel)  # without a picture it estimates one from the frames
+    gate, row = ContactGate(preprocess, values["sensor"]), encoder.sensor_row(values["sensor"])
     frames = stream(encoder, source, preprocess, live=live, sensor=row, contact=gate)
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(frames):
         for frame in frames:

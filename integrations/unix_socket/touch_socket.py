@@ -7,12 +7,11 @@ import argparse
 import contextlib
 import json
 import socket
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 
-def serve(embedded: Iterable[Any], path: str) -> None:
+def serve(embedded: Any, path: str) -> None:
     """Send each frame of a stream to all clients of the socket at `path`. A client that is too slow is dropped."""
     clients: list[socket.socket] = []
     with socket.socket(socket.AF_UNIX) as server, contextlib.ExitStack() as stack:
@@ -24,8 +23,9 @@ def serve(embedded: Iterable[Any], path: str) -> None:
             with contextlib.suppress(BlockingIOError):
                 clients.append(stack.enter_context(server.accept()[0]))
                 clients[-1].setblocking(False)
-            contact = None if frame.contact != frame.contact else bool(frame.contact)  # NaN is unknown
-            line = {"frame": frame.number, "time": frame.time, "contact": contact, "features": frame.values.tolist()}
+            line = {"frame": frame.number, "time": frame.time, "features": frame.values.tolist()}
+            line["contact"] = None if frame.contact != frame.contact else bool(frame.contact)  # NaN is unknown
+            line |= {"background": "estimated"} if frame.estimated else {}
             for client in list(clients):
                 try:
                     client.sendall(json.dumps(line).encode() + b"\n")
@@ -45,6 +45,6 @@ if __name__ == "__main__":
         parser.add_argument(name, nargs=count)
     given = parser.parse_args()
     encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(given.camera)
-    background, row = given.background and decode(given.background), encoder.sensor_row(given.sensor)
-    preprocess, gate = at.Preprocess(encoder, background), ContactGate(background, given.sensor)
+    preprocess = at.Preprocess(encoder, given.background and decode(given.background))  # without, it estimates one
+    row, gate = encoder.sensor_row(given.sensor), ContactGate(preprocess, given.sensor)
     serve(stream(encoder, source, preprocess, live=live, sensor=row, contact=gate), given.address)

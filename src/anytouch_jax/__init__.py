@@ -22,6 +22,7 @@ _HOMES = {
     "pretrain": "pretrain",
     "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",
+    "data.gels": "untouched_gel",
     "data.loading.loader": "Loader",
     "data.manifest.manifest": "Manifest",
     "weights.registry": "list_encoders",

@@ -336,10 +336,13 @@ def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
     manifest = manifests.read(world)
     lenient = replace(encoder, config=replace(encoder.config, data=replace(encoder.config.data, on_bad_sample="skip")))
     blind = replace(lenient, config=replace(lenient.config, data=replace(lenient.config.data, background="subtract")))
-    with pytest.raises(UserError, match="background_path"):  # however it was trained
-        embed_rows(blind, manifests.select_rows(manifest, np.array([0])), np.array([0]))
+    with pytest.raises(UserError, match="untouched gel"):  # however it was trained
+        embed_rows(blind, manifests.select_rows(manifest, np.array([0])), np.array([0]), log=lambda _: None)
+    gone = {name: manifest.column(name).to_pylist() for name in manifest.table.column_names}
+    gone |= {"path": ["gone.png"] * len(manifest)}
     with pytest.raises(UserError, match=r"none of the 2 rows can be read"):
-        embed_rows(blind, manifest, np.array([0, 1]), on_bad_sample="skip", log=lambda _: None)
+        lost = manifests.from_columns(gone, manifest.files[0])
+        embed_rows(lenient, lost, np.array([0, 1]), on_bad_sample="skip", log=lambda _: None)
 
 
 def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -186,7 +188,10 @@ def test_contact_is_a_difference_from_the_untouched_gel():
     gate = ContactGate(gel, "digit")
     assert (gate(gel), gate(pressed)) == (0.0, 1.0)
     assert np.isnan(ContactGate(None, "digit")(pressed))
-    first = ContactGate(None, "digit", first=True)
-    assert (first(gel), first(pressed)) == (0.0, 1.0)
+    running = SimpleNamespace(background=None)  # as of a Preprocess
+    gate_of = ContactGate(running, "digit")
+    assert np.isnan(gate_of(pressed))
+    running.background = gel
+    assert (gate_of(gel), gate_of(pressed)) == (0.0, 1.0)
     with pytest.raises(UserError, match="--background"):
         gate(np.zeros((80, 60, 3), np.uint8))

@@ -16,7 +16,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import counterfactual as cf
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore
 from anytouch_jax.evaluate.probing import probe_tasks
-from anytouch_jax.evaluate.statistics import GroupSums
+from anytouch_jax.evaluate.statistics import GroupSums, paired_gain
 
 WORLD = simulated(objects=16, each=1)
 
@@ -47,10 +47,10 @@ def test_a_paired_gain_is_narrower_than_two_intervals():
     rng, groups = np.random.default_rng(0), np.repeat(np.arange(40), 5)
     easy = np.repeat(rng.random(40) < 0.5, 5)  # both are right on half of the groups
     better = easy | (rng.random(200) < 0.3)
-    gain = cf.paired_gain([sums(better, groups)], [sums(easy, groups)], measured=False)
+    gain = paired_gain([sums(better, groups)], [sums(easy, groups)], measured=False)
     assert gain["difference"] == pytest.approx(better.mean() - easy.mean())
     assert 0 < gain["low"] < gain["difference"] < gain["high"] < gain["low"] + 0.2
-    same = cf.paired_gain([sums(easy, groups)], [sums(easy, groups)], measured=False)
+    same = paired_gain([sums(easy, groups)], [sums(easy, groups)], measured=False)
     assert (same["difference"], same["low"], same["high"]) == (0, 0, 0)
 
 
@@ -69,7 +69,7 @@ def test_touch_matters_where_only_touch_has_the_label():
     assert len(runs) == len(results["results"]) == 3
     gains = [
         {"task": key[1], "head": key[2], "protocol": key[3], "control": key[0]}
-        | cf.paired_gain(runs[cf.REAL, *key[1:]], several, measured=False)
+        | paired_gain(runs[cf.REAL, *key[1:]], several, measured=False)
         for key, several in runs.items() if key[0] != cf.REAL
     ]  # fmt: skip
     assert min(gain["low"] for gain in gains) > 0 and min(gain["difference"] for gain in gains) > 0.3

@@ -16,11 +16,13 @@ from anytouch_jax.evaluate.probing import (
     Outcome,
     ProbeResult,
     SubsetResult,
+    label_verdicts,
     leave_groups_out,
     majority_baseline,
     probe_features,
     probe_json,
     probe_table,
+    verdict,
 )
 
 Array = np.ndarray[Any, Any]
@@ -411,7 +413,8 @@ TWO = ProbeResult(
 
 
 def test_a_table_of_classes_and_numbers() -> None:
-    lines = probe_table([ONE, TWO]).splitlines()
+    assert probe_table([ONE, TWO]).count("\n| ") == 3  # parts are details
+    lines = probe_table([ONE, TWO], details=True).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
     one, part, empty, two = (dict(zip(cells[0], row, strict=True)) for row in cells[2:])
     assert (one["score"], one["95 %"], one["chance"], one["refits"]) == (
@@ -424,6 +427,30 @@ def test_a_table_of_classes_and_numbers() -> None:
     assert (part["probe"], part["score"], empty["score"]) == ("linear: with photo", "60.0 %", "-")
     assert (two["score"], two["95 %"], two["chance"]) == ("R2 0.810, 0.123", "0.700 to 0.900", "0.5")
     assert lines[-1] == "- linear (honest): 3 rows without this label left out"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [
+        (0.03, 0.21, "ours is 12 points above raw pixels (3 to 21)."),
+        (-0.02, 0.26, "no better than raw pixels: +12 points"),
+        (None, None, "ours is +12 points from raw pixels, by too few test recordings to be sure."),
+    ],
+)
+def test_a_verdict_is_a_paired_interval(low: float | None, high: float | None, words: str) -> None:
+    assert words in verdict("ours", {"difference": 0.12, "low": low, "high": high})
+
+
+def test_a_source_is_compared_with_raw_pixels_on_the_same_groups() -> None:
+    groups = np.repeat(np.arange(40), 3)
+    right = {"ours": np.ones(120, bool), "raw pixels": np.arange(120) % 2 == 0, "random encoder": np.zeros(120, bool)}
+    results = [
+        replace(ONE, probe=f"{name}: {kind}", outcome=Outcome(np.arange(120), correct, groups))
+        for name, correct in right.items() for kind in ("linear", "kNN")
+    ]  # fmt: skip
+    (sentence,) = label_verdicts([*results, replace(ONE, probe="commonest class")])
+    assert sentence.startswith("ours is 50 points above raw pixels (")
+    assert label_verdicts(results[:2]) == []
 
 
 def test_json() -> None:

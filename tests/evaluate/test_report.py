@@ -278,7 +278,7 @@ def test_the_reconstructions_show_each_sensor(demo: tuple[Path, list[str]]) -> N
 def test_a_report_says_what_it_could_not_score(
     touched: Path, tiny_run: Path, later: Path, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    """No background, no covariates, no forces, too few touches: the report is made and names each."""
+    """No covariates, no forces, too few touches: the report is made and names each."""
     table = manifests.read(touched).table
     gone = ("label.x", "label.y", "label.depth", "label.force", "label.area", "background_path", "grade")
     poor = touched.parent / "poor.parquet"
@@ -287,7 +287,7 @@ def test_a_report_says_what_it_could_not_score(
     path = demo_report(poor, tiny_run, later, tmp_path, lambda _: None, touches=12)
     text = path.read_text()
     for words in (
-        "no baseline by pixels minus background: row ", f"no baseline by {VECTOR}: the manifest has none",
+        f"no baseline by {VECTOR}: the manifest has none",
         "test: a sensor has 12 touches only, so galleries have 12, not 50",
         "test, gallery matched: not scored: The manifest has none of label.x",
         "force: the manifest has no column label.force",

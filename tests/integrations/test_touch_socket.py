@@ -30,7 +30,8 @@ def test_every_client_gets_whole_lines_and_a_lost_one_stops_nothing(tmp_path):
         number = 0
         while not stop.is_set():
             contact = (1.0, 0.0, float("nan"))[number % 3]
-            yield SimpleNamespace(number=number, time=0.1 * number, contact=contact, values=np.arange(3.0))
+            about = {"contact": contact, "estimated": False}
+            yield SimpleNamespace(number=number, time=0.1 * number, values=np.arange(3.0), **about)
             number += 1
             time.sleep(0.002)
 

@@ -102,7 +102,7 @@ def test_calibration_images_of_sitr_have_their_own_tokens(tmp_path):
     file = tmp_path / "sitr.safetensors"
     save_file({f"base_model.{key}": x for key, x in weights.items() if not key.startswith("head.")}, file)
     encoder = load_encoder(file, heads=4)
-    with pytest.raises(UserError, match="needs background"):
+    with pytest.raises(UserError, match="subtracts the untouched gel"):
         encoder.preprocess(ROLLED)
     frame = encoder.preprocess(ROLLED, ROLLED[::-1])
     difference = ROLLED[0, 0, 0] - float(ROLLED[-1, 0, 0])  # in grey levels

@@ -86,10 +86,10 @@ def test_a_frame_shows_its_difference_and_contact(page):
         assert page.get(f"/api/0/{path}").status_code == 400
 
 
-def test_without_a_background_the_first_frame_stands_in(film, tmp_path):
+def test_without_a_background_the_untouched_gel_is_estimated(film, tmp_path):
     shutil.copy(film, tmp_path / "film.avi")
     page = client(tmp_path / "film.avi")
-    assert [page.get(f"/api/0/frame/{row}").headers["x-panels"] for row in (0, 11)] == ["1", "3"]
+    assert [page.get(f"/api/0/frame/{row}").headers["x-panels"] for row in (0, 11)] == ["3", "3"]
     grey = {row: picture(page.get(f"/api/0/frame/{row}"))[:, :48].mean() for row in (11, 3, 4, 0, 7)}
     for row, value in grey.items():  # frames in any order
         assert abs(value - 20 - 15 * row) < 4

@@ -10,6 +10,7 @@ from lerobot.cameras.camera import Camera
 from lerobot.cameras.opencv import OpenCVCamera, OpenCVCameraConfig
 
 from anytouch_jax import load_encoder
+from anytouch_jax.data.gels import RunningGel
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.transforms import orient_frame, subtract_background
 from lerobot_camera_anytouch.config_anytouch import AnyTouchCameraConfig
@@ -25,7 +26,7 @@ class AnyTouchCamera(Camera):
         width, height = reversed(sides) if config.rotate in (90, 270) else sides
         inner = OpenCVCameraConfig(index_or_path=config.index_or_path, fps=config.fps, width=width, height=height)
         self._camera = OpenCVCamera(inner)
-        self._gel: np.ndarray | None = None
+        self._gel = RunningGel()
 
     @property
     def is_connected(self) -> bool:
@@ -38,13 +39,16 @@ class AnyTouchCamera(Camera):
         return [camera | {"type": "anytouch"} for camera in OpenCVCamera.find_cameras()]
 
     def connect(self, warmup: bool = True) -> None:
-        """Open the camera and take the picture of the untouched gel, from the file or from the first frame."""
+        """Open the camera and read the picture of the untouched gel. Without one it is estimated from the frames."""
         self._camera.connect(warmup=warmup)
         self.width, self.height = self._camera.width, self._camera.height
         if self.config.rotate in (90, 270):
             self.width, self.height = self.height, self.width
         self.fps = self._camera.fps
-        self._gel = decode(self.config.background) if self.config.background else np.array(self._camera.read())
+        self._gel = RunningGel()
+        if self.config.background:
+            self._gel.picture, self._gel.settled = decode(self.config.background), True
+        self._gel.add(np.array(self._camera.read()))
 
     def disconnect(self) -> None:
         """Close the camera."""
@@ -52,11 +56,11 @@ class AnyTouchCamera(Camera):
 
     def read(self, *settings: Any) -> np.ndarray:
         """Return the next picture."""
-        return self._prepared(self._camera.read(*settings))
+        return self._prepared(self._new(self._camera.read(*settings)))
 
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
         """Return the newest picture that was not read yet. Raises TimeoutError."""
-        return self._prepared(self._camera.async_read(timeout_ms=timeout_ms))
+        return self._prepared(self._new(self._camera.async_read(timeout_ms=timeout_ms)))
 
     def read_latest(self, max_age_ms: int = 500) -> np.ndarray:
         """Return the newest picture at once. Raises TimeoutError if it is older."""
@@ -65,7 +69,7 @@ class AnyTouchCamera(Camera):
     def features(self, max_age_ms: int = 500) -> np.ndarray:
         """Return the features f32 (E,) of the newest picture. The encoder is loaded at the first call."""
         frame = self._oriented(self._camera.read_latest(max_age_ms=max_age_ms))
-        gel = self._oriented(self._gel) if self._encoder.subtracts and self._gel is not None else None
+        gel = self._untouched() if self._encoder.subtracts else None
         return np.asarray(self._encoder.encode_touch(self._encoder.preprocess(frame, gel), self.config.sensor)[0])
 
     @cached_property
@@ -75,8 +79,14 @@ class AnyTouchCamera(Camera):
     def _oriented(self, frame: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(orient_frame(frame, self.config.rotate, self.config.flip))  # type: ignore[arg-type]
 
+    def _new(self, frame: np.ndarray) -> np.ndarray:
+        self._gel.add(frame)
+        return frame
+
+    def _untouched(self) -> np.ndarray:
+        assert self._gel.picture is not None
+        return self._oriented(self._gel.picture)
+
     def _prepared(self, frame: np.ndarray) -> np.ndarray:
-        frame = self._oriented(frame)
-        if not self.config.subtract or self._gel is None:
-            return frame
-        return subtract_background([frame], self._oriented(self._gel))[0]
+        upright = self._oriented(frame)
+        return subtract_background([upright], self._untouched())[0] if self.config.subtract else upright

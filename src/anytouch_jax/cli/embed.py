@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +17,7 @@ from anytouch_jax.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
+    from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.embed import Features
@@ -85,10 +86,11 @@ def run(options: EmbedOptions) -> int:
     encoder, pooling, head = load_inputs(options)
     about: dict[str, str] = {}
     if is_manifest:
-        features = _embed_manifest(encoder, options, pooling)
+        features = _embed_manifest(encoder, options, pooling, encoder.gels if head is None else head.gels)
     else:
-        row, preprocess, gate, about = frames_input(encoder, options, data)
+        row, preprocess, gate, about = frames_input(encoder, options, data, encoder.gels if head is None else head.gels)
         features = _embed_frames(encoder, options, pooling, row, preprocess, gate)
+        features.gels.update(gels_of(preprocess, options))
         log_universal(encoder, options)
     about |= {"pooling": pooling, "input": " ".join(map(str, options.data))}
     save_features(options.out, encoder, features, head, options, about)
@@ -150,30 +152,88 @@ def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def frames_input(
-    encoder: Encoder, options: FrameOptions, data: Path
+    encoder: Encoder, options: FrameOptions, data: Path, known: Mapping[str, np.ndarray]
 ) -> tuple[int, Preprocess, ContactGate, dict[str, str]]:
     """Return the sensor's row, preprocessing, contact gate and metadata of the frames of a folder, video or camera.
 
-    The picture of the untouched gel is that of --background, or that of the folder if the encoder needs it. What is
-    subtracted is logged.
+    `known` are the pictures of the untouched gel that a head was fitted with. What is subtracted is logged.
     """
-    from anytouch_jax.data.images import BACKGROUND, decode, list_images
+    from anytouch_jax.data.gels import as_taken
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.novelty import ContactGate
 
-    row, gel = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.background
-    if gel is None and data.is_dir():
-        gel = list_images(data)[1].get(BACKGROUND)
-    background = str(gel) if gel is not None else "the first frame" if encoder.needs_background else "not subtracted"
+    row, sensor = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.sensor or UNIVERSAL
     if options.background is not None and not encoder.subtracts:
         log("--background only decides contact: this encoder was trained on frames without background subtraction")
-    if options.background is None and encoder.needs_background:
-        log(f"this encoder needs background-subtracted frames: {background} is the background (see --background)")
-    picture = None if gel is None else decode(gel)
-    preprocess = Preprocess(encoder, picture, rotate=options.rotate, flip=options.flip)
-    gate = ContactGate(picture, options.sensor or UNIVERSAL, first=encoder.needs_background)
-    about = {"background": background if encoder.subtracts else "not subtracted", "rotate": str(options.rotate)}
-    return row, preprocess, gate, about | {"sensor": options.sensor or UNIVERSAL, "flip": options.flip}
+    known = {name: as_taken(gel, options.rotate, options.flip) for name, gel in known.items()}
+    picture, background = choose_gel(encoder, options.background, data, known)
+    preprocess = Preprocess(encoder, picture, rotate=options.rotate, flip=options.flip, known=known, log=log)
+    about = {"background": background, "rotate": str(options.rotate), "sensor": sensor, "flip": options.flip}
+    return row, preprocess, ContactGate(preprocess, sensor), about
+
+
+def choose_gel(
+    encoder: Encoder, named: Path | None, data: Path, known: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray | None, str]:
+    """Return the untouched gel of a folder, a video, a picture or a camera, and what it is, which is logged.
+
+    It is the picture that the user named, that of the unit among the `known` ones, that of the folder, or the median of
+    the frames. It is None for a camera, and for an encoder that does without. Raises UserError for too few frames.
+    """
+    from anytouch_jax.data import gels
+    from anytouch_jax.data.images import BACKGROUND, decode, list_images
+
+    stored = list_images(data)[1].get(BACKGROUND) if data.is_dir() else None
+    picture, what, count = None, "not subtracted", 0
+    if named is not None or (stored is not None and not (known and encoder.subtracts)):
+        picture, what = decode(named or stored), str(named or stored) if encoder.subtracts else what  # type: ignore[arg-type]
+    elif encoder.subtracts and not data.exists():
+        what = "a picture of the head, or a running estimate" if known else "a running estimate"
+        what = what if known or encoder.needs_background else "not subtracted"
+    elif encoder.subtracts:
+        look, count = (decode(stored), 1) if stored else gels.recording_gel(_some_frames(data))
+        gel, why = gels.same_unit(known, look)
+        if why:
+            log(gels.other_unit(why))
+        if gel is not None and (not why or (not stored and count < gels.FEWEST)):
+            picture, what = gel, "the picture that the head was fitted with"
+        elif stored or count >= gels.FEWEST:
+            picture, what = look, str(stored) if stored else f"estimated from {count} frames of {data}"
+        elif encoder.needs_background:
+            raise UserError(
+                f"{data} has too few frames to estimate the untouched gel, which is subtracted. {gels.ADVICE}"
+            )
+    if encoder.subtracts:
+        log(f"untouched gel: {what}")
+    return picture, what
+
+
+def _some_frames(data: Path) -> Iterator[np.ndarray]:
+    """Yield evenly spread frames of a folder, all frames of a video, or a picture. Broken ones are left out."""
+    from contextlib import suppress
+
+    from anytouch_jax.data import images
+    from anytouch_jax.data.gels import FRAMES
+
+    is_picture = data.is_file() and data.suffix.lower() in images.SUFFIXES
+    if not data.is_dir() and not is_picture:
+        yield from images.frames_from_video(data)
+        return
+    files = [data] if is_picture else images.list_images(data)[0]
+    for file in files[:: -(-len(files) // FRAMES)]:
+        with suppress(images.ImageError):
+            yield images.decode(file)
+
+
+def gels_of(preprocess: Preprocess, options: FrameOptions) -> dict[str, np.ndarray]:
+    """Return the untouched gel that was subtracted, upright, by the name of the sensor."""
+    from anytouch_jax.data.gels import reduced
+    from anytouch_jax.data.transforms import orient_frame
+
+    gel = preprocess.background
+    return (
+        {} if gel is None else {options.sensor or UNIVERSAL: reduced(orient_frame(gel, options.rotate, options.flip))}
+    )
 
 
 def log_universal(encoder: Encoder, options: FrameOptions) -> None:
@@ -192,26 +252,31 @@ def log_if_cut(video: Path, count: int) -> None:
         log(f"{video} reports {reported} frames and {count} could be read. The file may be incomplete.")
 
 
-def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any) -> Features:
+def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any, known: Mapping[str, np.ndarray]) -> Features:
     import numpy as np
 
+    from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import embed as embedding
 
     manifest = manifests.read(options.data)
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     usable = usable_rows(manifest, rows, options.frames)
+    gels = UnitGels(manifest, known, log) if encoder.subtracts else None
+    if gels is not None:
+        log(gels.report(usable))
     rows, values = embedding.embed_rows(
         encoder, manifest, usable, options.frames, pooling, options.join, batch=options.batch,
-        on_bad_sample=options.on_bad_sample, log=log,
+        on_bad_sample=options.on_bad_sample, gels=gels, log=log,
     )  # fmt: skip
     keys = {name: manifest.text_column(name)[rows] for name in ("path", "sensor", "sequence", "split")}
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
     others = ("object", "unit", "index", "timestamp")
     more = [name for name in manifest.table.column_names if name in others or name.startswith("label.")]
     keys |= {name: embedding.plain_column(manifest, name)[rows] for name in more}
-    touched = {} if options.head is None else {"contact": contact_of_rows(manifest, rows)}
-    return embedding.Features(values, rows, keys, len(usable) - len(rows), touched)
+    touched = {} if options.head is None else {"contact": contact_of_rows(manifest, rows, gels)}
+    pictures = {} if gels is None else gels.pictures(rows)
+    return embedding.Features(values, rows, keys, len(usable) - len(rows), touched, pictures)
 
 
 def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray:
@@ -228,15 +293,16 @@ def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray
     return usable
 
 
-def contact_of_rows(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
-    """Return the contact of `rows` (n,): label.contact, or by the row's background picture; NaN if unknown."""
+def contact_of_rows(manifest: Manifest, rows: np.ndarray, gels: UnitGels | None = None) -> np.ndarray:
+    """Return the contact of `rows` (n,): label.contact, or by the untouched gel; NaN if unknown."""
     import numpy as np
 
+    from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.prepare import contact
 
     known, limits = contact.known_contact(manifest)[rows], contact.threshold_of_rows(manifest, None, 0.0)[rows]
-    scored = rows[np.isnan(known) & manifest.present("background_path")[rows]]
-    score = contact.contact_scores(manifest, scored).score[rows] if len(scored) else np.full(len(rows), np.nan)
+    unknown = rows[np.isnan(known)]
+    score = contact.contact_scores(manifest, unknown, gels=gels or UnitGels(manifest)).score[rows]
     return np.where(np.isnan(known), np.where(np.isnan(score), np.nan, score > limits), known)
 
 

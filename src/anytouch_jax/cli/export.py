@@ -82,7 +82,7 @@ def run(options: ExportOptions) -> int:
     names = ("frames", "platforms", "pooling", "join")
     about = export(
         encoder, options.out, form="onnx" if onnx else "jax",
-        calibration=_calibration(encoder, options) if options.int8 else None,
+        **(_calibration(encoder, options) if options.int8 else {}),
         **{name: getattr(options, name) for name in names},
     )  # fmt: skip
     print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; {about['input']}")
@@ -93,17 +93,19 @@ def run(options: ExportOptions) -> int:
     return 0
 
 
-def _calibration(encoder: Encoder, options: ExportOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), evenly spaced in the manifests."""
+def _calibration(encoder: Encoder, options: ExportOptions) -> dict[str, Any]:
+    """Return `export`'s touches u8 (200, T, H, W, 3) with sensor rows i32 (200,), evenly spaced, and untouched gels."""
     import numpy as np
 
     from anytouch_jax.cli.embed import usable_rows
+    from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder.embed import embed_rows
+    from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
     from anytouch_jax.encoder.engines import CALIBRATION
 
     manifest, clips = manifests.read(options.data), list[np.ndarray]()
-    rows = usable_rows(manifest, np.arange(len(manifest)), options.frames)
+    gels = UnitGels(manifest)
+    rows = rows_with_gel(encoder, gels, usable_rows(manifest, np.arange(len(manifest)), options.frames), log)
     if len(rows) < CALIBRATION:
         raise UserError(f"--int8 needs {CALIBRATION} touches and --data has {len(rows)}. Name more manifests.")
     rows = rows[np.linspace(0, len(rows) - 1, CALIBRATION).astype(int)]
@@ -112,9 +114,10 @@ def _calibration(encoder: Encoder, options: ExportOptions) -> tuple[np.ndarray, 
         clips.append(part)
         return part
 
-    given, _ = embed_rows(encoder, manifest, rows, options.frames, edit=keep, log=log)
+    given, _ = embed_rows(encoder, manifest, rows, options.frames, edit=keep, gels=gels, log=log)
     sensors = manifest.text_column("sensor")[given]
-    return np.concatenate(clips), np.array([encoder.sensor_row(name, lambda _: None) for name in sensors], np.int32)
+    ids = np.array([encoder.sensor_row(name, lambda _: None) for name in sensors], np.int32)
+    return {"calibration": (np.concatenate(clips), ids), "gels": gels.pictures(given) if encoder.subtracts else None}
 
 
 def _export_card(options: ExportOptions, folder: Path) -> int:

@@ -100,8 +100,8 @@ def _seen_by(model: Path, table: Manifest, unit: UnitHealth) -> UnitHealth:
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, 96).astype(int))] if len(rows) else rows
     touched = contact_of_rows(table, rows)
     rows, touched = rows[~np.isnan(touched)], touched[~np.isnan(touched)] > 0
-    values = embed_rows(load_encoder(model), table, rows, log=log)[1] if len(rows) else np.zeros((0, 1))
-    return replace(unit, checks=(*unit.checks, contact_visible(values, touched)))
+    kept, values = embed_rows(load_encoder(model), table, rows, log=log) if len(rows) else (rows, np.zeros((0, 1)))
+    return replace(unit, checks=(*unit.checks, contact_visible(values, touched[np.isin(rows, kept)])))
 
 
 def _lines(path: Path) -> list[str]:

@@ -52,6 +52,7 @@ class LabelOptions(ProbeOptions):
     seeds: NotNegative[int] = 5  # Bootstrap resamples of the training groups.
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says so."""
+    details: bool = False  # Also print parts of the test rows: classes that alignment may have named, and others.
     save: Path | None = None  # Write the linear head of one --model as .npz, for embed --head and stream --head.
     coverage: Inner = 0.9  # Share of touches whose set of classes holds the true one, of a saved head.
     false_alarms: Inner = 0.05  # Share of known touches that a saved head calls novel.
@@ -107,7 +108,7 @@ class BenchmarkOptions(BatteryOptions):
 
 def run_label(options: LabelOptions) -> int:
     """Probe a label column, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.probing import probe_label, probe_table
+    from anytouch_jax.evaluate.probing import label_verdicts, probe_label, probe_table
 
     if options.leave_out is not None:
         refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")
@@ -117,7 +118,11 @@ def run_label(options: LabelOptions) -> int:
         refuse_unused(options, ("coverage", "false_alarms"), "without --save, which writes the calibrated head")
     check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
-    print_table(probe_table(probe_label(**_settings(options), log=log)))
+    settings = _settings(options)
+    details = settings.pop("details")
+    results = probe_label(**settings, log=log)
+    print("".join(f"{line}\n" for line in label_verdicts(results)))
+    print_table(probe_table(results, details=details))
     log_default((*options.model, *options.features))
     return 0
 
@@ -135,6 +140,7 @@ def run_tasks(options: TasksOptions) -> int:
     if settings.pop("counterfactual"):
         return _run_counterfactual(options, settings)
     results = probe_tasks(**settings, log=log)
+    print("".join(f"{line}\n" for line in results["verdicts"]))
     print_table(probe_table(results["results"], results["paper"]))
     log_default((*options.model, *options.features))
     return 0
@@ -165,6 +171,7 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     from anytouch_jax.evaluate.probing import probe_benchmark, probe_table
 
     results = probe_benchmark(**_settings(options), log=log)
+    print("".join(f"{line}\n" for line in results["verdicts"]))
     print_table(probe_table(results["results"], results["paper"]))
     log_default((*options.model, *options.features))
     return 0

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -64,6 +66,7 @@ def run(options: RetrieveOptions) -> int:
         raise UserError("Give a manifest with --data, or features to search in with --index.")
     import numpy as np
 
+    from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.encoder import encoder as features
@@ -85,19 +88,26 @@ def run(options: RetrieveOptions) -> int:
     table = manifests.read(options.data)
     rows = table.rows_of(options.split)
     rows = rows[~np.isin(table.text_column("sensor")[rows], FIELD_SENSORS)]
+    gels = UnitGels(table)
     rows = retrieval.deepest_rows(table, rows, frames=options.frames)
+    for encoder in encoders.values():
+        rows = embedding.rows_with_gel(encoder, gels, rows, log)
     settings: dict[str, Any] = {
         "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
         "seeds": options.seeds,
     }  # fmt: skip
     retrieval.cross_sensor_retrieval(table, {}, rows, **settings)  # raises for an impossible gallery, before the work
+    log(gels.report(rows))
     values: dict[str, Any] = {}
     for name, encoder in encoders.items():
-        kept, values[name] = embedding.embed_rows(encoder, table, rows, options.frames, options.pooling, log=log)
+        kept, values[name] = embedding.embed_rows(
+            encoder, table, rows, options.frames, options.pooling, gels=gels, log=log
+        )
         if len(kept) < len(rows):
             raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest first.")
     if options.controls:
-        for name, make in ((PIXELS, background_difference), (VECTOR, retrieval.contact_vector)):
+        pixels = partial(background_difference, gels=gels)
+        for name, make in ((PIXELS, pixels), (VECTOR, retrieval.contact_vector)):
             try:
                 values[name] = make(table, rows)
             except UserError as error:
@@ -133,7 +143,7 @@ def _search(options: RetrieveOptions) -> int:
     enable_compilation_cache()
     encoder = load_encoder((options.model or (Path(DEFAULT),))[0])
     index.check(encoder.source, encoder.fingerprint)
-    ids, cosines = index.search(_query(options, encoder, index.about), options.count)
+    ids, cosines = index.search(_query(options, encoder, index.about, index.gels), options.count)
     hits = [{"cosine": f"{cosine:.3f}"} | index.describe(row) for row, cosine in zip(ids[0], cosines[0], strict=True)]
     head = list(hits[0])
     print_table(markdown_table(head, [[shorten(hit[name]) for name in head] for hit in hits]))
@@ -144,10 +154,13 @@ def _search(options: RetrieveOptions) -> int:
     return 0
 
 
-def _query(options: RetrieveOptions, encoder: Encoder, about: dict[str, str]) -> np.ndarray:
+def _query(
+    options: RetrieveOptions, encoder: Encoder, about: dict[str, str], known: Mapping[str, np.ndarray]
+) -> np.ndarray:
     """Return features (1, d) of a picture, of the last clip of a folder or video, or of a sentence."""
     import numpy as np
 
+    from anytouch_jax.cli.embed import choose_gel
     from anytouch_jax.data import images
     from anytouch_jax.encoder.base import Preprocess
 
@@ -166,8 +179,7 @@ def _query(options: RetrieveOptions, encoder: Encoder, about: dict[str, str]) ->
         frames = list(images.frames_from_video(path))[-length:]
     if len(frames) < length:
         raise UserError(f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more frames.")
-    gel = None if options.background is None else images.decode(options.background)
-    preprocess = Preprocess(encoder, gel)
+    preprocess = Preprocess(encoder, choose_gel(encoder, options.background, path, known)[0])
     clip = np.stack([preprocess(frame) for frame in frames])[None]
     join: Any = about.get("join", "mean")
     return encoder.encode_touch(clip, options.sensor or UNIVERSAL, pooling=pooling, join=join)  # type: ignore[arg-type]

@@ -52,7 +52,8 @@ def run(options: StreamOptions) -> int:
 
     source, live = stream.open_source(data)
     encoder = on_engine(encoder, options.engine, options.frames, pooling)
-    row, preprocess, gate, about = embed.frames_input(encoder, options, data)
+    known = encoder.gels if head is None else head.gels
+    row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
     embedded = stream.stream(
         encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,
         pooling=pooling, join=options.join, log=log, contact=gate, reuse=options.reuse,
@@ -73,7 +74,8 @@ def run(options: StreamOptions) -> int:
             about |= {"started": f"{result.started:.6f}"}
             about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}
         features = Features(result.values, result.numbers, {"frame_index": result.numbers, "time": result.time})
-        features.keys["reused"] = result.reused
+        features.keys.update(reused=result.reused, estimated=result.estimated)
+        features.gels.update(embed.gels_of(preprocess, options))
         features.predictions["contact"] = result.contact
         embed.save_features(options.out, encoder, features, head, options, about)
     embed.log_universal(encoder, options)
@@ -91,7 +93,7 @@ def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
     line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
     if live:
         line |= {"picture": frame.picture, "missed": frame.missed}
-    line["reused"] = frame.reused
+    line |= {"reused": frame.reused} | ({"background": "estimated"} if frame.estimated else {})
     if head is not None and head.calibration is not None:
         one = head.assess(frame.values[None])
         line |= {"label": str(one.label[0]), "p": round(float(one.p.max()), 6)}

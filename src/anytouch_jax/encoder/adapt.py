@@ -19,6 +19,7 @@ import pyarrow as pa
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, from_json, to_json
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
@@ -82,6 +83,9 @@ def adapt(
         return Adapted(config, params, (), float("nan"), float("nan"), "fitted", metadata)
     with precision(config):
         classes, prototypes = _classes(run, manifest, sensor, labels, log)
+        if config.data.background == "subtract":
+            rows = np.flatnonzero((manifest.text_column("sensor") == sensor) & (classes >= 0))
+            classes[np.setdiff1d(rows, rows[UnitGels(manifest).has(rows)])] = -1
         fitted = choose_frames(manifest, sensor, "train", frames, classes, seed)
         in_val = (manifest.text_column("sensor") == sensor) & (manifest.text_column("split") == "val") & (classes >= 0)
         rows, measured = fitted[:MEASURED], "fitted"

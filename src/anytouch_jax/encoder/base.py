@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
+from anytouch_jax.data.gels import RunningGel, other_unit, same_unit, untouched_gel
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
@@ -91,6 +92,11 @@ class Encoder:
         """Whether it was trained on background-subtracted touches only."""
         return self.config.data.background == "subtract"
 
+    @property
+    def gels(self) -> dict[str, np.ndarray]:
+        """Pictures of the untouched gel by unit, of an exported encoder that stores some."""
+        return {}
+
     @cached_property
     def fingerprint(self) -> str:
         """CRC-32 of the touch encoder's parameters, in hexadecimal."""
@@ -133,11 +139,15 @@ class Encoder:
     def preprocess(self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None) -> np.ndarray:
         """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder does so.
 
-        Raises UserError if the encoder needs a `background`, the picture of the untouched gel, and there is none. Use
-        `Preprocess` for a camera: it stores the background.
+        Raises UserError if the encoder needs a `background`, the picture of the untouched gel, and there is none.
+        `untouched_gel(frames)` makes one. Use `Preprocess` for a camera: it stores the background.
         """
         if self.needs_background and background is None:
-            raise UserError(f"{self.source} needs background-subtracted frames. Give the background, an untouched gel.")
+            raise UserError(
+                f"{self.source} subtracts the untouched gel. Give its picture, or that of some frames: "
+                "encoder.preprocess(frame, at.untouched_gel(frames)). Or prepare all frames with "
+                "at.Preprocess(encoder, frames=frames)."
+            )
         return Preprocess(self, background)(frame)
 
     def encode_touch(
@@ -291,33 +301,61 @@ class Preprocess:
     """Frames of one sensor in the form that an encoder was trained on.
 
     They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and resized. For an encoder
-    that `subtracts`, the `background` (a frame of the untouched gel) is subtracted first. Without a background an
-    encoder that needs one takes the first frame, and another takes frames without subtraction.
+    that `subtracts`, the `background` (a picture of the untouched gel) is subtracted first, or the `untouched_gel` of
+    `frames`. Without either, the first frame chooses among the `known` pictures of a head. If none is of its unit,
+    `log` gets a warning, and the frames so far give a running estimate. So they do for an encoder that needs a
+    background. Another takes frames without subtraction. All pictures are as the camera takes them.
 
-    >>> preprocess = Preprocess(encoder, background=camera.read())
+    >>> preprocess = Preprocess(encoder, frames=frames)
     >>> features = encoder.encode_touch(preprocess(camera.read()), "digit")
     """
 
     def __init__(
-        self, encoder: Encoder, background: npt.ArrayLike | None = None, *, rotate: int = 0, flip: Flip = "none"
-    ) -> None:
-        self._prepare = encoder.prepare
-        self._subtracts = encoder.needs_background or (encoder.subtracts and background is not None)
+        self, encoder: Encoder, background: npt.ArrayLike | None = None, *,
+        frames: Iterable[npt.ArrayLike] | None = None, rotate: int = 0, flip: Flip = "none",
+        known: Mapping[str, np.ndarray] | None = None, log: Log = warn,
+    ) -> None:  # fmt: skip
+        if background is not None and frames is not None:
+            raise UserError("Give a background, or the frames that it is taken from, not both.")
+        self._prepare, self._subtracts = encoder.prepare, encoder.subtracts
         self._orient = partial(orient_frame, rotate=rotate, flip=flip)
-        self._background = None
+        self._known, self._log = dict(known or {}), log
+        self._running = RunningGel() if encoder.needs_background or self._known else None
+        self._background = None if frames is None else untouched_gel(frames)
         if background is not None:
-            self._background = self._orient(to_rgb(np.asarray(background), "the background"))
+            self._background = to_rgb(np.asarray(background), "the background")
+        self._gel: tuple[np.ndarray | None, np.ndarray] = None, np.zeros((0, 0, 3), np.uint8)
+
+    @property
+    def background(self) -> np.ndarray | None:
+        """The picture of the untouched gel, RGB u8 (h, w, 3), as the camera takes it; None if there is none (yet)."""
+        return self._running.picture if self._background is None and self._running else self._background
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the background is a running estimate that is not settled."""
+        return self._background is None and self._running is not None and not self._running.settled
 
     def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
         """Return a frame as RGB u8 (size, size, 3), or as an encoder of another family reads it.
 
         `frame` is RGB u8 (h, w, 3), or grey, RGBA, u16 or floats in 0..1. Raises ImageError for any other.
         """
-        frame = np.ascontiguousarray(self._orient(to_rgb(np.asarray(frame), "the frame")))
-        if self._subtracts:
-            self._background = frame if self._background is None else self._background
-            return self._prepare(frame, self._background)
-        return self._prepare(frame)
+        frame = to_rgb(np.asarray(frame), "the frame")
+        if self._background is None and self._known:
+            known, self._known = self._known, {}
+            gel, why = same_unit(known, frame)
+            self._background = None if why else gel
+            if why:
+                self._log(other_unit(why))
+        if self._background is None and self._running is not None:
+            self._running.add(frame)
+        frame, gel = np.ascontiguousarray(self._orient(frame)), self.background
+        if gel is None or not self._subtracts:
+            return self._prepare(frame)
+        if self._gel[0] is not gel:
+            self._gel = gel, np.ascontiguousarray(self._orient(gel))
+        return self._prepare(frame, self._gel[1])
 
 
 def _unit(values: npt.ArrayLike) -> np.ndarray:

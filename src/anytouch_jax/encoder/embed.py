@@ -13,8 +13,9 @@ import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.bars import tracked
+from anytouch_jax.data.gels import ADVICE, UnitGels, gel_arrays, gels_of_arrays
 from anytouch_jax.data.loading.samples import evaluation
-from anytouch_jax.data.manifest.manifest import Manifest, replace_column
+from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, read_arrays
 
@@ -63,7 +64,7 @@ class Features:
     """Features f32 (n, d), their `rows` i64 (n,) and further `keys` (n,).
 
     Rows are those of a manifest, or frame numbers of a video or folder. `predictions`: arrays (n, ...) of a head.
-    `skipped` counts rows without features.
+    `skipped` counts rows without features. `gels`: pictures of the untouched gel by unit.
     """
 
     values: np.ndarray
@@ -71,27 +72,31 @@ class Features:
     keys: dict[str, np.ndarray]
     skipped: int = 0
     predictions: dict[str, np.ndarray] = field(default_factory=dict)
+    gels: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def embed_rows(
     encoder: Encoder, manifest: Manifest, rows: np.ndarray, frames: int = 1, pooling: Pooling = "class",
     join: Join = "mean", *, batch: int = BATCH, on_bad_sample: Literal["error", "skip"] = "error",
     sensor_row: int | None = None, edit: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
-    log: Log = warn,
+    gels: UnitGels | None = None, log: Log = warn,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return (row numbers i64 (n,), features f32 (n, d)) of manifest rows, each frame encoded once.
 
     A row's clip is the `frames` frames that end at it. A sensor that the model does not know gets the universal tokens,
     which is logged; `sensor_row` serves all rows by one row of the table. `edit` changes clips u8 (B, T, H, W, 3) of
     rows (B,) before they are encoded. With `on_bad_sample` "skip", rows that cannot be read are left out, and the first
-    are logged. Raises UserError.
+    are logged. So are rows for which `gels` (default: the rule of `data.gels`) has no picture of the untouched gel, if
+    the encoder needs one. Raises UserError.
     """
     if not len(rows):
         raise UserError("there are no rows to embed; check the split and the filters")
+    if gels is None and encoder.subtracts:
+        gels = UnitGels(manifest)
+        log(gels.report(rows))
+    rows = rows_with_gel(encoder, gels, rows, log)
     for name in sorted(set(manifest.text_column("sensor")[rows])) if sensor_row is None else ():
         encoder.sensor_row(name, log)
-    if on_bad_sample == "error":
-        manifest = with_backgrounds(encoder, manifest, rows, log)
     settings = {"data.batch_size": min(batch, len(rows)), "data.on_bad_sample": on_bad_sample}
     config, ids, skipped = encoder.config.with_settings(settings), [], list[str]()
 
@@ -99,7 +104,7 @@ def embed_rows(
         kind: Literal["still", "clip"] = "still" if frames == 1 else "clip"
         for row_ids, part in evaluation(
             manifest, rows, config, kind, frames=frames, unknown="universal", prepare=encoder.prepare,
-            like=encoder.blank, skipped=skipped,
+            like=encoder.blank, skipped=skipped, gels=gels,
         ):  # fmt: skip
             ids.append(row_ids)
             clips = part.clip[: len(row_ids)]
@@ -156,30 +161,22 @@ def embed_frames(
     return Features(values, index, keys, max(0, len(names) - length + 1) - len(index))
 
 
-def with_backgrounds(encoder: Encoder, manifest: Manifest, rows: np.ndarray, log: Log = warn) -> Manifest:
-    """Return the manifest with a background for each of `rows` if the encoder needs one.
+def rows_with_gel(encoder: Encoder, gels: UnitGels | None, rows: np.ndarray, log: Log = warn) -> np.ndarray:
+    """Return those of `rows` that have an untouched gel, all of them for an encoder that needs none.
 
-    The first frame of a recording stands in for a background that is missing, as with a camera. Raises UserError for a
-    still without one.
+    The others are counted. Raises UserError if none has one.
     """
-    missing = rows[~manifest.present("background_path")[rows]]
-    if not encoder.needs_background or not len(missing):
-        return manifest
-    sequence = manifest.codes("sequence", own=True)
-    advice = "`anytouch data contact MANIFEST` estimates and stores pictures of the untouched gel."
-    stills = missing[np.bincount(sequence)[sequence[missing]] == 1]
-    if len(stills):
+    if not encoder.needs_background or gels is None:
+        return rows
+    has = gels.has(rows)
+    if not has.any():
         raise UserError(
-            f"{manifest.where(int(stills[0]))} and {len(stills) - 1} other rows are stills and have no "
-            f"background_path, which {encoder.source} subtracts. {advice} Or pass --on-bad-sample skip to embed."
+            f"{encoder.source} subtracts the untouched gel. {len(rows)} rows have no picture of it, and too few frames "
+            f"to estimate it. {ADVICE}"
         )
-    order = np.lexsort((np.asarray(manifest.table["frame_index"]), sequence))
-    first = order[np.searchsorted(sequence[order], sequence[missing])]
-    log(f"{len(missing)} rows have no background_path. The first frame of their recording is subtracted. {advice}")
-    cells, paths = manifest.column("background_path").to_pylist(), manifest.column("path").to_pylist()
-    for row, other in zip(missing.tolist(), first.tolist(), strict=True):
-        cells[row] = paths[other]
-    return replace_column(manifest, "background_path", cells)
+    if not has.all():
+        log(f"{(~has).sum()} of {len(rows)} rows have no picture of the untouched gel, and are left out")
+    return rows[has]
 
 
 def plain_column(manifest: Manifest, name: str) -> np.ndarray:
@@ -195,7 +192,7 @@ def save_npz(path: str | Path, features: Features, metadata: dict[str, str]) -> 
     described = {f"about/{name}": np.asarray(value) for name, value in metadata.items()}
     keys = {f"key/{name}": values for name, values in features.keys.items()}
     arrays: dict[str, Any] = {"features": features.values, "rows": features.rows}
-    arrays |= features.predictions | keys | described
+    arrays |= features.predictions | keys | described | gel_arrays(features.gels)
     with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, **arrays)
 
@@ -204,7 +201,8 @@ def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
     """Return the features and the metadata of a file of `save_npz`. Raises UserError for any other file."""
     try:
         arrays = read_arrays(path)
-    except (OSError, ValueError) as error:
+        gels = gels_of_arrays(arrays)
+    except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{path} is not a features file of `anytouch embed`: {error}") from None
     values, rows = (arrays.get(name, np.zeros(0, str)) for name in ("features", "rows"))
     numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
@@ -216,4 +214,4 @@ def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
     if any(array.shape != rows.shape for array in keys.values()):
         raise UserError(f"{path}: its keys (key/path and others) must be one for each of the {len(rows)} rows.")
     about = {name.removeprefix("about/"): str(array)[:200] for name, array in arrays.items() if name[:6] == "about/"}
-    return Features(values, rows, keys), about
+    return Features(values, rows, keys, gels=gels), about

@@ -90,6 +90,10 @@ class EngineEncoder(Encoder):
     def contract(self) -> str:
         return str(self.run.about["sha256"])
 
+    @property
+    def gels(self) -> dict[str, np.ndarray]:
+        return self.run.gels
+
     def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
         if dtype == "bfloat16":
             raise UserError(f"{self.source} is computed in float32 or int8; leave out --dtype")

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from base64 import b64decode, b64encode
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ import numpy as np
 from jax import export as jax_export
 
 from anytouch_jax.config import UNIVERSAL, parse_json, to_json
+from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.encoder import engines
 from anytouch_jax.encoder.arrays import rows_of_sensors, unit_rows
 from anytouch_jax.errors import CheckError, UserError
@@ -77,6 +79,11 @@ class Exported:
         with jax.enable_x64(self.about["dtype"] == "float64"):
             return np.asarray(self._run(frames, rows))
 
+    @property
+    def gels(self) -> dict[str, np.ndarray]:
+        """Pictures RGB u8 (h, w, 3) of the untouched gel, by unit, of the touches that int8 was calibrated on."""
+        return {name: decode_bytes(b64decode(text), name) for name, text in self.about.get("gels", {}).items()}
+
     def _row(self, name: str) -> int:
         sensors: dict[str, int] = self.about["sensors"]
         if name not in sensors:
@@ -123,14 +130,15 @@ def load(path: str | Path, engine: Engine | None = None) -> Exported:
 def export(
     encoder: Encoder, path: str | Path, *, frames: int = 1, platforms: Sequence[str] = ("cpu", "cuda"),
     pooling: Pooling = "class", join: Join = "mean", form: Literal["jax", "onnx"] = "jax",
-    calibration: tuple[np.ndarray, np.ndarray] | None = None,
+    calibration: tuple[np.ndarray, np.ndarray] | None = None, gels: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
 
     The artefact is first called with 1 and 5 touches and compared with the live model. ONNX is float32, for CPUs. With
     `calibration`, touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), its linear layers become int8 after the
-    comparison. Raises CheckError if they differ, UserError for what ONNX is not written for and if it cannot be
-    compared on this machine, OSError for a full disk.
+    comparison. `gels` are pictures of the untouched gel of their units, for the description. Raises CheckError if they
+    differ, UserError for what ONNX is not written for and if it cannot be compared on this machine, OSError for a full
+    disk.
     """
     from anytouch_jax.encoder.base import check_frames
 
@@ -180,6 +188,7 @@ def export(
         **more,
         **call_of(encoder, frames=frames, width=width, pooling=pooling, join=join),
         "worst_difference": differs,
+        "gels": {name: b64encode(encode(gel)).decode() for name, gel in (gels or {}).items()},
         "example": _EXAMPLE[form].format(name=path.name, shape=_shape(encoder, frames)),
     }
     atomic_write(path, data)

@@ -8,6 +8,7 @@ from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -107,7 +108,7 @@ class FamilyEncoder(Encoder):
     def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
         """Return a frame u8 (h, w, 3) as the network of the family reads it, f32 (height, width, 3).
 
-        Raises UserError for a background of another size.
+        Raises UserError for a background of other proportions.
         """
         return prepare(frame, background, self.preparation, self.image_size)
 
@@ -238,7 +239,9 @@ def pooled(family: Family, form: VitConfig, output: VitOutput, pooling: Pooling)
 def prepare(frame: np.ndarray, background: np.ndarray | None, steps: Preparation, size: Size) -> np.ndarray:
     """Return a frame u8 (h, w, 3) prepared by the steps of a family, f32 (height, width, 3) of `size`."""
     if background is not None and background.shape != frame.shape:
-        raise UserError(f"the background {background.shape} and the frame {frame.shape} must have one shape")
+        if abs(background.shape[1] * frame.shape[0] / (background.shape[0] * frame.shape[1]) - 1) > 0.05:
+            raise UserError(f"the background {background.shape} and the frame {frame.shape} have other proportions")
+        background = cv2.resize(background, frame.shape[1::-1], interpolation=cv2.INTER_AREA)
     image = frame
     if background is not None and steps.difference == "levels":  # 127: the authors truncate 127.5
         image = np.clip(frame.astype(np.int16) - background + 127, 0, 255).astype(np.uint8)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.data.gels import gel_arrays, gels_of_arrays
 from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.novelty import Assessment, Calibration
 from anytouch_jax.errors import UserError
@@ -27,7 +28,7 @@ class LinearHead:
 
     `classes` (K,) str; `weights` (d, columns) and `bias` (columns,), one column for two classes, else K; features minus
     `mean` (d,) are divided by `scale` (d,). It predicts `label` from features of `frames` a touch and `pooling` by the
-    encoder with that `fingerprint`.
+    encoder with that `fingerprint`. `gels` are pictures of the untouched gel by unit that its touches were less.
     """
 
     classes: Array
@@ -40,6 +41,7 @@ class LinearHead:
     frames: int
     fingerprint: str
     calibration: Calibration | None = None
+    gels: dict[str, Array] = field(default_factory=dict)
 
     def __call__(self, features: npt.ArrayLike) -> tuple[Array, Array]:
         """Return the likeliest class (n,) str and probabilities f32 (n, K) of features (n, d)."""
@@ -128,6 +130,7 @@ def save_head(path: str | Path, head: LinearHead) -> None:
     known = head.calibration
     arrays = {"mark" if name == "fingerprint" else name: value for name, value in vars(head).items()}
     del arrays["calibration"]
+    arrays |= gel_arrays(arrays.pop("gels"))
     arrays |= {} if known is None else {f"calibration/{name}": np.asarray(value) for name, value in vars(known).items()}
     with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, format=FORMATS[known is None], **arrays)
@@ -147,8 +150,10 @@ def load_head(path: str | Path) -> LinearHead:
             raise ValueError("it has no format of a head")
         check_array("frames", arrays["frames"], (), "iu")
         known = Calibration.from_arrays(arrays, len(arrays["mean"]))
-        arrays = {name: value for name, value in arrays.items() if not name.startswith("calibration/")}
-        head = LinearHead(frames=int(arrays.pop("frames")), fingerprint=arrays.pop("mark"), calibration=known, **arrays)
+        gels = gels_of_arrays(arrays)
+        arrays = {name: value for name, value in arrays.items() if not name.startswith(("calibration/", "gel"))}
+        about = {"frames": int(arrays.pop("frames")), "fingerprint": arrays.pop("mark")}
+        head = LinearHead(calibration=known, gels=gels, **about, **arrays)
         _check_head(head)
         return head
     except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,9 @@ from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import check_array
+
+if TYPE_CHECKING:
+    from anytouch_jax.encoder.base import Preprocess
 
 Array = npt.NDArray[Any]
 
@@ -127,18 +130,21 @@ class Assessment(NamedTuple):
 class ContactGate:
     """Contact of frames of one sensor, by the difference from the untouched gel (`data.prepare.contact`).
 
-    `background` is a picture RGB u8 (h, w, 3), or None: then the first frame is it, if `first`, or contact stays
-    unknown.
+    `background` is a picture RGB u8 (h, w, 3), a `Preprocess`, whose running estimate is used after it was called with
+    the frame, or None: then contact stays unknown.
     """
 
-    def __init__(self, background: Array | None, sensor: str, *, first: bool = False) -> None:
-        self._gel = None if background is None else UntouchedGel(background)
-        self._first, self.threshold = first, THRESHOLDS.get(sensor, DEFAULT_THRESHOLD)
+    def __init__(self, background: Array | Preprocess | None, sensor: str) -> None:
+        self._source: Any = background
+        self._picture: Array | None = None
+        self._gel: UntouchedGel | None = None
+        self.threshold = THRESHOLDS.get(sensor, DEFAULT_THRESHOLD)
 
     def __call__(self, frame: Array) -> float:
         """Return 1 (contact), 0 (none) or NaN (unknown) of a frame RGB u8 (h, w, 3)."""
-        if self._gel is None and self._first:
-            self._gel = UntouchedGel(frame)
+        picture = getattr(self._source, "background", self._source)
+        if picture is not self._picture:
+            self._picture, self._gel = picture, None if picture is None else UntouchedGel(picture)
         try:
             return np.nan if self._gel is None else float(self._gel.score(frame) > self.threshold)
         except ValueError as error:

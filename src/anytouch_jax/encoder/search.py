@@ -51,7 +51,10 @@ def _largest(values: Array, k: int, block: int = 64) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class TouchIndex:
-    """Unit features f32 (n, d), their `rows` and `keys` (n,), and metadata (`about`: weights, pooling, frames)."""
+    """Unit features f32 (n, d), their `rows` and `keys` (n,), and metadata (`about`: weights, pooling, frames).
+
+    `gels` are the pictures of the untouched gel of their units.
+    """
 
     values: Array
     rows: Array
@@ -59,6 +62,7 @@ class TouchIndex:
     about: dict[str, str]
     source: str = "the index"
     cells: Any = field(default=None, repr=False)
+    gels: dict[str, Array] = field(default_factory=dict, repr=False)
 
     def search(self, features: Array, count: int = 10) -> tuple[Array, Array]:
         """Return row numbers i64 (m, count) and cosines f32 (m, count) of the nearest, nearest first, of (m, d).
@@ -97,7 +101,7 @@ def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
     features, about = read_npz(path)
     unit = unit_rows(features.values).astype(np.float32)
     cells = _cells(unit) if approximate else None
-    return TouchIndex(unit, features.rows, features.keys, about, str(path), cells)
+    return TouchIndex(unit, features.rows, features.keys, about, str(path), cells, features.gels)
 
 
 def _cells(values: Array) -> Any:

@@ -64,12 +64,16 @@ class Frame(NamedTuple):
 
 
 class Clip(NamedTuple):
-    """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN."""
+    """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN.
+
+    `estimated`: the untouched gel is a running estimate.
+    """
 
     last: Frame
     frames: np.ndarray
     resize: float
     contact: float = float("nan")
+    estimated: bool = False
 
 
 class Embedded(NamedTuple):
@@ -78,7 +82,8 @@ class Embedded(NamedTuple):
     `at`: seconds from the start of the stream to the frame. `seconds`: those of PARTS. `age`: seconds from the grabbed
     frame to its features, with decoding and waiting. `started`: start of the stream in Unix seconds. `time`: the time
     stamp of a video's frame, or `at` of a camera's. `picture` and `missed` are those of `Frame`. `contact`: 1, 0 or
-    NaN (unknown). `reused`: the features are those of the last clip that was embedded (`Reuse`).
+    NaN (unknown). `reused`: the features are those of the last clip that was embedded (`Reuse`). `estimated`: the
+    untouched gel is a running estimate, which may still improve.
     """
 
     number: int
@@ -92,6 +97,7 @@ class Embedded(NamedTuple):
     missed: int = 0
     contact: float = float("nan")
     reused: bool = False
+    estimated: bool = False
 
 
 class Mailbox:
@@ -193,7 +199,7 @@ def stream(
                 seconds = (last.decode, clip.resize, copied - begin, end - copied)
                 stamp = at if last.time is None else last.time
                 age = end - last.read
-                about = (last.picture, last.missed, clip.contact, reused)
+                about = (last.picture, last.missed, clip.contact, reused, clip.estimated)
                 yield Embedded(last.number, at, values, seconds, age, started, stamp, *about)
         finally:
             mailbox.close()
@@ -275,7 +281,9 @@ def _read(
             resize = time.perf_counter() - begin
             touched = float("nan") if contact is None else contact(frame.pixels)
             clip = np.stack(list(ring)[::stride])
-            if len(ring) == ring.maxlen and not mailbox.put(Clip(frame, clip, resize, touched)):
+            if len(ring) == ring.maxlen and not mailbox.put(
+                Clip(frame, clip, resize, touched, getattr(preprocess, "estimated", False))
+            ):
                 break
         mailbox.close()
     except BaseException as error:
@@ -395,6 +403,7 @@ class Result(NamedTuple):
     error: CameraError | None = None
     contact: np.ndarray = np.zeros(0)
     reused: np.ndarray = np.zeros(0, bool)
+    estimated: np.ndarray = np.zeros(0, bool)
 
 
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
@@ -418,15 +427,15 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         interrupted = True
     except CameraError as error:
         failure = error
-    numbers, at, seconds, age, times, contact, reused = (
+    numbers, at, seconds, age, times, contact, reused, estimated = (
         np.asarray([getattr(frame, name) for frame in stored])
-        for name in ("number", "at", "seconds", "age", "time", "contact", "reused")
+        for name in ("number", "at", "seconds", "age", "time", "contact", "reused", "estimated")
     )
     return Result(
         np.stack([frame.values for frame in stored]) if stored else np.zeros((0, 0), np.float32),
         numbers.astype(np.int64), at, seconds.reshape(-1, len(PARTS)), age, total, interrupted,
         stored[-1].started if stored else 0.0, times, stored[-1].missed if stored else 0, pictures["frozen"],
-        pictures["black"], failure, contact, reused.astype(bool),
+        pictures["black"], failure, contact, reused.astype(bool), estimated.astype(bool),
     )  # fmt: skip
 
 

@@ -8,13 +8,12 @@ Background only is the untouched gel. Mean touch is the mean of all features.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from anytouch_jax.data.images import decode
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.embed import embed_rows
@@ -37,7 +36,7 @@ def probe_counterfactual(
     """Return the results of `probe_tasks` for the five kinds of touch, and what real touch adds to each of the others.
 
     An entry of the second has task, head, control, difference, low and high. The last two are a 95 % interval of the
-    paired difference of accuracy or R2, over the same test groups and seeds. Background only needs a background_path on
+    paired difference of accuracy or R2, over the same test groups and seeds. Background only needs an untouched gel for
     every row. Without it the control is left out, which is logged. `options` are others of `probe_tasks`. Raises
     UserError.
     """
@@ -56,7 +55,7 @@ def probe_counterfactual(
             real = runs[REAL, task, head, protocol]
             measured = real[0].sums.shape[1] > 2
             entry = {"task": task, "head": head, "protocol": protocol, "control": name}
-            gains.append(entry | paired_gain(real, several, measured))
+            gains.append(entry | statistics.paired_gain(real, several, measured))
     return results, gains
 
 
@@ -64,7 +63,8 @@ def touch_sources(
     table: Manifest, encoder: Encoder, *, cache: Path | None = None, log: Log = print, **encoding: Any
 ) -> list[FeatureSource]:
     """Return features of the real touch and of the four controls; "background only" where rows have backgrounds."""
-    real = encoder_features(encoder, table, folder=cache, log=log, **encoding)
+    gels = UnitGels(table)
+    real = encoder_features(encoder, table, folder=cache, gels=gels, log=log, **encoding)
 
     def from_real(partners: Callable[[Array, int], Array]) -> FeatureStore:
         return FeatureStore(lambda rows, frames: real.get(partners(rows, frames)[:, None], frames))
@@ -77,10 +77,10 @@ def touch_sources(
         return shift_in_time(table, rows, frames)
 
     stores = {REAL: real, SHUFFLED: from_real(lambda rows, _: shuffle_rows(table, rows)), SHIFTED: from_real(shifted)}
-    if table.present("background_path").all():
-        stores[BACKGROUND] = FeatureStore(_background_features(table, encoder, **encoding))
+    if gels.has(np.flatnonzero(np.isin(table.text_column("split"), ("train", "val", "test")))).all():
+        stores[BACKGROUND] = FeatureStore(_background_features(table, encoder, gels, **encoding))
     else:
-        log(f"{BACKGROUND}: left out, as some rows have no background_path")
+        log(f"{BACKGROUND}: left out, as some rows have no picture of the untouched gel")
     stores[MEAN] = FeatureStore(average)
     return [FeatureSource(name, store, encoder) for name, store in stores.items()]
 
@@ -107,33 +107,18 @@ def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
     return partner[rows]
 
 
-def _background_features(table: Manifest, encoder: Encoder, **encoding: Any) -> Callable[[Array, int], Array]:
-    @lru_cache(256)  # many rows share one
-    def gel(file: Path) -> Array:
-        picture = decode(file)
-        return encoder.prepare(picture, picture if encoder.subtracts else None)
+def _background_features(
+    table: Manifest, encoder: Encoder, gels: UnitGels, **encoding: Any
+) -> Callable[[Array, int], Array]:
+    gel = gels.shared(lambda picture: encoder.prepare(picture, picture if encoder.subtracts else None))
 
     def empty(clips: Array, rows: Array) -> Array:
-        gels = np.stack([gel(table.file(row, "background_path")) for row in rows.tolist()])
-        return np.broadcast_to(gels[:, None], clips.shape)
+        return np.broadcast_to(np.stack([np.asarray(gel(row)) for row in rows.tolist()])[:, None], clips.shape)
 
     def compute(rows: Array, frames: int) -> Array:
-        return embed_rows(encoder, table, rows, frames, edit=empty, log=lambda _: None, **encoding)[1]
+        return embed_rows(encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding)[1]
 
     return compute
-
-
-def paired_gain(real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool) -> dict[str, float | None]:
-    """Return by how much the score of `real` is above that of `other` on the same rows, with its 95 % interval."""
-    metric = statistics.r2_of if measured else statistics.mean_of
-    width = real[0].sums.shape[1]
-
-    def gain(sums: Array) -> Array:
-        return metric(sums[..., :width]) - metric(sums[..., width:])
-
-    both = [GroupSums(a.groups, np.concatenate([a.sums, b.sums], 1)) for a, b in zip(real, other, strict=True)]
-    low, high = statistics.bootstrap_interval(both, gain)
-    return {"difference": float(np.mean([gain(run.sums.sum(0)) for run in both])), "low": low, "high": high}
 
 
 def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:

@@ -17,6 +17,7 @@ import numpy as np
 from sklearn.decomposition import PCA
 
 from anytouch_jax.config import preset
+from anytouch_jax.data.gels import ADVICE, UnitGels
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -32,7 +33,7 @@ Order = Literal["right", "shuffled", "repeated"]
 Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
 
 RAW, RANDOM = "raw pixels", "random encoder"
-VERSION = 3  # of the features; a change to their computation raises it
+VERSION = 4  # of the features; a change to their computation raises it
 RAW_SIZE = (240, 320)  # of a picture before its area averages
 SMALL = (24, 32)
 COMPONENTS = 200  # principal components of raw pixels
@@ -86,28 +87,35 @@ class FeatureStore:
 
 def encoder_features(
     encoder: Encoder, table: Manifest, *, pooling: Pooling = "class", join: Join = "mean", order: Order = "right",
-    universal: bool = False, folder: Path | None = None, log: Callable[[str], None] = lambda _: None,
+    universal: bool = False, folder: Path | None = None, gels: UnitGels | None = None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> FeatureStore:  # fmt: skip
     """Return the features of an encoder; `universal`: the universal tokens for every sensor.
 
     An unknown sensor gets these too, which is reported by `log`.
     """
+    gels = gels or UnitGels(table)
 
     def describe() -> dict[str, Any]:
         about = {"pooling": pooling, "join": join, "universal": universal, "background": encoder.config.data.background}
-        return _content(table, encoder_digest(encoder), order) | about
+        content = _content(table, encoder_digest(encoder), order) | about
+        return content | ({"gels": gels.digest()} if encoder.subtracts else {})
 
     def compute(rows: Array, frames: int) -> Array:
         sensor_row = encoder.config.model.universal_row if universal else None
         edit = partial(reorder_frames, order=order)
-        return embed_rows(encoder, table, rows, frames, pooling, join, sensor_row=sensor_row, edit=edit, log=log)[1]
+        about: dict[str, Any] = {"sensor_row": sensor_row, "edit": edit, "gels": gels, "log": log}
+        return embed_rows(encoder, table, rows, frames, pooling, join, **about)[1]
 
     return FeatureStore(compute, describe, folder)
 
 
-def pixel_features(table: Manifest, *, order: Order = "right", folder: Path | None = None) -> FeatureStore:
+def pixel_features(
+    table: Manifest, *, order: Order = "right", folder: Path | None = None, gels: UnitGels | None = None
+) -> FeatureStore:
     """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in 0..1."""
-    read = _pair_reader(table, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
+    gels = gels or UnitGels(table)
+    read = _pair_reader(table, gels, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
 
     def compute(rows: Array, frames: int) -> Array:
         clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
@@ -118,7 +126,9 @@ def pixel_features(table: Manifest, *, order: Order = "right", folder: Path | No
         places = places.reshape(windows.shape)
         return np.concatenate([last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1)
 
-    return FeatureStore(compute, lambda: _content(table, "raw pixels in colour", order), folder)
+    return FeatureStore(
+        compute, lambda: _content(table, "raw pixels in colour", order) | {"gels": gels.digest()}, folder
+    )
 
 
 def file_features(path: Path, table: Manifest) -> FeatureStore:
@@ -213,35 +223,23 @@ def raw_pixels(frame: Array, background: Array | None) -> Array:
     return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background)])
 
 
-def _pair_reader(table: Manifest, prepare: Callable[[Array], Any]) -> Callable[[int], tuple[Any, Any]]:
-    """Return a function from a row to its prepared frame and background, None without one."""
-    backgrounds: dict[Path, Any] = {}  # many rows share one
-
-    def read(row: int) -> tuple[Any, Any]:
-        frame = prepare(read_image(table, row))
-        if table.value(row, "background_path") is None:
-            return frame, None
-        file = table.file(row, "background_path")
-        if file not in backgrounds:
-            if len(backgrounds) >= 256:  # 230 kB each
-                backgrounds.clear()
-            backgrounds[file] = prepare(read_image(table, row, "background_path"))
-        return frame, backgrounds[file]
-
-    return read
+def _pair_reader(table: Manifest, gels: UnitGels, prepare: Callable[[Array], Any]) -> Callable[[int], tuple[Any, Any]]:
+    """Return a function from a row to its prepared frame and untouched gel, None without one."""
+    gel = gels.shared(prepare)
+    return lambda row: (prepare(read_image(table, row)), gel(row))
 
 
-def background_difference(table: Manifest, rows: Array) -> Array:
-    """Return frames minus their backgrounds in RGB, averaged down to SMALL: f32 (n, 24 * 32 * 3) in -1..1.
+def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = None) -> Array:
+    """Return frames minus their untouched gel in RGB, averaged down to SMALL: f32 (n, 24 * 32 * 3) in -1..1.
 
-    Raises UserError that names a row without a background, or whose background has other proportions.
+    Raises UserError that names a row without one, or whose untouched gel has other proportions.
     """
-    read = _pair_reader(table, lambda image: (_small(image), image.shape[1] / image.shape[0]))
+    read = _pair_reader(table, gels or UnitGels(table), lambda one: (_small(one), one.shape[1] / one.shape[0]))
     values = np.zeros((len(rows), SMALL[0] * SMALL[1] * 3), np.float32)
     for place, row in enumerate(map(int, rows)):
         (frame, proportion), background = read(row)
         if background is None:
-            raise UserError(f"{table.where(row)} has no background_path. Add one, or leave this baseline out.")
+            raise UserError(f"{table.where(row)} has no picture of the untouched gel. {ADVICE}")
         if abs(proportion / background[1] - 1) > 0.05:
             raise UserError(f"{table.where(row)}: its background_path has other proportions than the frame.")
         values[place] = frame - background[0]
@@ -290,29 +288,52 @@ class FeatureSource(NamedTuple):
         return [f"universal tokens for {', '.join(unknown)}"] if unknown else []
 
 
+def opened(models: Sequence[str | Path | FeatureSource]) -> list[Encoder | FeatureSource]:
+    """Return the encoders of names and paths, and other sources unchanged."""
+    return [one if isinstance(one, FeatureSource) else load_encoder(one) for one in models]
+
+
+def with_gel(rows: TaskRows, gels: UnitGels, models: Sequence[Encoder | FeatureSource]) -> TaskRows:
+    """Return the rows that all models can read: those that have an untouched gel, if one of them needs it.
+
+    The others are counted in a note. Raises UserError if none is left.
+    """
+    encoders = [one if isinstance(one, Encoder) else one.encoder for one in models]
+    if not any(encoder is not None and encoder.needs_background for encoder in encoders):
+        return rows
+    has = np.all(gels.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
+    if not has.any():
+        raise UserError(
+            f"None of {len(rows.rows)} rows has a picture of the untouched gel, which is subtracted. {ADVICE}"
+        )
+    note = f"{(~has).sum()} rows are left out: they have no picture of the untouched gel"
+    return rows.take(np.flatnonzero(has))._replace(notes=(*rows.notes, *([] if has.all() else [note])))
+
+
 def sources(
-    table: Manifest, models: Sequence[str | Path | FeatureSource], features: Sequence[str | Path], controls: bool,
-    cache: Path | None, rows: dict[int, Array], order: Order = "right", least: int = 1, **encoding: Any,
+    table: Manifest, models: Sequence[Encoder | FeatureSource], features: Sequence[str | Path], controls: bool,
+    cache: Path | None, rows: dict[int, Array], order: Order = "right", least: int = 1, *, gels: UnitGels,
+    **encoding: Any,
 ) -> list[FeatureSource]:  # fmt: skip
     """Return models, the random encoder, features files and raw pixels, in this order.
 
     `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of every clip.
     """
     several = [model for model in models if isinstance(model, FeatureSource)]
-    encoders = {str(model): load_encoder(model) for model in models if not isinstance(model, FeatureSource)}
+    encoders = {model.source: model for model in models if isinstance(model, Encoder)}
     if controls:
         first = next((one for one in (*encoders.values(), *(source.encoder for source in several)) if one), None)
         encoders[RANDOM] = first.untrained() if first else random_encoder(preset("tiny"))
     for name, encoder in encoders.items():
         check_frames(encoder.config.model, least)
-        store = encoder_features(encoder, table, order=order, folder=cache, **encoding)
+        store = encoder_features(encoder, table, order=order, folder=cache, gels=gels, **encoding)
         several.append(FeatureSource(name, store, encoder))
     for path in features:
         several.append(FeatureSource(str(path), file_features(Path(path), table)))
         for frames, ids in rows.items():
             several[-1].store.add(ids, frames)
     if controls:
-        several.append(FeatureSource(RAW, pixel_features(table, order=order, folder=cache), None, "common"))
+        several.append(FeatureSource(RAW, pixel_features(table, order=order, folder=cache, gels=gels), None, "common"))
     if not several:
         raise UserError("There is nothing to probe. Give --model or --features, or keep the controls.")
     return several

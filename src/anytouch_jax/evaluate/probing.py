@@ -15,12 +15,14 @@ import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from anytouch_jax.bars import tracked
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder import novelty
@@ -245,15 +247,48 @@ def probe_json(results: Sequence[ProbeResult]) -> str:
     return json.dumps(records, indent=2, allow_nan=False)
 
 
-def probe_table(results: Sequence[ProbeResult | Mapping[str, Any]], paper: float | None = None) -> str:
+def verdict(name: str, gain: Mapping[str, float | None], task: str = "") -> str:
+    """Return a sentence on features against raw pixels, from a `statistics.paired_gain`."""
+    points, low, high = (100 * (gain[key] or 0.0) for key in ("difference", "low", "high"))
+    of = f"{task}: " if task else ""
+    if gain["low"] is None:
+        return f"{of}{name} is {points:+.0f} points from raw pixels, by too few test recordings to be sure."
+    interval = f"({low:.0f} to {high:.0f})"
+    if low > 0:
+        return f"{of}{name} is {points:.0f} points above raw pixels {interval}."
+    return (
+        f"{of}{name} is no better than raw pixels: {points:+.0f} points {interval}. Try --pooling both, more "
+        "recordings, or another encoder, and look at the untouched gel with `anytouch view`."
+    )
+
+
+def label_verdicts(results: Sequence[ProbeResult]) -> list[str]:
+    """Return a sentence on each source of features of `probe_label` against raw pixels, by its first head."""
+    first: dict[str, ProbeResult] = {}
+    for result in results:
+        first.setdefault(result.probe.partition(": ")[0], result)
+    sums = {
+        name: statistics.classification_sums(one.outcome.correct, one.outcome.groups)
+        for name, one in first.items() if one.outcome is not None and ": " in one.probe
+    }  # fmt: skip
+    raw = sums.pop(RAW, None)
+    sums.pop(RANDOM, None)
+    return [] if raw is None else [
+        verdict(name, statistics.paired_gain([one], [raw], False)) for name, one in sums.items()
+    ]  # fmt: skip
+
+
+def probe_table(
+    results: Sequence[ProbeResult | Mapping[str, Any]], paper: float | None = None, *, details: bool = False
+) -> str:
     """Return results, or results of `probe_tasks`, as one Markdown table, with the notes below.
 
-    `paper`: the accuracy of AnyTouch in the paper.
+    `paper`: the accuracy of AnyTouch in the paper. `details`: also a row for each part of the test rows.
     """
     lines, notes = list[dict[str, str]](), list[str]()
     for result in results:
         if isinstance(result, ProbeResult):
-            lines += _result_lines(result)
+            lines += _result_lines(result)[: None if details else 1]
             notes += [f"- {result.probe} ({result.protocol}): {note}" for note in result.notes]
         else:
             names = {name: result.get(name, "") for name in ("features", "task", "head", "protocol")}
@@ -326,19 +361,22 @@ def probe_label(
     """
     if save is not None and len(models) != 1:
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
-    table = manifests.read([str(path) for path in data])
+    table, opened = manifests.read([str(path) for path in data]), feature_cache.opened(models)
+    gels = UnitGels(table)
     rows, subsets = label_rows(
-        table, label, group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames
-    )
+        table, label, group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames,
+        among=partial(feature_cache.with_gel, gels=gels, models=opened),
+    )  # fmt: skip
     log(f"{len(rows.rows)} of {len(table)} rows take part")
+    log(gels.report(rows.rows[:, 0]))
     for note in rows.notes:
         log(note)
     if leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")
     splits.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
-    results, encoding = list[ProbeResult](), dict[str, Any](least=frames, pooling=pooling, join=join)
-    for source in feature_cache.sources(table, models, features, controls, cache, {frames: rows.rows}, **encoding):
+    results, encoding = list[ProbeResult](), dict[str, Any](least=frames, pooling=pooling, join=join, gels=gels)
+    for source in feature_cache.sources(table, opened, features, controls, cache, {frames: rows.rows}, **encoding):
         pixels = source.name == RAW
         x = feature_cache.pixel_components(source.store, rows) if pixels else source.store.get(rows.rows, frames)
         results += probe_rows(x, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds,
@@ -348,6 +386,8 @@ def probe_label(
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
             assert tested.fitted is not None
             head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
+            if source.encoder.subtracts:
+                head = replace(head, gels=gels.pictures(rows.rows[:, 0]))
             head = _calibrated(
                 head, x, rows, results[0].penalty or 1.0, log, coverage=coverage, false_alarms=false_alarms
             )
@@ -378,10 +418,14 @@ def _calibrated(head: LinearHead, x: Array, rows: TaskRows, penalty: float, log:
 def label_rows(
     table: Manifest, label: str, *, group: str = "", leave_out: str | None = None,
     where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
+    among: Callable[[TaskRows], TaskRows] = lambda rows: rows,
 ) -> tuple[TaskRows, dict[str, Array]]:  # fmt: skip
-    """Return the rows of `probe_label`, and masks of those whose class (held-out object) alignment may have named."""
+    """Return the rows of `probe_label`, and masks of those whose class (held-out object) alignment may have named.
+
+    `among` chooses some of the rows.
+    """
     task = tasks.label_task(table, label, group=leave_out or group, where=where, sensor=sensor)
-    rows = tasks.select(table, task, frames)
+    rows = among(tasks.select(table, task, frames))
     column, name = (task.label, "classes") if leave_out is None else (task.groups[0], f"{leave_out}s")
     return rows, tasks.described_subsets(table, column, rows.rows[:, 0], name)
 
@@ -438,17 +482,21 @@ def probe_tasks(
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
     table = data if isinstance(data, Manifest) else manifests.read([str(path) for path in data])
-    plans, left_out = _plan_tasks(table, tasks, frames, sides, max_rows, log)
+    opened, gels = feature_cache.opened(models), UnitGels(table)
+    among = partial(feature_cache.with_gel, gels=gels, models=opened)
+    plans, left_out = _plan_tasks(table, tasks, frames, sides, max_rows, log, among)
     if order != "right" and (features or all(plan.frames == 1 for plan in plans)):
         raise UserError("--order has no effect on stills or on --features. Leave it out, or give --frames.")
     lengths = sorted({plan.frames for plan in plans})  # one pass computes the features of all tasks
     rows = {n: np.concatenate([plan.rows.rows.ravel() for plan in plans if plan.frames == n]) for n in lengths}
+    log(gels.report(np.unique(np.concatenate(list(rows.values())))))
     encoding: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
-    sources = feature_cache.sources(table, models, features, controls, cache, rows, least=frames or 1, **encoding)
+    encoding["gels"] = gels
+    sources = feature_cache.sources(table, opened, features, controls, cache, rows, least=frames or 1, **encoding)
     if join != "mean" and any(s.encoder and (frames or 1) <= s.encoder.config.model.frames for s in sources):
         raise UserError("--join has no effect without --frames longer than a clip of the model.")
     protocols: tuple[Protocol, ...] = ("honest", "published") if protocol == "published" else (protocol,)
-    results = []
+    results, keep = [], {} if keep is None else keep
     for source in sources:
         for length, ids in rows.items():
             source.store.add(ids, length)
@@ -460,15 +508,19 @@ def probe_tasks(
                 head = ProbeHead(name, source.scaling, recipe=recipe or GradientRecipe())
                 scored, runs = _score(labelled, plan, head, each, seeds)
                 names = {"features": source.name, "task": plan.task.name, "head": name, "protocol": each}
-                if keep is not None:
-                    keep[tuple(names.values())] = runs
+                keep[tuple(names.values())] = runs
                 results.append(names | scored | about | {"notes": notes + scored["notes"]})
         log(f"probed {source.name}")
+    kinds = {plan.task.name: plan.roles.measured for plan in plans}
+    verdicts = [
+        verdict(name, statistics.paired_gain(runs, keep[RAW, *others], kinds[others[0]]), f"{others[0]}, {others[1]}")
+        for (name, *others), runs in keep.items() if name not in (RAW, RANDOM) and (RAW, *others) in keep
+    ]  # fmt: skip
     report = {
         "manifest": table.content_hash, "data": [str(path) for path in table.files], "paper": paper, "seeds": seeds,
         "sides": {name: list(sides.get(name) or ()) or None for name in SIDES},
         "runs": {source.name: dataclasses.asdict(source.encoder.config) for source in sources if source.encoder},
-        "left_out": left_out, "results": results,
+        "left_out": left_out, "verdicts": verdicts, "results": results,
     }  # fmt: skip
     if out is not None:
         atomic_write(out, json.dumps(report, indent=2, allow_nan=False))
@@ -489,7 +541,7 @@ def probe_benchmark(models: Models, data: Paths | Manifest, benchmark: str, **op
 
 def _plan_tasks(
     table: Manifest, names: Sequence[str | Task], frames: int | None, sides: dict[str, Names], max_rows: int | None,
-    log: Log,
+    log: Log, among: Callable[[TaskRows], TaskRows],
 ) -> tuple[list[_Plan], dict[str, str]]:  # fmt: skip
     """Return the plans of the tasks that can be probed, and why the others cannot. Raises UserError if none can."""
     plans, left_out = list[_Plan](), dict[str, str]()
@@ -501,7 +553,7 @@ def _plan_tasks(
     errors = []
     for task in map(tasks.find_task, names):
         try:
-            plans.append(_plan(table, task, frames, sides, max_rows))
+            plans.append(_plan(table, task, frames, sides, max_rows, among))
         except UserError as error:
             left_out[task.name] = str(error).removeprefix(f"Task {task.name}: ")
             errors.append(f"Task {task.name}: {left_out[task.name]}")
@@ -512,14 +564,17 @@ def _plan_tasks(
     return plans, left_out
 
 
-def _plan(table: Manifest, task: Task, frames: int | None, sides: dict[str, Names], max_rows: int | None) -> _Plan:
+def _plan(
+    table: Manifest, task: Task, frames: int | None, sides: dict[str, Names], max_rows: int | None,
+    among: Callable[[TaskRows], TaskRows],
+) -> _Plan:  # fmt: skip
     """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them. Raises UserError."""
     for name, count in (("max_rows", max_rows), ("frames", frames)):
         if count is not None and count < 1:
             raise UserError(f"{name} must be at least 1, not {count}.")
     if unknown := sides.keys() - set(SIDES):
         raise TypeError(f"Unknown options {', '.join(sorted(unknown))}.")
-    rows = tasks.select(table, task, frames)
+    rows = among(tasks.select(table, task, frames))
     roles, _ = splits.assign_roles(task, rows, sides)
     used = np.flatnonzero(splits.split_scheme(roles)[1] & (roles.may_fit | roles.may_test))
     rows = rows.take(splits.subsample(used, max_rows or len(used)))

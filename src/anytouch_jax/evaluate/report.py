@@ -17,13 +17,14 @@ import numpy as np
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.images import decode, encode
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import known_contact
-from anytouch_jax.encoder.embed import embed_rows
+from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, plots, probing, retrieval, statistics
@@ -261,6 +262,7 @@ def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) 
     """Return masked patches and next frames of stage 1 on a test clip of each sensor, and its errors."""
     config, params = encoder.config, encoder.params | {"decoder": encoder.part_params("decoder")}
     rows, frames = _with_images(manifest, manifest.rows_of("test")), config.model.frames + 1
+    rows = rows_with_gel(encoder, UnitGels(manifest), rows, lambda _: None)
     if config.objective.next_frame and config.data.clip_share > 0:  # else the head for clips is untrained
         ends = np.intersect1d(manifest.clips(frames, "test")[:, -1], rows)
     else:
@@ -320,11 +322,13 @@ class _Study:
 def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, log: Log) -> _Study:
     most = {"train": touches // 2, "val": touches // 2, "test": touches}
     rows = np.concatenate([_chosen(table, name, count, seed) for name, count in most.items()])
-    classes, patches = {}, {}
+    classes, patches, gels = {}, {}, UnitGels(table)
+    for encoder in encoders.values():
+        rows = rows_with_gel(encoder, gels, rows, log)
     for name, encoder in encoders.items():
-        values = embed_rows(encoder, table, rows, pooling="both", log=log)[1]
+        values = embed_rows(encoder, table, rows, pooling="both", gels=gels, log=log)[1]
         classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)
-    pixels, notes = _baseline(PIXELS, lambda: background_difference(table, rows))
+    pixels, notes = _baseline(PIXELS, lambda: background_difference(table, rows, gels))
     return _Study(table, rows, table.text_column("split")[rows], classes, patches, pixels, tuple(notes))
 
 

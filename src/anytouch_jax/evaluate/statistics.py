@@ -50,6 +50,19 @@ def mae_of(sums: Array) -> Array:
     return np.asarray(sums[..., 1] / sums[..., 4])
 
 
+def paired_gain(real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool) -> dict[str, float | None]:
+    """Return by how much the score of `real` is above that of `other` on the same rows, with its 95 % interval."""
+    metric = r2_of if measured else mean_of
+    width = real[0].sums.shape[1]
+
+    def gain(sums: Array) -> Array:
+        return metric(sums[..., :width]) - metric(sums[..., width:])
+
+    both = [GroupSums(a.groups, np.concatenate([a.sums, b.sums], 1)) for a, b in zip(real, other, strict=True)]
+    low, high = bootstrap_interval(both, gain)
+    return {"difference": float(np.mean([gain(run.sums.sum(0)) for run in both])), "low": low, "high": high}
+
+
 def bootstrap_interval(runs: Sequence[GroupSums], value: Callable[[Array], Array]) -> tuple[float | None, float | None]:
     """Return the 95 % percentile interval of the mean over runs of `value` (sums -> number).
 

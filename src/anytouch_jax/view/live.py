@@ -91,8 +91,8 @@ class Live:
         self._rotate = 0
         self._flip: Flip = "none"
         self.background: Array | None = None  # the captured picture of the untouched gel, RGB u8 (h, w, 3)
-        self._gel: tuple[Array, UntouchedGel] | None = None
-        self._preprocess = Preprocess(encoder)
+        self._gel: tuple[Array | None, Any] = None, None  # a picture, and what the panels need of it
+        self._preprocess = self._preprocessing(None)
         self._raw: deque[tuple[int, Array]] = deque(maxlen=8)  # the last pictures by the number of their frame
         self._count = 0
         self._near: tuple[list[dict[str, Any]], float] = ([], 0.0)
@@ -150,8 +150,11 @@ class Live:
         """Take a picture RGB u8 (h, w, 3) as the untouched gel, or go on without one."""
         # Frames are turned before, so the encoder's preprocessing does not.
         self.background = picture
-        self._gel = None if picture is None else (scale_down(picture), UntouchedGel(picture))
-        self._preprocess = Preprocess(self._encoder, picture)
+        self._preprocess = self._preprocessing(picture)
+
+    def _preprocessing(self, picture: Array | None) -> Preprocess:
+        known = {} if self._head is None else self._head.gels
+        return Preprocess(self._encoder, picture, known=known, log=self._log)
 
     def _oriented(self, picture: Array) -> Array:
         return np.ascontiguousarray(orient_frame(picture, self._rotate, self._flip))
@@ -183,7 +186,10 @@ class Live:
             return
         picture = self._oriented(pictures[0])
         threshold = THRESHOLDS.get(self._sensor or UNIVERSAL, DEFAULT_THRESHOLD)
-        view, score = touch_panels(picture, self._gel, threshold)
+        gel = self._preprocess.background
+        if gel is not self._gel[0]:
+            self._gel = gel, None if gel is None else (scale_down(gel), UntouchedGel(gel))
+        view, score = touch_panels(picture, self._gel[1], threshold)
         if self.recorder is not None:
             self.recorder.add(picture)
         self._times.append((frame.seconds[-1], frame.age))
@@ -194,7 +200,7 @@ class Live:
             "threshold": threshold, "contact": None if score != score else bool(score > threshold),
             "encoder": encoder.round(2).tolist(), "age": age.round(2).tolist(), "missed": frame.missed,
             "recording": None if self.recorder is None else self.recorder.state(),
-        }  # fmt: skip
+        } | ({"background": "estimated"} if frame.estimated else {})  # fmt: skip
         about |= self._classify(frame.values) | {"near": self._nearest(frame.values)}
         self._publish(about, encode(view, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 85))
 

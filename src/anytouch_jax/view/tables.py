@@ -7,6 +7,7 @@ by itself. Pictures are read when they are shown.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import parse_json
+from anytouch_jax.data.gels import FRAMES, UnitGels, recording_gel
 from anytouch_jax.data.images import QUIET, count_frames, decode, list_images, open_video, to_rgb
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -44,7 +46,6 @@ class Table:
     def __init__(self, manifest: Manifest, name: str, film: Path | None = None) -> None:
         self.manifest, self.name = manifest, name
         self._film = None if film is None else _Film(film)
-        self._background = lru_cache(32)(self._read_background)
         self._chosen = lru_cache(8)(self._choose)
 
     def about(self) -> dict[str, Any]:
@@ -87,21 +88,25 @@ class Table:
         return decode(self.manifest.file(row, "image_path"))
 
     def panels(self, row: int) -> tuple[Array, float]:
-        """Return the panels of a row (see `touch_panels`) and its contact score, NaN without a background."""
-        frame, gel = self.frame(row), None
-        first = self._rows(int(np.searchsorted(self._order[1], self._position(row), "right")) - 1)[0]
-        path = self.manifest.value(row, "background_path")
-        if path is not None or first != row:
-            gel = self._background(row if path is not None else int(first), path)
-        return touch_panels(frame, gel, self.threshold(row))
+        """Return the panels of a row (see `touch_panels`) and its contact score, NaN without an untouched gel."""
+        return touch_panels(self.frame(row), self._untouched(row), self.threshold(row))
 
     def threshold(self, row: int) -> float:
         """Return the contact score above which a frame of the row's sensor shows contact."""
         return THRESHOLDS.get(self.manifest.value(row, "sensor"), DEFAULT_THRESHOLD)
 
-    def _read_background(self, row: int, path: str | None) -> tuple[Array, UntouchedGel]:
-        picture = self.frame(row) if path is None else decode(self.manifest.file(row, "background_path"))
-        return scale_down(picture), UntouchedGel(picture)
+    @cached_property
+    def _untouched(self) -> Callable[[int], tuple[Array, UntouchedGel] | None]:
+        """A function from a row to its untouched gel, scaled down and to compare, None if it is unknown."""
+
+        def made(picture: Array) -> tuple[Array, UntouchedGel]:
+            return scale_down(picture), UntouchedGel(picture)
+
+        if self._film is None:
+            return UnitGels(self.manifest).shared(made, 32)
+        count = len(self.manifest)
+        of_film = made(recording_gel(map(self._film.read, range(0, count, -(-count // FRAMES))))[0])
+        return lambda _: of_film
 
     def _check(self, row: int) -> None:
         if not 0 <= row < len(self.manifest):

@@ -16,6 +16,7 @@ import numpy as np
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data import transforms
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
@@ -38,11 +39,12 @@ class SampleReader:
     """Reads samples of `manifest` at the model's size, augmented by the settings of `config`.
 
     The first resized frames that fit into `data.cache` MB stay in memory, so a small data set is read once. The
-    samples do not depend on it.
+    samples do not depend on it. `gels` are the pictures that are subtracted, by default those of the rows.
     """
 
     manifest: Manifest
     config: Config
+    gels: UnitGels | None = None
     _cache: dict[Path, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     def touch(
@@ -58,11 +60,12 @@ class SampleReader:
         size, data = self.config.model.image_size, self.config.data
         plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
         # Frames are resized once and cached, unless the background is subtracted at their original size.
-        subtracts = self._subtracts(int(rows[-1]), epoch)
+        gel = None if self.config.data.background == "keep" or self.gels is None else self.gels(int(rows[-1]))
+        subtracts = self._subtracts(int(rows[-1]), epoch, gel)
         load = None if epoch is None or (plain and subtracts) else self._resized
         frames = [read_image(self.manifest, row, load=load) for row in rows]
-        background = None
-        if subtracts:
+        background = gel if subtracts else None
+        if subtracts and gel is None:
             if self.manifest.value(rows[-1], "background_path") is None:
                 raise SampleError(
                     f"{self.manifest.where(rows[-1])} has no background_path, which --data.background subtract "
@@ -81,11 +84,11 @@ class SampleReader:
         *augmented, background = transforms.touch_transform([*frames, background], size, rng, data)
         return np.stack(transforms.subtract_background(augmented, background), out=out)
 
-    def _subtracts(self, row: int, epoch: int | None) -> bool:
+    def _subtracts(self, row: int, epoch: int | None, gel: np.ndarray | None) -> bool:
         """Return whether the background of a row is subtracted. "either" draws it, and always does in evaluation."""
         if self.config.data.background != "either":
             return self.config.data.background == "subtract"
-        if self.manifest.value(row, "background_path") is None:
+        if gel is None and self.manifest.value(row, "background_path") is None:
             return False
         return epoch is None or bool(
             np.random.default_rng([self.config.run.seed, epoch, row, _SUBTRACT]).random() < 0.5
@@ -167,6 +170,7 @@ def evaluation(
     prepare: Prepare | None = None,
     like: np.ndarray | None = None,
     skipped: list[str] | None = None,
+    gels: UnitGels | None = None,
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
     """Yield (row ids i64 (n,), TouchBatch of B rows) over `rows` in order, with the same bytes every time.
 
@@ -175,7 +179,8 @@ def evaluation(
     With `data.on_bad_sample` "skip" bad rows are left out, which the row ids show, and `skipped` gets a sentence for
     each of the first NAMED. `unknown` "universal" gives unknown sensors the universal tokens. `prepare` makes an array
     of the form of `like` from a frame u8 (h, w, 3) and its background or None, in place of the resizing and the
-    subtraction. Raises UserError: ManifestError for an unknown sensor, SampleError for a bad sample, and for a row that
+    subtraction. `gels` are the pictures of the untouched gel, by default those of the rule in `data.gels`. Raises
+    UserError: ManifestError for an unknown sensor, SampleError for a bad sample, and for a row that
     ends no clip.
     """
     rows = np.asarray(rows, np.int64)
@@ -189,9 +194,8 @@ def evaluation(
         )
     side = config.model.image_size
     blank = np.zeros((side, side, 3), np.uint8) if like is None else like
-    return _batches(
-        SampleReader(manifest, config), rows, windows, sensor, prepare, blank, [] if skipped is None else skipped
-    )
+    reader = SampleReader(manifest, config, gels or (None if config.data.background == "keep" else UnitGels(manifest)))
+    return _batches(reader, rows, windows, sensor, prepare, blank, [] if skipped is None else skipped)
 
 
 def _batches(

@@ -7,7 +7,8 @@ scaled to 160 on its long side, so thresholds do not depend on the camera's reso
 
 The untouched gel of a row is its `background_path`, the rows of split `background` of its unit (or else sequence), or a
 picture that the user names. Otherwise it is estimated from the frames of its recording, and compared with the estimates
-of other recordings of the unit (see `untouched_gel`). Where it cannot be decided, the score stays empty.
+of other recordings of the unit (see `untouched_gel`). Where these are undecided, it is the median of the unit's frames,
+unless that is clearly pressed: then the score stays empty.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +29,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.images import ImageError, decode, encode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_column, select_rows
 from anytouch_jax.data.manifest.schema import shown
@@ -37,12 +40,14 @@ from anytouch_jax.data.prepare.untouched_gel import (
     UntouchedGel,
     estimate_untouched_gel,
     gel_of_unit,
+    median_gel,
     scale_picture,
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
 _MAX_FRAMES, _MAX_RECORDINGS = 48, 48  # of a recording, and of a unit, from which the untouched gel is estimated
+_MANY = 3  # recordings of a unit whose median shows where nothing presses
 _MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
 _Scored = tuple[int, float, str]  # row, score, reason
 _Pictures = Callable[[np.ndarray], list[np.ndarray]]  # some frames of rows
@@ -151,11 +156,12 @@ class ContactQuality:
 
 def contact_scores(
     manifest: Manifest, rows: np.ndarray | None = None, *, backgrounds: Mapping[str, UntouchedGel] | None = None,
-    workers: int = 2,
+    gels: UnitGels | None = None, workers: int = 2,
 ) -> ContactScores:  # fmt: skip
     """Return the score of every row, or of `rows` only. Frames are read by `workers` threads.
 
-    `backgrounds` are pictures from `read_backgrounds` for rows without one. A frame or background that cannot be read,
+    `backgrounds` are pictures from `read_backgrounds` for rows without one. With `gels`, the pictures of the rule in
+    `data.gels` serve all rows. A frame or background that cannot be read,
     or an untouched gel that cannot be decided, gives the score NaN and a reason. It raises nothing.
     """
     if workers < 1:
@@ -165,7 +171,7 @@ def contact_scores(
     reasons = np.full(len(manifest), "not asked for", dtype=object)
     has_background = manifest.present("background_path")[rows]
     recordings = decided = 0
-    gels: list[tuple[np.ndarray, UntouchedGel]] = []
+    found: list[tuple[np.ndarray, UntouchedGel]] = []
     faults: dict[int, str] = {}
     with ThreadPoolExecutor(workers) as pool:
         pictures = partial(_pictures, manifest, pool, faults)
@@ -175,13 +181,15 @@ def contact_scores(
                 for row, value, reason in pool.map(score_row, some[start : start + 1024].tolist()):
                     score[row], reasons[row] = value, reason
 
-        cached = lru_cache(256)(lambda path: UntouchedGel(decode(path)))
-        score_given = partial(_score_row, manifest, faults, lambda row: cached(manifest.file(row, "background_path")))
-        assign(partial(score_given, "given"), rows[has_background])
-        for group in _groups(manifest, rows[~has_background]):
+        if gels is not None:
+            has_background = gels.has(rows)
+            reasons[rows[~has_background]] = "none: no picture of the untouched gel"
+        gel_of_row: Any = (gels or UnitGels(manifest)).shared(UntouchedGel)
+        assign(partial(_score_row, manifest, faults, gel_of_row, "given"), rows[has_background])
+        for group in _groups(manifest, rows[~has_background]) if gels is None else ():
             gel, source = _gel_of_group(manifest, group, pictures, backgrounds or {})
             if gel is not None:
-                gels.append((group, gel))
+                found.append((group, gel))
                 assign(partial(_score_row, manifest, faults, gel, source), group)
                 continue
             for recording, gel, source in _estimates(manifest, group, pictures):
@@ -190,10 +198,10 @@ def contact_scores(
                 if gel is None:
                     reasons[recording] = f"none: {source}"
                 else:
-                    gels.append((recording, gel))
+                    found.append((recording, gel))
                     assign(partial(_score_row, manifest, faults, gel, source), recording)
     sentences = tuple(f"{manifest.where(row)}: {faults[row]}" for row in sorted(faults)[: EXAMPLES + 1])
-    return ContactScores(score, reasons, recordings, decided, tuple(gels), sentences)
+    return ContactScores(score, reasons, recordings, decided, tuple(found), sentences)
 
 
 def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -> Manifest:
@@ -295,6 +303,7 @@ def _estimates(
     for gel, _, shape in estimates.values():
         by_shape.setdefault(shape, []).extend([] if gel is None else [gel])
     common = {shape: gel_of_unit(gels) for shape, gels in by_shape.items()}
+    usual = median_gel(pictures(group)) if len(recordings) >= _MANY else None
     for place, recording in enumerate(recordings):
         gel, reason, shape = estimates.get(place) or estimate(recording)
         agreed = common.get(shape)
@@ -303,6 +312,8 @@ def _estimates(
             yield recording, agreed, "estimated from other recordings of the unit"
         elif gel is not None and any(rival.score(gel.picture) >= DIFFERENT for rival in rivals):
             yield recording, None, "recordings of its unit show different untouched gels"
+        elif gel is None and usual is not None and usual.picture.shape == shape:
+            yield recording, usual, "the median of the unit"
         else:
             yield recording, gel, reason
 

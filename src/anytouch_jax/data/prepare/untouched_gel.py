@@ -103,16 +103,33 @@ def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel
 
     `pictures` u8 (h, w, 3) are frames from `scale_picture`, all of one size.
     """
+    group, reason = free_frames(pictures)
+    return (None, reason) if group is None else (UntouchedGel(_median([pictures[i] for i in group])), "estimated")
+
+
+def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]:
+    """Return the numbers of the frames that show the untouched gel, or None, and the reason; `pictures` as above."""
     reason = ""
     for marked in (False, True):
         frames = [close_dots(picture) for picture in pictures] if marked else list(pictures)
         group, reason = _least_structured_group(frames)
         if group is not None:
-            gel = UntouchedGel(_median([pictures[frame] for frame in group]))
-            if gel.has_dots == marked:
-                return gel, "estimated"
+            if has_dots(_median([pictures[i] for i in group])) == marked:
+                return group, ""
             reason = "free and pressed gel look alike"
     return None, reason
+
+
+def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
+    """Return the per-pixel median of frames of one unit, pressed or not; None if it shows a press itself.
+
+    None, too, for frames that are all alike: they may always be pressed. `pictures` as for `estimate_untouched_gel`.
+    """
+    free = _median(pictures) if len(pictures) else np.zeros(0)
+    others = [picture for picture in pictures if _distance(free, picture) >= DIFFERENT]
+    if not others or np.median([_press_of(free, other) for other in others]) >= ALIKE:
+        return None
+    return UntouchedGel(free)
 
 
 def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:

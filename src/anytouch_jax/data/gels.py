@@ -1,0 +1,330 @@
+"""The picture of the untouched gel: one rule for manifests, folders, films, pictures and live sources.
+
+The first of these counts:
+
+* the picture that the user names
+* the picture of the same unit that a head or an index was fitted with
+* a stored picture: `background_path`, rows of split `background`, background.png of a folder
+* the median of the unit's frames
+* for a live source, a running estimate
+
+A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one unit.
+
+The median is over frames of split train, if the unit has any. Pressed or not, they may all take part, as presses are at
+changing places. `experiments/results/backgrounds.md` compares it with stored pictures.
+"""
+
+from __future__ import annotations
+
+import threading
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.config import FIELD_SENSORS
+from anytouch_jax.data.images import decode, to_rgb
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.prepare.untouched_gel import EDGE, free_frames, scale_picture
+from anytouch_jax.data.transforms import Flip, orient_frame
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import check_array
+
+Array = npt.NDArray[Any]
+T = TypeVar("T")
+FRAMES = 100  # frames of a median: 10 of them to all of them score alike
+FEWEST = 5  # frames of a median: fewer show the press itself
+SIDE = 320  # pixels of the long side of a median
+SETTLED = 300  # frames after which a running estimate stays
+TINT = 8.0  # grey levels: frames of one unit differ by less in most places, units of one product by more
+STORED = 32  # units whose pictures a file stores
+ADVICE = "Give one of the gel with nothing on it: --background, or background.png next to the frames."
+
+
+class Spread:
+    """`make` of at most FRAMES evenly spaced items of a sequence of unknown length."""
+
+    def __init__(self, make: Callable[[Any], Array]) -> None:
+        self.items, self.count = list[Array](), 0
+        self._make, self._step = make, 1
+
+    def add(self, item: Any) -> None:
+        """Count one item more, and keep it if its turn has come."""
+        if self.count % self._step == 0 and len(self.items) == FRAMES:
+            self.items, self._step = self.items[::2], 2 * self._step
+        if self.count % self._step == 0:
+            self.items.append(self._make(item))
+        self.count += 1
+
+
+def untouched_gel(frames: Iterable[npt.ArrayLike]) -> Array:
+    """Return the picture u8 (h, w, 3) of the untouched gel: the median of frames (h, w, 3) of one camera.
+
+    The frames may be pressed, at changing places. At most FRAMES of them are used, evenly spread. Raises UserError for
+    fewer than FEWEST frames, and for frames of several sizes.
+    """
+    spread = Spread(lambda frame: to_rgb(np.asarray(frame), "a frame"))
+    for frame in frames:
+        spread.add(frame)
+    if spread.count < FEWEST:
+        raise UserError(f"{spread.count} frames are too few for a picture of the untouched gel. Give {FEWEST} or more.")
+    if len(shapes := {frame.shape for frame in spread.items}) > 1:
+        raise UserError(f"the frames have {len(shapes)} sizes. Give frames of one camera.")
+    return median(spread.items)
+
+
+def median(frames: Sequence[Array]) -> Array:
+    """Return the per-pixel median u8 (h, w, 3) of frames of one size."""
+    middle = (len(frames) - 1) // 2
+    return np.partition(np.stack(frames), middle, axis=0)[middle]
+
+
+def estimate(frames: Sequence[Array]) -> Array:
+    """Return the untouched gel of one recording: the median of its free frames if these stand out, else of all."""
+    some = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 24).astype(int))]
+    small = [scale_picture(frame) for frame in some]
+    decides = len(some) >= FEWEST and min(small[0].shape[:2]) > 2 * EDGE + 2
+    group = free_frames(small)[0] if decides else None
+    return median(frames if group is None else [some[i] for i in group])
+
+
+def reduced(frame: Array) -> Array:
+    """Return a copy of a frame, whose long side has at most SIDE pixels."""
+    return frame.copy() if max(frame.shape[:2]) <= SIDE else scale_picture(frame, SIDE)
+
+
+def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
+    """Return the untouched gel of one frame or more of a folder or a film, and how many count for it.
+
+    With fewer than FEWEST it shows the press itself.
+    """
+    spread = Spread(reduced)
+    for frame in frames:
+        spread.add(frame)
+    if not spread.items:
+        raise UserError("no frame can be read, so the untouched gel is unknown. Check the pictures.")
+    usual = alike(spread.items)
+    return estimate(usual), len(usual)
+
+
+def alike(frames: Sequence[Array]) -> list[Array]:
+    """Return the frames of the commonest size."""
+    sizes = Counter(frame.shape for frame in frames)
+    return [frame for frame in frames if frame.shape == sizes.most_common(1)[0][0]]
+
+
+class RunningGel:
+    """The untouched gel of a live source: `picture`, None before its first frame, from the frames so far.
+
+    It is estimated whenever their number has doubled, and `settled` after SETTLED of them.
+    """
+
+    def __init__(self) -> None:
+        self.picture: Array | None = None
+        self.settled, self._spread, self._due = False, Spread(reduced), 1
+
+    def add(self, frame: Array) -> None:
+        """Take one frame more, RGB u8 (h, w, 3)."""
+        if self.settled:
+            return
+        self._spread.add(frame)
+        count = self._spread.count
+        if count >= self._due:
+            self._due, self.settled = min(2 * count, SETTLED), count >= SETTLED
+            self.picture = estimate(self._spread.items)
+
+
+def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
+    """Return an upright picture as the camera takes it, before `orient_frame` turns and mirrors it."""
+    return np.ascontiguousarray(orient_frame(orient_frame(picture, 0, flip), -rotate % 360))
+
+
+def same_unit(known: Mapping[str, Array], picture: Array) -> tuple[Array | None, str]:
+    """Return the known picture that looks most like `picture`, None without any, and how another unit differs ("")."""
+    sizes = {name: gel.shape[1] / gel.shape[0] / (picture.shape[1] / picture.shape[0]) for name, gel in known.items()}
+    fitting = {name: known[name] for name, ratio in sizes.items() if abs(ratio - 1) < 0.05}
+    if not fitting:
+        return None, "in size" if known else ""
+
+    def small(one: Array) -> Array:
+        return cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+    own = small(picture)
+    tints = {name: np.median(np.abs(small(gel) - own), axis=(0, 1)).max() for name, gel in fitting.items()}
+    name = min(tints, key=lambda one: float(tints[one]))
+    return fitting[name], "" if tints[name] <= TINT else f"in tint, by {tints[name]:.0f} grey levels"
+
+
+def other_unit(why: str) -> str:
+    """Return the warning about a camera whose picture differs from all that a head or an index was fitted with."""
+    return (
+        f"The picture differs {why} from every unit that the head or index was fitted with. Its own untouched gel is "
+        "subtracted. Do not trust the result before you have checked it."
+    )
+
+
+class _Unit(NamedTuple):
+    """The picture of a unit, None if there is none, what it is, from how many frames, and whether a head has it."""
+
+    picture: Array | None = None
+    source: str = "none"
+    frames: int = 0
+    fitted: bool = False
+
+
+class UnitGels:
+    """The untouched gel of every row of a manifest. A unit is looked at when one of its rows is asked for.
+
+    `known` are the pictures of a head or an index by unit, of which the same unit gets its own. `log` gets one warning
+    about units that are none of these.
+    """
+
+    def __init__(
+        self, manifest: Manifest, known: Mapping[str, Array] | None = None, log: Callable[[str], None] | None = None
+    ) -> None:
+        self._manifest, self._known, self._log = manifest, known or {}, log
+        keys = np.stack([manifest.codes(name, own=True) for name in ("sensor", "dataset", "unit")], 1)
+        _, self._first, self._unit = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        self._stored = manifest.present("background_path")
+        self._split = manifest.text_column("split")
+        self._has_image = ~np.isin(manifest.text_column("sensor"), FIELD_SENSORS)
+        self._units, self._lock = dict[int, _Unit](), threading.Lock()
+
+    def __call__(self, row: int) -> Array | None:
+        """Return the picture RGB u8 (h, w, 3) of a row's unit; None if that of the row counts, or there is none."""
+        return self._of(row).picture
+
+    def read(self, row: int) -> Array | None:
+        """Return the untouched gel of a row, its own picture where that counts. Raises UserError if it is broken."""
+        picture = self(row)
+        if picture is not None or not self._stored[row]:
+            return picture
+        try:
+            return decode(self._manifest.file(row, "background_path"))
+        except UserError as error:
+            raise UserError(f"{self._manifest.where(row)}, column 'background_path': {error}") from None
+
+    def shared(self, make: Callable[[Array], T], most: int = 256) -> Callable[[int], T | None]:
+        """Return a function from a row to `make` of its untouched gel (or None), made once for all rows of it."""
+        made = dict[Any, T]()
+
+        def of_row(row: int) -> T | None:
+            key: Any = int(self._unit[row])
+            if self(row) is None:
+                key = self._manifest.file(row, "background_path") if self._stored[row] else None
+            if key is not None and key not in made:
+                one = make(self.read(row))  # type: ignore[arg-type]
+                if len(made) >= most:
+                    made.clear()
+                return made.setdefault(key, one)
+            return made.get(key)
+
+        return of_row
+
+    def has(self, rows: Array) -> Array:
+        """Return which rows have one, bool (rows,)."""
+        return np.array([self._stored[row] or self(row) is not None for row in rows.tolist()], bool)
+
+    def report(self, rows: Array) -> str:
+        """Return a line on what is used for rows."""
+        count, units = Counter[str](), dict[str, dict[int, int]]()
+        for row in rows.tolist():
+            one = self._of(row)
+            count[one.source] += 1
+            units.setdefault(one.source, {})[int(self._unit[row])] = one.frames
+        parts = []
+        for source, some in count.items():
+            frames, of = sum(units[source].values()), len(units[source])
+            about = f" of {frames:,} frames of {of} unit{'s' * (of > 1)}" if frames else ""
+            parts.append(f"{source}{about} for {some:,} rows")
+        return f"untouched gel: {'; '.join(parts)}"
+
+    def pictures(self, rows: Array) -> dict[str, Array]:
+        """Return the pictures of the units of rows by name, those of the STORED units with most rows."""
+        rows, found = rows[self.has(rows)], {}
+        units, first, counts = np.unique(self._unit[rows], return_index=True, return_counts=True)
+        for place in np.argsort(-counts, kind="stable")[:STORED].tolist():
+            picture = self.read(int(rows[first[place]]))
+            assert picture is not None
+            found[self._name(int(units[place]))] = reduced(picture)
+        return found
+
+    def _name(self, unit: int) -> str:
+        cells = (self._manifest.value(int(self._first[unit]), name) for name in ("dataset", "sensor", "unit"))
+        return " ".join(str(cell) for cell in cells if cell)
+
+    def digest(self) -> str:
+        """Return what decides the pictures that are not stored ones, as text."""
+        digest = 0
+        for row in np.unique(np.where(self._stored, -1, self._first[self._unit]))[1 if self._stored.any() else 0 :]:
+            picture = self._find_once(int(self._unit[row])).picture
+            digest = zlib.crc32(b"-" if picture is None else picture.tobytes(), digest)
+        return f"{digest:08x}"
+
+    def _of(self, row: int) -> _Unit:
+        if not self._stored[row]:
+            return self._find_once(int(self._unit[row]))
+        one = self._find_once(int(self._unit[row])) if self._known else _Unit()
+        return one if one.fitted else _Unit(None, "a stored picture")
+
+    def _find_once(self, unit: int) -> _Unit:
+        with self._lock:
+            if unit not in self._units:
+                self._units[unit] = self._find(unit)
+            return self._units[unit]
+
+    def _find(self, unit: int) -> _Unit:
+        """Return the median of a unit's frames, or the picture of the same unit among the known ones."""
+        rows = np.flatnonzero((self._unit == unit) & self._has_image)
+        found = self._median(rows[self._split[rows] == "background"], 1, "rows of split background")
+        if found.picture is None:
+            found = self._median(self._fitted(rows), FEWEST, "the median")
+        if found.picture is None:  # a unit of few frames is taken for another one of its sensor
+            sensor = self._manifest.codes("sensor")
+            alike = np.flatnonzero((sensor == sensor[self._first[unit]]) & self._has_image)
+            found = self._median(self._fitted(alike), FEWEST, "the median of its sensor")
+        if not self._known:
+            return found
+        look = found.picture if found.picture is not None else self._median(rows, 1, "").picture
+        name = self._name(unit)
+        known = {name: self._known[name]} if name in self._known else self._known
+        gel, why = (None, "") if look is None else same_unit(known, look)
+        if why and self._log is not None:
+            self._log(other_unit(why))
+            self._log = None  # once
+        return found if gel is None or why else _Unit(gel, "the picture that the head was fitted with", 0, True)
+
+    def _fitted(self, rows: Array) -> Array:
+        """Return the rows of split train, or else all but those of split background."""
+        train = rows[self._split[rows] == "train"]
+        return train if len(train) else rows[self._split[rows] != "background"]
+
+    def _median(self, rows: Array, fewest: int, source: str) -> _Unit:
+        frames = []
+        for row in rows[np.unique(np.linspace(0, len(rows) - 1, FRAMES).astype(int))].tolist() if len(rows) else ():
+            with suppress(UserError):  # reading the row itself reports it
+                frames.append(reduced(decode(self._manifest.file(row))))
+        usual = alike(frames)
+        return _Unit() if len(usual) < fewest else _Unit(median(usual), source, len(usual))
+
+
+def gel_arrays(pictures: Mapping[str, Array]) -> dict[str, Array]:
+    """Return pictures by unit as arrays for an .npz file."""
+    arrays = {f"gel/{number}": picture for number, picture in enumerate(pictures.values())}
+    return {"gels": np.array(list(pictures), str)} | arrays if pictures else {}
+
+
+def gels_of_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the pictures among the arrays of an .npz file. Raises KeyError or ValueError for others."""
+    names, found = arrays.get("gels", np.zeros(0, str)), {}
+    check_array("gels", names, (len(names.reshape(-1)),), "U")
+    for number, name in enumerate(names.tolist()):
+        picture = arrays[f"gel/{number}"]
+        check_array(f"gel/{number}", picture, (*picture.shape[:2], 3), "u")
+        found[name] = picture
+    return found

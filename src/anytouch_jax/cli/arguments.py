@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Annotated, Any, get_type_hints
 
+from anytouch_jax.cli.words import check_words, option_of, options_of
 from anytouch_jax.config.parsing import check
 from anytouch_jax.errors import UserError
 
@@ -39,17 +40,21 @@ RENAMED = {
 }
 
 
-def parse_options(kind: Any, name: str, args: Sequence[str], default: Any = None, *, add_help: bool = True) -> Any:
+def parse_options(
+    kind: Any, name: str, args: Sequence[str], default: Any = None, *, add_help: bool = True,
+    others: Mapping[str, str] | None = None,
+) -> Any:  # fmt: skip
     """Return the record `kind` of the options in `args`.
 
-    Raises UserError for a renamed or repeated option or a number out of its range, and SystemExit after --help and
-    tyro's own errors.
+    `others` are options of the command that are parsed elsewhere. Raises UserError for words that are no options, for
+    values of another type or out of their range, and SystemExit after --help.
     """
     import tyro
 
     args = [expand_home(arg) for arg in args]
     _refuse_renamed(kind, args)
-    _refuse_repeated(kind, args)
+    if not (add_help and {"-h", "--help"} & {*args}):
+        check_words(name.partition(" [")[0], [*options_of(kind, default)], args, others or {})
     # The text of an option explains a default that is None or empty.
     hint = tyro.conf.arg(help_behavior_hint=lambda value: "" if value in ("None", "") else f"(default: {value})")
     kept = get_type_hints(kind, include_extras=True)
@@ -72,11 +77,6 @@ def expand_home(arg: str) -> str:
     return name + equals + os.path.expanduser(value) if name.startswith("--") else arg
 
 
-def option_of(arg: str) -> str:
-    """Return the name of an option as documented: --save-every for --save_every=5."""
-    return arg.partition("=")[0].replace("_", "-")
-
-
 def spelled(field: str) -> str:
     """Return the option of a field: --save-every for save_every."""
     return f"--{field.replace('_', '-')}"
@@ -89,20 +89,3 @@ def _refuse_renamed(kind: Any, args: Sequence[str]) -> None:
             if old.startswith("--") and old in RENAMED and old not in known:
                 rest = option.removeprefix(old) if RENAMED[old].startswith("--") else ""
                 raise UserError(f"{option} has a new name: use {RENAMED[old]}{rest}")
-
-
-def _refuse_repeated(kind: Any, args: Sequence[str]) -> None:
-    """Raise UserError for an option of several values that is repeated: the first values would be lost."""
-    options = [option_of(arg) for arg in args]
-    for option in map(spelled, _options_of_several(kind)):
-        if options.count(option) > 1:
-            raise UserError(f"{option} is given twice. Write it once, followed by all its values.")
-
-
-def _options_of_several(kind: Any) -> Iterator[str]:
-    """Yield the options that take several values, those of a section as section.name."""
-    for name, hint in get_type_hints(kind).items():
-        if is_dataclass(hint):
-            yield from (f"{name}.{inner}" for inner in _options_of_several(hint))
-        elif tuple in (get_origin(hint), *map(get_origin, get_args(hint))):
-            yield name

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
+from anytouch_jax.config.parsing import Count, NotNegative
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,8 +32,8 @@ class StreamOptions(embed.FrameOptions):
     engine: Literal["xla", "onnxruntime", "openvino"] | None = None
     """What runs the encoder: xla, or for an .onnx file of `anytouch export` onnxruntime. The others need the extra
     engines, and export the encoder first."""
-    stride: int = 1  # Frames from one frame of a clip to the next, as in the training data.
-    reuse: float = 0.0
+    stride: Count[int] = 1  # Frames from one frame of a clip to the next, as in the training data.
+    reuse: NotNegative[float] = 0.0
     """Reuse features while no place changes by more than so many times the camera's noise (0: while frames are
     equal)."""
 

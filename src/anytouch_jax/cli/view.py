@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import log, refuse_unused
-from anytouch_jax.config.parsing import Count
+from anytouch_jax.config.parsing import Range
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class ViewOptions:
     head: Path | None = None  # Show the class of a camera's touch by this head of `anytouch probe label --save`.
     out: Path | None = None  # Folder for recordings of a camera, with their manifest.parquet.
     host: str = "127.0.0.1"  # Address to listen on. For any but this machine's own, the page asks for a token.
-    port: Count[int] = 8765  # Port to listen on.
+    port: Annotated[int, Range(1, 65535, "1 to 65535")] = 8765  # Port to listen on.
 
 
 def run(options: ViewOptions) -> int:

@@ -83,6 +83,7 @@ class FamilyEncoder(Encoder):
     def sensor_row(self, name: str, log: Log = warn) -> int:
         """Return the row of a sensor. A family without sensors ignores it, which is logged once."""
         names, name = self.config.model.sensors, families.ALIASES.get(str(name), str(name))
+        check_spelling(name, names)
         if len(names) == 1:
             if name != UNIVERSAL and "sensor" not in self._logged:
                 self._logged.add("sensor")
@@ -90,7 +91,6 @@ class FamilyEncoder(Encoder):
             return 0
         if name in names and (name != UNIVERSAL or self.form.model.sensor_tokens):
             return names.index(name)
-        check_spelling(name, names)
         if self.form.model.sensor_tokens:
             log(f"sensor {name!r} has no tokens in {self.source}: using the universal tokens")
             return names.index(UNIVERSAL)

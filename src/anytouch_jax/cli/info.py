@@ -25,11 +25,12 @@ _WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Describe an encoder by name, a run, weights, a manifest, features, a head or an exported encoder.
+    """Describe an encoder by name, a run, weights, a manifest, features, a head, an exported encoder or a film.
 
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
 
-    `anytouch info encoders` lists the encoders in the package. `--health` checks the sensor units of a manifest.
+    `anytouch info encoders` lists the encoders in the package, and `anytouch info cameras` the connected cameras.
+    `--health` checks every sensor unit of a manifest.
     """
 
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
@@ -111,6 +112,10 @@ def _lines(path: Path) -> list[str]:
         return [_named(name) for name in registry.list_encoders()]
     if str(path) in registry.list_encoders():
         return [_named(str(path)), *_weights(registry.locate(path))]
+    if str(path) == "cameras":
+        from anytouch_jax.data.cameras import list_cameras
+
+        return [line for camera in list_cameras() for line in camera.lines()] or ["no camera is connected"]
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
@@ -137,8 +142,34 @@ def _lines(path: Path) -> list[str]:
         return lines
     if suffix in _WEIGHTS or path.name.endswith(".index.json"):
         return _weights(path, weights)
-    known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features or a head"
+    if lines := _film(path):
+        return lines
+    known = (
+        f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features, a head, a film"
+    )
     raise UserError(f"{path} has no known format. Known are {known}.")
+
+
+def _film(path: Path) -> list[str]:
+    """Return a line about a film, [] for another file."""
+    import cv2
+
+    from anytouch_jax.data.cameras import format_of
+    from anytouch_jax.data.images import open_video
+
+    film = open_video(path)
+    names = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+    count, width, height, rate = (film.get(name) for name in names)
+    codec, is_film = format_of(film), film.isOpened() and film.read()[0]
+    film.release()
+    if not is_film:
+        return []
+    seconds = f" and {count / rate:.1f} s at {rate:.4g} frames/s" if rate > 0 and count > 0 else ""
+    frames = f"{count:.0f} frames{seconds}" if count > 0 else "an unknown number of frames"
+    return [
+        f"{path}: a film of {frames}, {width:.0f} x {height:.0f} pixels, codec {codec or 'unknown'}",
+        "use it with embed, stream and view",
+    ]
 
 
 def _named(name: str) -> str:

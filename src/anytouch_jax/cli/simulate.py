@@ -42,7 +42,9 @@ class SimulateOptions:
     vision: Share = 0.7  # Share of the recordings with a photograph.
     text: Share = 0.7  # Share of the recordings with a caption.
     held_out: Below1 = 0.25  # Share of the objects in the test split, by pairs of primitive and texture.
-    first: NotNegative[int] = 0  # Number of the first touch. Another number gives other touches of the same objects and splits.
+    first: NotNegative[int] = (
+        0  # Number of the first touch. Another number gives other touches of the same objects and splits.
+    )
     fields: tuple[str, ...] = ()  # Fields to write as .npy: displacement, pressure, shear.
     size: NotNegative[int] = 224  # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
     units: Literal["each", "one"] = "each"

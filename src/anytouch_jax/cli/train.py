@@ -9,9 +9,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Literal, NamedTuple, get_type_hints
 
-from anytouch_jax.cli.arguments import parse_options, spelled
+from anytouch_jax.cli.arguments import options_of, parse_options, spelled
 from anytouch_jax.cli.output import log
-from anytouch_jax.cli.words import options_of
 from anytouch_jax.config import (
     Config,
     DataConfig,

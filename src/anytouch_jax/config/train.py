@@ -82,7 +82,9 @@ class DataConfig:
     batch_size: Count[int] = 64  # Samples of a step (--batch).
     clip_share: Share = 0.5  # Share of clips. The rest are stills.
     order: Literal["alternate", "random"] = "alternate"  # Batches of stills and clips: in turn, or mixed (release).
-    weights: NotNegative[tuple[tuple[str, float], ...] | None] = None  # Dataset and how often an epoch draws it. 0: never.
+    weights: NotNegative[tuple[tuple[str, float], ...] | None] = (
+        None  # Dataset and how often an epoch draws it. 0: never.
+    )
     negatives: Literal["any", "same_sensor"] = "any"  # Sensors of the negatives of matching: any, or the positive's.
     parts: NotNegative[int] = 0
     """Cut large data into this many parts of whole shards. A slot of a batch draws from its own part, so that a host

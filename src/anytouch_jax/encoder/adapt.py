@@ -64,9 +64,9 @@ def adapt(
 ) -> Adapted:  # fmt: skip
     """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split train.
 
-    `run` is what `load_encoder` takes: a name, a run folder, a weights file or an address. The tokens start as the universal ones, and stay so with 0 frames. The embedding of each frame is drawn to the
-    prototype of its class in the column `labels`: the mean embedding of the known sensors' frames of that class. Raises
-    UserError.
+    `run` is what `load_encoder` takes: a name, a run folder, a weights file or an address. The tokens
+    start as the universal ones, and stay so with 0 frames. The embedding of each frame is drawn to the prototype of its
+    class in the column `labels`: the mean embedding of the known sensors' frames of that class. Raises UserError.
     """
     if frames < 0 or steps < 1:
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")

@@ -15,14 +15,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.data.images import QUIET, frame_time, open_video, to_rgb
+from anytouch_jax.data.cameras import open_source as open_source  # callers find it next to `stream`
+from anytouch_jax.data.images import QUIET, frame_time, to_rgb
 from anytouch_jax.encoder.base import Preprocess, precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
@@ -135,24 +135,6 @@ class Mailbox:
         with self._changed:
             self.is_closed, self._error = True, self._error or error
             self._changed.notify_all()
-
-
-def open_source(name: str | Path) -> tuple[Source, bool]:
-    """Return the source, and whether it is a camera, of a camera's number or a video file. Raises UserError."""
-    live = str(name).isdecimal() and not Path(name).exists()
-    if not live and not Path(name).is_file():
-        raise UserError(f"there is no video {name}; give a video file, or the number of a camera, such as 0")
-    with QUIET:
-        source = cv2.VideoCapture(int(str(name))) if live else open_video(name)
-    if not source.isOpened():
-        raise UserError(
-            f"camera {name} cannot be opened; check its number and its cable"
-            if live
-            else f"{name} is not a video that can be read; convert it first"
-        )
-    if live:
-        source.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the driver's own queue would hold old frames
-    return source, live
 
 
 def stream(

@@ -6,7 +6,6 @@ One row is one tactile frame (the columns are in `schema.py`), and row numbers c
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, ModelConfig, SpellingError, check_spelling
+from anytouch_jax.config import FIELD_SENSORS, ModelConfig, SpellingError, check_spelling
 from anytouch_jax.data.manifest.content import Summary, clip_windows, content_digest, summarise, table_blocks
 from anytouch_jax.data.manifest.remote import is_remote, local_copy
 from anytouch_jax.data.manifest.schema import (

@@ -86,8 +86,9 @@ def test_cameras_are_listed_with_names_serials_sizes_and_rates(system):
 
 @pytest.mark.parametrize(
     ("name", "number"),
-    [("0", 0), ("7", 7), ("/dev/video7", 7), ("DIGIT", 0), ("digit", 0), ("d20345", 0), ("gelsight mini", 2), ("film.mp4", None),
-     ("films/digit", None), ("http://127.0.0.1/a", "http://127.0.0.1/a"), ("rtsp://host", "rtsp://host"), ("", None)],
+    [("0", 0), ("7", 7), ("/dev/video7", 7), ("DIGIT", 0), ("digit", 0), ("d20345", 0), ("gelsight mini", 2),
+     ("film.mp4", None), ("films/digit", None), ("http://host/a", "http://host/a"), ("rtsp://host", "rtsp://host"),
+     ("", None)],
 )  # fmt: skip
 def test_what_a_user_may_call_a_camera(system, name, number):
     assert camera_of(name) == number

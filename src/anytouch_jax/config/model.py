@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check
 from anytouch_jax.errors import ConfigError, letters_apart
+from anytouch_jax.shown import shown_short
 
 UNIVERSAL = "universal"
 SENSORS = (
@@ -51,6 +52,7 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
         )
 
 
+@shown_short
 @dataclass(frozen=True)
 class Stack:
     """A stack of transformer blocks."""
@@ -66,6 +68,7 @@ class Stack:
             raise ConfigError(f"width {self.width} must be a multiple of heads {self.heads}")
 
 
+@shown_short
 @dataclass(frozen=True)
 class TextTower:
     """CLIP's text tower."""
@@ -79,6 +82,7 @@ class TextTower:
         check(self, "--model.text.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class ModelConfig:
     """Everything that decides the shapes and the arithmetic of the network.

@@ -15,6 +15,7 @@ from anytouch_jax.config import parsing
 from anytouch_jax.config.model import ModelConfig
 from anytouch_jax.config.parsing import Above0, Below1, Count, NotNegative, Range, Seed, Share, check
 from anytouch_jax.errors import ConfigError
+from anytouch_jax.shown import shown_short
 
 Recipe = Literal["paper", "release"]
 Towers = Literal["none", "scratch", "pretrained"]
@@ -25,6 +26,7 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
 
+@shown_short
 @dataclass(frozen=True)
 class LossConfig:
     """Weights and choices of the losses (Sec. 3.2 to 3.6 and appendix)."""
@@ -53,6 +55,7 @@ class LossConfig:
         return 1.0 - self.mask_ratio
 
 
+@shown_short
 @dataclass(frozen=True)
 class OptimConfig:
     """AdamW and its schedule (appendix "Implementation details")."""
@@ -73,6 +76,7 @@ class OptimConfig:
         check(self, "--optim.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class DataConfig:
     """Reading and augmentation of the data."""
@@ -110,6 +114,7 @@ class DataConfig:
         check(self, "--data.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class SimulatedConfig:
     """Simulated touches that training draws from (--data simulated). No data set is written."""
@@ -148,6 +153,7 @@ class RunConfig:
         check(self, "--run.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class Config:
     """A whole run. Build one with `preset(...)`, change it with `dataclasses.replace`."""

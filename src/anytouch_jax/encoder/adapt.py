@@ -31,6 +31,7 @@ from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
+from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import checkpoint, compatible, registry
 from anytouch_jax.weights.families import load_family
 from anytouch_jax.weights.load import Loaded, load_model
@@ -42,6 +43,7 @@ MEASURED = 64  # frames on which the loss is measured before and after
 PROTOTYPE_ROWS = 1000  # frames of the known sensors for the prototypes of the classes
 
 
+@shown_short
 class Adapted(NamedTuple):
     """A model with a fitted row of tokens, and how well it fits.
 

@@ -27,6 +27,7 @@ from anytouch_jax.encoder.base import Preprocess, precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
 from anytouch_jax.errors import UserError
+from anytouch_jax.shown import shown_short
 
 PARTS = ("decode", "resize", "copy", "encoder")
 KEPT = 100_000  # last frames whose times are stored if their features are not
@@ -47,6 +48,7 @@ class CameraError(UserError):
     """A camera that delivers no frames any more."""
 
 
+@shown_short
 class Frame(NamedTuple):
     """Pixels RGB u8 (h, w, 3) of frame `number`, the clock when it was `read`, and the seconds of decoding.
 
@@ -63,6 +65,7 @@ class Frame(NamedTuple):
     missed: int = 0
 
 
+@shown_short
 class Clip(NamedTuple):
     """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN."""
 
@@ -72,6 +75,7 @@ class Clip(NamedTuple):
     contact: float = float("nan")
 
 
+@shown_short
 class Embedded(NamedTuple):
     """Features f32 (E,) of the clip that ends with frame `number`.
 
@@ -355,6 +359,7 @@ class _Watch:
         return "ok"
 
 
+@shown_short
 class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 

@@ -41,6 +41,7 @@ from anytouch_jax.data.manifest.schema import (
 )
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_path
+from anytouch_jax.shown import described
 
 _LONGEST_PATH = 4000  # bytes, on Linux
 KEYS = ("sequence", "touch", "grasp_group")  # columns whose values belong to their file
@@ -61,6 +62,17 @@ class Manifest:
 
     def __len__(self) -> int:
         return int(self.table.num_rows)
+
+    def __repr__(self) -> str:
+        counts = {}
+        for name in ("split", "sensor"):
+            most = sorted(pc.value_counts(self.column(name)).to_pylist(), key=lambda entry: -entry["counts"])
+            counts[f"{name}s"] = listed([f"{entry['values']} {entry['counts']:,}" for entry in most])
+        recordings = len(np.unique(self.codes("sequence", own=True)))
+        return described(
+            f"Manifest {self._name}", rows=f"{len(self):,} in {recordings:,} recordings", **counts,
+            columns=listed(self.table.column_names),
+        )  # fmt: skip
 
     def where(self, row: int) -> str:
         """Return "line 5 of /data/m.csv", or "row 3 of /data/m.parquet", for errors."""

@@ -38,6 +38,7 @@ from anytouch_jax.data.prepare.scan import (
     finding,
     scan,
 )
+from anytouch_jax.shown import shown_short
 
 _SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
 _LISTED = 1000  # rows of a finding that are written to JSON
@@ -48,6 +49,7 @@ _WIDER = 1.5  # touch images may spread this much more than photographs before t
 _CERTAIN = 0.95  # share of the rows that must resemble the background images to call a dataset swapped
 
 
+@shown_short
 @dataclass(frozen=True)
 class VerifyReport:
     """The result of `verify`. `shares` holds, for each dataset and column, the share of rows that have a value."""

@@ -33,7 +33,8 @@ def made(tmp_path, world, tiny_run):
         "manifest": manifest, "loader": at.Loader(manifest, loader_config), "features": features,
         "index": load_index(tmp_path / "f.npz"), "head": at.ProbeHead(), "touch": at.TouchBatch(clip, rows),
         "stage 2": at.Stage2Batch(None, match), "traced": jax.eval_shape(lambda: at.TouchBatch(clip, rows)),
-        "state": state, "linear head": LinearHead(classes, ARRAY, ARRAY[0], ARRAY[0], ARRAY[0], "object", "class", 1, "f"),
+        "state": state,
+        "linear head": LinearHead(classes, ARRAY, ARRAY[0], ARRAY[0], ARRAY[0], "object", "class", 1, "f"),
     }.items()  # fmt: skip
 
 

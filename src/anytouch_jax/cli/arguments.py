@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
+import sys
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
@@ -69,9 +72,21 @@ def parse_options(
         kind.__name__, (kind,), {"__doc__": kind.__doc__, "__module__": kind.__module__, "__annotations__": hints}
     )
     extra = {} if default is None else {"default": default}
-    options = tyro.cli(
-        shown, prog=f"anytouch {name}", args=args, config=[tyro.conf.AvoidSubcommands], add_help=add_help, **extra
-    )
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed):
+            options = tyro.cli(
+                shown, prog=f"anytouch {name}", args=args, config=[tyro.conf.AvoidSubcommands], add_help=add_help,
+                **extra,
+            )  # fmt: skip
+    except SystemExit as stop:
+        error: BaseException | None = stop
+        while error is not None:  # a record that refuses its values: tyro draws a box around the error
+            if isinstance(error, UserError):
+                raise error from None
+            error = error.__context__
+        sys.stderr.write(printed.getvalue())
+        raise
     check(options, "--")
     return options
 

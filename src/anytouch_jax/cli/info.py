@@ -25,7 +25,7 @@ _WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Describe an encoder by name, a run, weights, a manifest, features, a head, an exported encoder or a film.
+    """Describe an encoder by name, a run, weights, a manifest, features, a head, pictures, a film, or the cameras.
 
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
 
@@ -142,34 +142,37 @@ def _lines(path: Path) -> list[str]:
         return lines
     if suffix in _WEIGHTS or path.name.endswith(".index.json"):
         return _weights(path, weights)
-    if lines := _film(path):
+    if lines := _pictures(path):
         return lines
-    known = (
-        f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features, a head, a film"
-    )
-    raise UserError(f"{path} has no known format. Known are {known}.")
+    known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features, a head"
+    raise UserError(f"{path} has no known format. Known are {known}, pictures and films.")
 
 
-def _film(path: Path) -> list[str]:
-    """Return a line about a film, [] for another file."""
+def _pictures(path: Path) -> list[str]:
+    """Return lines about a picture, a folder of pictures or a film, [] for anything else."""
     import cv2
 
+    from anytouch_jax.data import images
     from anytouch_jax.data.cameras import format_of
-    from anytouch_jax.data.images import open_video
 
-    film = open_video(path)
+    use = "use it with embed and view"
+    is_picture = path.suffix.lower() in images.SUFFIXES
+    if path.is_dir() or is_picture:
+        files = [path] if is_picture else images.list_images(path)[0]
+        height, width = images.decode(files[0]).shape[:2]
+        what = "a picture" if is_picture else f"a folder of {len(files)} pictures"
+        return [f"{path}: {what} of {width} x {height} pixels", use]
+    film = images.open_video(path)
     names = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
-    count, width, height, rate = (film.get(name) for name in names)
+    count, wide, high, rate = (film.get(name) for name in names)
     codec, is_film = format_of(film), film.isOpened() and film.read()[0]
     film.release()
     if not is_film:
         return []
-    seconds = f" and {count / rate:.1f} s at {rate:.4g} frames/s" if rate > 0 and count > 0 else ""
-    frames = f"{count:.0f} frames{seconds}" if count > 0 else "an unknown number of frames"
-    return [
-        f"{path}: a film of {frames}, {width:.0f} x {height:.0f} pixels, codec {codec or 'unknown'}",
-        "use it with embed, stream and view",
-    ]
+    frames = f"{count:.0f} frames" if count > 0 else "an unknown number of frames"
+    seconds = f", {count / rate:.1f} s at {rate:.4g} frames/s" if rate > 0 and count > 0 else ""
+    about = f"{wide:.0f} x {high:.0f} pixels, codec {codec or 'unknown'}"
+    return [f"{path}: a film of {frames}{seconds}, {about}", f"{use}, and with stream"]
 
 
 def _named(name: str) -> str:
@@ -183,13 +186,15 @@ def _named(name: str) -> str:
 
 def _folder(path: Path) -> list[str]:
     """Return lines about a run, or about the manifest in the folder: that called manifest, or the first."""
+    from anytouch_jax.data.images import SUFFIXES
     from anytouch_jax.data.manifest.schema import is_manifest
     from anytouch_jax.weights.checkpoint import steps
 
     tables = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
     tables.sort(key=lambda file: file.stem != "manifest")
     if steps(path / "checkpoints") or not tables:
-        return _run(path)
+        is_run = (path / "checkpoints").exists() or not any(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return _run(path) if is_run else _pictures(path)
     others = ", ".join(sorted(file.name for file in tables[1:]))
     return [*_manifest(tables[0]), *([f"other manifests in this folder: {others}"] if others else [])]
 

@@ -20,6 +20,7 @@ from anytouch_jax.config import (
     PresetName,
     RunConfig,
     SimulatedConfig,
+    check_spelling,
     preset,
     presets,
 )
@@ -147,6 +148,8 @@ def _configure(options: TrainOptions) -> Config:
 
 def _refuse_unread(options: TrainOptions, config: Config) -> None:
     """Raise UserError for options that do not go together, and for settings that this stage does not read."""
+    for name in config.model.sensors:
+        check_spelling(name)
     baseline = presets.find_baseline(options.baseline)
     if options.stage == 2 and options.init and not baseline.starts_from_stage1:
         raise UserError(f"baseline {baseline.name} has no stage 1. Remove --init.")

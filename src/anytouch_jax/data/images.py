@@ -119,11 +119,15 @@ def decode(path: str | Path) -> np.ndarray:
 
 def decode_bytes(data: bytes, name: str | Path) -> np.ndarray:
     """Return the image in `data` as `decode` does; `name` is for errors."""
+    return to_rgb(stored_pixels(data, name), name)
+
+
+def stored_pixels(data: bytes, name: str | Path) -> np.ndarray:
+    """Return the pixels in `data` as they are stored, in RGB order; `name` is for errors. Raises ImageError."""
     try:
-        pixels = _unpack(data)
+        return _unpack(data)
     except (ValueError, EOFError, MemoryError) as error:
         raise ImageError(f"{name} cannot be read: {error}") from None
-    return to_rgb(pixels, name)
 
 
 def encode(picture: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:

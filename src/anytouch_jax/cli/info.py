@@ -42,8 +42,6 @@ class InfoOptions:
 
 def run(options: InfoOptions) -> int:
     """Print some lines about every path."""
-    if not options.paths:
-        raise UserError("There is nothing to describe. Name a file or a folder.")
     if options.health:
         return _health(options)
     refuse_unused(options, ("picture", "model"), "without --health")

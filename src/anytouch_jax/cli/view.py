@@ -44,18 +44,20 @@ class ViewOptions(CameraOptions):
 
 def run(options: ViewOptions) -> int:
     """Serve the page until Ctrl-C."""
-    if not options.paths:
-        raise UserError("There is nothing to show. Name a manifest, a folder, a film, features, a run or a camera.")
     try:
         from anytouch_jax.view import server
     except ModuleNotFoundError as error:
         if error.name not in ("starlette", "uvicorn"):
             raise
         raise UserError('The page needs starlette and uvicorn: pip install "anytouch_jax[view]"') from None
-    cameras = [path for path in options.paths if _is_camera(path, options.live)]
+    from anytouch_jax.data.cameras import camera_of
+
+    played = [path for path in options.paths if options.live and _is_film(path)]
+    cameras = [path for path in options.paths if path in played or camera_of(path) is not None]
     if not cameras:
-        asked = [field.name for field in fields(CameraOptions)]
-        refuse_unused(options, ("model", "sensor", "head", "out", *asked), "without a camera, or a film with --live")
+        refuse_unused(options, ("model", "sensor", "head", "out"), "without a camera, or a film with --live")
+    if len(cameras) == len(played):
+        refuse_unused(options, [field.name for field in fields(CameraOptions)], "without a camera")
     if len(cameras) > 1:
         raise UserError(f"One camera can be shown at a time, not {len(cameras)}. Start another page for the next.")
     begin = time.perf_counter()
@@ -67,11 +69,8 @@ def run(options: ViewOptions) -> int:
     return 0
 
 
-def _is_camera(name: str, live: bool) -> bool:
-    from anytouch_jax.data.cameras import camera_of
-
-    is_film = Path(name).is_file() and Path(name).suffix.lower() not in (".csv", ".parquet", ".npz")
-    return camera_of(name) is not None or (live and is_film)
+def _is_film(name: str) -> bool:
+    return Path(name).is_file() and Path(name).suffix.lower() not in (".csv", ".parquet", ".npz")
 
 
 def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Live:

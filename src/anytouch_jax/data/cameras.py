@@ -172,7 +172,7 @@ def _given(source: Any, camera: int | str, asked: CameraSettings) -> str:
     if asked.format is not None and asked.format.upper() != form:
         missed.append(asked.format.upper())
     words += f", not {' and '.join(missed)} as asked for" if missed else ""
-    modes = [mode for one in list_cameras() if one.number == camera for mode in one.modes]
+    modes = _modes(DEVICES / f"video{camera}") if isinstance(camera, int) else ()
     others = [(max(mode.rates), mode.format) for mode in modes if mode.rates and size == (mode.width, mode.height)]
     fastest, best = max(others, default=(0.0, ""))
     return words + (f". With format {best} it gives {fastest:g}" if best != form and fastest > rate + 1 else "")

@@ -117,17 +117,13 @@ def decode(path: str | Path) -> np.ndarray:
     return decode_bytes(data, path)
 
 
-def decode_bytes(data: bytes, name: str | Path) -> np.ndarray:
-    """Return the image in `data` as `decode` does; `name` is for errors."""
-    return to_rgb(stored_pixels(data, name), name)
-
-
-def stored_pixels(data: bytes, name: str | Path) -> np.ndarray:
-    """Return the pixels in `data` as they are stored, in RGB order; `name` is for errors. Raises ImageError."""
+def decode_bytes(data: bytes, name: str | Path, *, as_stored: bool = False) -> np.ndarray:
+    """Return the image in `data` as `decode` does, or its pixels before any scaling; `name` is for errors."""
     try:
-        return _unpack(data)
+        pixels = _unpack(data)
     except (ValueError, EOFError, MemoryError) as error:
         raise ImageError(f"{name} cannot be read: {error}") from None
+    return pixels if as_stored else to_rgb(pixels, name)
 
 
 def encode(picture: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:

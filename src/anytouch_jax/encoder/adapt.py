@@ -153,7 +153,7 @@ def choose_frames(
 
 
 def _read_model(run: str | Path) -> tuple[Loaded, Params]:
-    """Return the model, and its parameters as they are stored. Raises UserError for one of another family."""
+    """Return the model, and its stored parameters. Raises UserError for an encoder of another family."""
     path = registry.locate(run)
     family, weights = load_family(path)
     if family is not None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
-from anytouch_jax.data.images import ImageError, stored_pixels, to_rgb
+from anytouch_jax.data.images import ImageError, decode_bytes, to_rgb
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.files import Files, distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -146,7 +146,7 @@ def _judge(data: bytes, path: Path, is_image: bool) -> _FileState:
     if not is_image:
         return _FileState("ok", digest=digest)
     try:
-        stored = stored_pixels(data, path)
+        stored = decode_bytes(data, path, as_stored=True)
         pixels = to_rgb(stored, path)
     except ImageError as error:
         reason = str(error).removeprefix(f"{path} ").removeprefix("cannot be read: ")

@@ -190,7 +190,7 @@ def check_words(
     for arg in args:
         if arg == "--" and not only_values:
             only_values = True
-        elif _is_option(arg) and not only_values:
+        elif is_option(arg) and not only_values:
             name, equals, value = option_of(arg), "=" in arg, arg.partition("=")[2]
             if name not in named:
                 raise UserError(_unknown(name, {**others, **{one: one for one in named}}, advice))
@@ -222,7 +222,8 @@ def check_words(
             raise UserError(f"{name} is given twice. Write it once, followed by all its values.")
 
 
-def _is_option(arg: str) -> bool:
+def is_option(arg: str) -> bool:
+    """Return whether a word is an option, and not a number such as -1."""
     return arg.startswith("-") and arg.lstrip("-")[:1].isalpha() and arg.lstrip("-").lower() not in ("inf", "nan")
 
 

@@ -9,7 +9,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Literal, NamedTuple, get_type_hints
 
-from anytouch_jax.cli.arguments import options_of, parse_options, spelled
+from anytouch_jax.cli.arguments import is_option, options_of, parse_options, spelled
 from anytouch_jax.cli.output import log
 from anytouch_jax.config import (
     Config,
@@ -176,7 +176,7 @@ def _split_sections(args: Sequence[str]) -> tuple[list[str], list[str]]:
     section: list[str] = []
     target = plain
     for arg in args:
-        if arg.startswith("-") and not arg.lstrip("-").replace(".", "", 1).isdigit():
+        if is_option(arg):
             target = section if "." in arg.partition("=")[0] else plain
         target.append(arg)
     return plain, section

@@ -126,7 +126,7 @@ class SimulatedConfig:
     """Sensors that are simulated."""
     coarse: Share = 0.4  # Share of touches at which each sensor touches as by hand.
     wild: Share = 0.0  # Share of touches by sensors that mix two others, for the universal tokens.
-    depth: tuple[float, float] = (0.15, 1.0)  # Range of the deepest press, mm.
+    depth: NotNegative[tuple[float, float]] = (0.15, 1.0)  # Range of the deepest press, mm.
     vision: Share = 0.4  # Share of touches with a photograph.
     text: Share = 0.7  # Share of touches with a caption.
     places: Count[int] = 4  # Photographed places of each object.

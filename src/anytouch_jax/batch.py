@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from anytouch_jax.shown import shown_short
+
 Array = Any  # a numpy or a jax array
 
 
+@shown_short
 class FieldBatch(NamedTuple):
     """Touches with exact fields of their last frame (h, w), free of scale as in `nn.fields`.
 
@@ -31,6 +34,7 @@ class FieldBatch(NamedTuple):
     slip: Array
 
 
+@shown_short
 class TouchBatch(NamedTuple):
     """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table, and touches with fields or None."""
 
@@ -39,6 +43,7 @@ class TouchBatch(NamedTuple):
     fields: FieldBatch | None = None
 
 
+@shown_short
 class AlignBatch(NamedTuple):
     """Stage 2, alignment. Images and texts are packed into V and L slots; an unused slot has row B.
 
@@ -55,6 +60,7 @@ class AlignBatch(NamedTuple):
     text_row: Array
 
 
+@shown_short
 class MatchBatch(NamedTuple):
     """Stage 2, matching triples: three times (clip u8 (B, T, H, W, 3), sensor i32 (B,)).
 
@@ -71,6 +77,7 @@ class MatchBatch(NamedTuple):
     place: Array = None
 
 
+@shown_short
 class Stage2Batch(NamedTuple):
     """One stage-2 step: both parts (recipe paper) or one of them (recipe release), and touches with fields or None."""
 

@@ -8,6 +8,19 @@ def shorten(text: str) -> str:
     return text if len(text) <= _LETTERS else f"{text[:350]} ... {text[-140:]}"
 
 
+def letters_apart(one: str, other: str) -> int:
+    """Return how many letters must be added, removed, replaced or exchanged with the next to get the other word."""
+    before, last = list[int](), list(range(len(other) + 1))
+    for i, letter in enumerate(one):
+        row = [i + 1]
+        for j, wanted in enumerate(other):
+            row.append(min(last[j + 1] + 1, row[j] + 1, last[j] + (letter != wanted)))
+            if i and j and letter == other[j - 1] and one[i - 1] == wanted:
+                row[-1] = min(row[-1], before[j - 1] + 1)
+        before, last = last, row
+    return last[-1]
+
+
 class UserError(ValueError):
     """A user's mistake. The message is one sentence that says what is wrong, where, and what to do."""
 

@@ -8,12 +8,18 @@ import os
 import subprocess
 import sys
 import warnings
+from dataclasses import is_dataclass
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
 
 from anytouch_jax.cli import arguments
 from anytouch_jax.cli.app import COMMANDS, GROUPS, guarded, main
+from anytouch_jax.cli.arguments import options_of
+from anytouch_jax.cli.train import Sections
+from anytouch_jax.config import preset
+from anytouch_jax.config.parsing import Range
 from anytouch_jax.errors import UserError
 
 HELP = """
@@ -85,18 +91,96 @@ def test_an_old_option_is_answered_with_its_new_name(mistake, typed, option):
     assert option in mistake(*typed.split())
 
 
+def options_and_words(name):
+    """The options of a command, and words that give each required one a value of its kind."""
+    options = list(options_of(COMMANDS[name].options))
+    words = [word for one in options if one.is_required for word in given(one)]
+    if name == "train":
+        config = preset("tiny", stage=2, towers="scratch")
+        options += options_of(Sections, Sections(*(getattr(config, home) for home in get_type_hints(Sections))))
+    return options, words
+
+
+def given(option, value=None):
+    """Words that give an option a value for each of its places; `value` for its numbers."""
+    values = [value or "1" if kind in (int, float) else "x" for kind in option.kinds]
+    return values if option.is_positional else [option.name, *values]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_of_every_command_answers_a_mistake_with_one_sentence(name, mistake, anytouch):
+    options, needed = options_and_words(name)
+    flags = {one.name.rpartition(".")[0] + one.name.rpartition(".")[2] for one in options if one.is_flag}
+    known = {one.name for one in options} | flags
+
+    def answer(option, *words, part=None):
+        text = mistake(*name.split(), *([] if option.is_required else needed), *words)
+        assert (part or option.name) in text and len(text) < 400, text
+
+    page = anytouch(*name.split(), "--help-all" if name == "train" else "--help").out
+    for option in (one for one in options if not one.is_positional):
+        assert name == "train" or option.name in page
+        if (typo := option.name[:-1]) not in known and len(typo) > 5:
+            answer(option, typo, "x", part="did you mean --")
+        if option.is_flag:
+            answer(option, f"{option.name}=yes")
+            continue
+        if not option.may_be_empty:
+            answer(option, option.name)
+        if option.is_list:
+            answer(option, option.name, "a,b", part=f"write {option.name} a b")
+        if {int, float} & {*option.kinds}:
+            answer(option, *given(option, "many"))
+        if Literal in map(get_origin, option.kinds):
+            answer(option, *given(option))
+
+
+def ranges_of(kind, prefix="--"):
+    """Yield each number of a record of options with whether it is whole, and its range."""
+    plain = get_type_hints(kind)
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        parts = [plain[name], *get_args(plain[name])]
+        inner = next((one for one in parts if is_dataclass(one)), None)
+        spelt = f"{prefix}{name.replace('_', '-')}"
+        if inner is not None:
+            yield from ranges_of(inner, f"{spelt}.")
+        elif found := [one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Range)]:
+            yield spelt, int in parts, found[0]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_number_of_every_command_has_a_range(name, mistake):
+    options, needed = options_and_words(name)
+    kinds = (COMMANDS[name].options, Sections) if name == "train" else (COMMANDS[name].options,)
+    ranges = {option: rest for kind in kinds for option, *rest in ranges_of(kind)}
+    for option in options:
+        assert option.name in ranges or not {int, float} & {*option.kinds}, option
+        is_whole, (low, high, _) = ranges.get(option.name, (True, (-np.inf, np.inf, "")))
+        wrong = [f"{2**70}"] if is_whole else ["nan", "inf", "-inf", "1e400"]
+        wrong += [f"{low - 1:.17g}"] * bool(np.isfinite(low)) + [f"{high + 1:.17g}"] * bool(np.isfinite(high))
+        for value in wrong if option.name in ranges else ():
+            last = option.name.rpartition(".")[2]  # a stack of blocks does not know the name of its section
+            assert last in mistake(*name.split(), *needed, *given(option, value)), (option.name, value)
+
+
 @pytest.mark.parametrize(
-    ("typed", "option"),
+    ("typed", "right"),
     [
-        ("probe label --data a.csv --label object --data=b.csv", "--data"),
-        ("probe label --data a.csv --where force 1 --where slip 2", "--where"),
-        ("train --data a.csv --run r --model.sensors digit --model.sensors gelslim", "--model.sensors"),
-        ("retrieve --data a.csv --model r --model s", "--model"),
-        ("probe tasks --data a.csv --tasks slip --tasks force", "--tasks"),
+        ("probe label --data a.csv --data=b.csv", "--data is given twice"),
+        ("train --data a --run r --model.sensors digit --model.sensors gelslim", "--model.sensors is given twice"),
+        ("probe label --data a.csv --where force,7", "write --where force 7"),
+        ("data contact m.csv --threshold digit=5 gelsight=7", "write --threshold digit 5 gelsight 7"),
+        ("data simulate --out x --sensors [gelsight_mini, digit]", "write --sensors gelsight_mini digit"),
+        ("stream --data 0 --out x --camera-size 640x480", "write --camera-size 640 480"),
+        ("embed frames --out x", "did you mean --data frames?"),
+        ("info a --health b", "'b' belongs to no option"),
+        ("embed", "--data and --out are missing"),
+        ("train --data m --run r --learning-rat 1", "did you mean --optim.learning-rate?"),
+        ("train --data m --run r --model.sensors digti universal", "did you mean digit?"),
     ],
 )
-def test_an_option_of_several_values_is_given_once(mistake, typed, option):
-    assert option in mistake(*typed.split())
+def test_a_mistake_names_what_is_right(mistake, typed, right):
+    assert right in mistake(*typed.split())
 
 
 def test_the_home_folder_follows_an_equals_sign_too(monkeypatch, mistake, tmp_path):

@@ -79,7 +79,7 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
         def release(self):
             pass
 
-    monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
+    monkeypatch.setattr(streams, "open_source", lambda *_: (Camera(), True))
     monkeypatch.setattr(streams, "_PATIENCE", 0.01)
     before = signal.signal(
         signal.SIGINT, signal.default_int_handler
@@ -125,7 +125,7 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
 
 @pytest.mark.parametrize("out", ["f.npz", "-"])
 def test_a_camera_that_is_lost_keeps_the_features_and_fails(anytouch, tmp_path, tiny_run, monkeypatch, out):
-    monkeypatch.setattr(streams, "open_source", lambda name: (FaultyCamera("grab", frames=30), True))
+    monkeypatch.setattr(streams, "open_source", lambda *_: (FaultyCamera("grab", frames=30), True))
     monkeypatch.setattr(streams, "RETRY", 0.05)
     before = time.time()
     target = out if out == "-" else tmp_path / out
@@ -143,7 +143,7 @@ def test_a_camera_that_is_lost_keeps_the_features_and_fails(anytouch, tmp_path, 
 
 
 def test_a_camera_that_never_shows_a_frame_is_one_sentence(mistake, tmp_path, tiny_run, monkeypatch):
-    monkeypatch.setattr(streams, "open_source", lambda name: (FaultyCamera(frames=0), True))
+    monkeypatch.setattr(streams, "open_source", lambda *_: (FaultyCamera(frames=0), True))
     monkeypatch.setattr(streams, "RETRY", 0.0)
     done = mistake("stream", "--model", tiny_run, "--data", 0, "--sensor", "digit", "--out", tmp_path / "f.npz")
     assert "camera" in done and not (tmp_path / "f.npz").exists()

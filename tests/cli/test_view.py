@@ -8,7 +8,8 @@ from anytouch_jax.view import server
 
 
 def test_mistakes(mistake, tmp_path):
-    assert "nothing to show" in mistake("view")
+    assert "PATHS is missing" in mistake("view")
+    assert "--camera-fps has no effect" in mistake("view", tmp_path, "--camera-fps", 30)
     assert "no.csv" in mistake("view", tmp_path / "no.csv")
     (tmp_path / "a.mp4").write_bytes(b"no film")
     assert "no film" in mistake("view", tmp_path / "a.mp4")

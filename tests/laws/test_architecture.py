@@ -25,18 +25,19 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "files": set(),
     "bars": set(),
-    "batch": set(),
-    "config": {"errors"},
-    "nn": {"ops", "config"},
+    "shown": set(),
+    "batch": {"shown"},
+    "config": {"errors", "shown"},
+    "nn": {"ops", "config", "shown"},
     "objectives": {"ops", "nn.functional", "batch", "config"},
-    "weights": {"nn", "config", "files", "errors"},
-    "data": {"config", "batch", "files", "errors", "bars"},
+    "weights": {"nn", "config", "files", "errors", "shown"},
+    "data": {"config", "batch", "files", "errors", "bars", "shown"},
     "sim": {"data.manifest", "data.tokenizer", "config", "files", "errors"},
-    "train": {"batch", "config", "weights", "files", "errors"},
+    "train": {"batch", "config", "weights", "files", "errors", "shown"},
     # ops: unit-norm embeddings, and the contrast that fits a new sensor's tokens
-    "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "files", "errors", "bars"},
+    "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "files", "errors", "bars", "shown"},
     # objectives: stage 1's errors on pixels are measured by stage 1's own functions
-    "evaluate": {"encoder", "objectives", "data", "ops", "config", "files", "errors", "bars"},
+    "evaluate": {"encoder", "objectives", "data", "ops", "config", "files", "errors", "bars", "shown"},
     "view": {"evaluate", "encoder", "data", "config", "files", "errors"},
 }
 FREE = {"cli", "pretrain", "__init__", "__main__"}  # may import anything of ours, except that nobody imports cli

@@ -228,7 +228,7 @@ def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("ANYTOUCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
-    monkeypatch.setattr(streams, "open_source", lambda name: (Camera(), True))
+    monkeypatch.setattr(streams, "open_source", lambda *_: (Camera(), True))
     monkeypatch.setattr(streams, "Mailbox", lambda replace: Mailbox(replace=False))  # the encoder keeps up
     test_corpora.write_corpus(tmp_path / "far", "gelslam", "train", [{"capture": "a", "frame_idx": 0, "value": 1}])
     for number in range(4):

@@ -16,7 +16,8 @@ class AdaptOptions:
     Example: anytouch adapt --model runs/stage1 --data mine.csv --sensor my_gel --labels material --out runs/my_gel
     """
 
-    model: Path  # Run folder of stage 1 or stage 2.
+    model: Path
+    """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
     data: tuple[Path, ...]  # Manifests with frames of the sensor in split train.
     sensor: str  # Name of the sensor, as in the column sensor of the manifest.
     out: Path  # Run folder to write, for embed, probe and retrieve.

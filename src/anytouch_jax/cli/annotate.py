@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from anytouch_jax.cli import output
 from anytouch_jax.cli.output import log, refuse_unused
-from anytouch_jax.config.parsing import Count, NotNegative, Range
+from anytouch_jax.config.parsing import Above0, Count, NotNegative, Range, Threads
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -50,13 +50,13 @@ class AnnotateOptions:
     """Prompt of your dataset, as in: mydata photograph."""
     second_image: str = "image2_path"  # Column of a second photograph, for the prompt object.
     overwrite: bool = False  # Also ask for rows that have a caption.
-    threads: Count[int] = 4  # Questions at a time.
+    threads: Threads = 4  # Questions at a time.
     side: Annotated[int, Range(16, math.inf, "16 or more")] = 512  # Longest side of the pictures that are sent, pixels.
-    timeout: float = 60.0  # Seconds to wait for an answer.
-    tries: int = 5  # Tries for a question.
-    max_tokens: int = 200  # Largest number of tokens of an answer.
+    timeout: Above0[float] = 60.0  # Seconds to wait for an answer.
+    tries: Count[int] = 5  # Tries for a question.
+    max_tokens: Count[int] = 200  # Largest number of tokens of an answer.
     token_field: str = "max_tokens"  # Name of that limit in the protocol. Newer models need max_completion_tokens.
-    temperature: float | None = 0.0  # Temperature. None is not sent.
+    temperature: NotNegative[float | None] = 0.0  # Temperature. None is not sent.
     json_mode: bool = True  # Ask for a JSON object. Use --no-json-mode for servers without it.
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from tyro.conf import Positional
 
 from anytouch_jax.cli import output
 from anytouch_jax.cli.output import log, refuse_unused
-from anytouch_jax.config.parsing import Range
+from anytouch_jax.config.parsing import Finite, NotNegative, Share, Threads
 
 
 @dataclass(frozen=True)
@@ -27,20 +25,20 @@ class ContactOptions:
     manifest: Positional[Path]  # Manifest to mark (.csv, .parquet).
     out: Path | None = None  # Manifest to write (default: NAME_contact, next to the manifest).
     drop: bool = False  # Drop frames without contact. The split background and unknown frames stay.
-    threshold: tuple[tuple[str, float], ...] = ()
+    threshold: NotNegative[tuple[tuple[str, float], ...]] = ()
     """Contact threshold of the score by sensor, as in: digit 5 gelsight 7."""
     background: tuple[str, ...] = ()
     """Picture of the untouched gel for recordings without one: FILE for all, or UNIT=FILE for each sensor unit."""
-    share: float = 0.0
+    share: Share = 0.0
     """Also require this share (0 to 1) of the highest score of the recording. This removes the start and end of a
     contact. --picture and --check ignore it."""
     picture: Path | None = None
     """PNG of kept and dropped frames by rising score. Look at it before you trust a threshold."""
     check: bool = False  # Print precision and recall against a reference column. Writes a manifest only with --out.
     reference: str | None = None  # Column for --check (default: label.force, label.contact or label.contact_score).
-    above: Annotated[float | None, Range(-math.inf, math.inf, "a number")] = None
+    above: Finite[float | None] = None
     """Value of the reference column above which a frame is in contact."""
-    threads: int = 2  # Threads that read pictures.
+    threads: Threads = 2  # Threads that read pictures.
 
 
 def run(options: ContactOptions) -> int:

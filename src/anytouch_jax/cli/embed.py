@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from anytouch_jax.bars import tracked
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
-from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
+from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.config.parsing import Count
 from anytouch_jax.errors import UserError
 
@@ -112,9 +112,11 @@ def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean"
     head = None if options.head is None else load_head(options.head)
     pooling = options.pooling or ("class" if head is None else head.pooling)
     enable_compilation_cache()
+    encoder = load_encoder(options.model).computed_in(options.dtype)
+    if options.sensor is not None:
+        check_spelling(options.sensor, encoder.config.model.sensors)
     if str(options.model) == DEFAULT:
         log(f"encoder: {DEFAULT} (name another with --model)")
-    encoder = load_encoder(options.model).computed_in(options.dtype)
     check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)
     if head is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import UNIVERSAL, ModelConfig, to_json
-from anytouch_jax.config.parsing import Share
+from anytouch_jax.config.parsing import Count, Share
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class ExportOptions:
     by this package's names. release: weights by the names of the authors' files."""
     int8: bool = False  # onnx: integer products of 8 bits, calibrated on 200 touches of --data.
     data: tuple[Path, ...] = ()  # onnx: manifests (.csv, .parquet) with touches like those to come.
-    frames: int = 1  # jax, onnx: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
+    frames: Count[int] = 1  # jax, onnx: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")  # jax: the platforms it runs on.
     pooling: Literal["class", "mean", "both"] = "class"  # jax, onnx: class token, mean of patch tokens, or both.
     join: Literal["mean", "sum", "concat"] = "mean"  # jax: how the segments of a long clip are joined.

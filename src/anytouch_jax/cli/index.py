@@ -8,6 +8,8 @@ from typing import Literal
 
 from tyro.conf import Positional
 
+from anytouch_jax.config.parsing import NotNegative, Share
+
 
 @dataclass(frozen=True)
 class DatasetOptions:
@@ -26,11 +28,11 @@ class DatasetOptions:
     out: Path | None = None
     """Manifest to write, .parquet or .csv, in ROOT or a folder above it (default: ROOT/NAME.parquet)."""
     keep: bool = False  # Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path.
-    val: float = 0.05  # Share of the objects or recordings in split val, for a dataset without splits.
-    test: float = 0.05  # Share of the objects or recordings in split test, for a dataset without splits.
+    val: Share = 0.05  # Share of the objects or recordings in split val, for a dataset without splits.
+    test: Share = 0.05  # Share of the objects or recordings in split test, for a dataset without splits.
     lists: Path | None = None  # Folder of the dataset's list files, if they are not in ROOT.
     task: Literal["material", "rough"] = "material"  # touch_and_go: the task whose lists decide the split.
-    fold: int = 0  # feel: the fold k whose split_<k>.npy decides the split.
+    fold: NotNegative[int] = 0  # feel: the fold k whose split_<k>.npy decides the split.
     export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
     sensor: str | None = None
     """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new name."""

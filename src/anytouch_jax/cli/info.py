@@ -25,11 +25,12 @@ _WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Describe an encoder by name, a run, weights, a manifest, features, a head or an exported encoder.
+    """Describe an encoder by name, a run, weights, a manifest, features, a head, pictures, a film, or the cameras.
 
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
 
-    `anytouch info encoders` lists the encoders in the package. `--health` checks the sensor units of a manifest.
+    `anytouch info encoders` lists the encoders in the package, and `anytouch info cameras` the connected cameras.
+    `--health` checks every sensor unit of a manifest.
     """
 
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
@@ -41,8 +42,6 @@ class InfoOptions:
 
 def run(options: InfoOptions) -> int:
     """Print some lines about every path."""
-    if not options.paths:
-        raise UserError("There is nothing to describe. Name a file or a folder.")
     if options.health:
         return _health(options)
     refuse_unused(options, ("picture", "model"), "without --health")
@@ -111,6 +110,10 @@ def _lines(path: Path) -> list[str]:
         return [_named(name) for name in registry.list_encoders()]
     if str(path) in registry.list_encoders():
         return [_named(str(path)), *_weights(registry.locate(path))]
+    if str(path) == "cameras":
+        from anytouch_jax.data.cameras import list_cameras
+
+        return [line for camera in list_cameras() for line in camera.lines()] or ["no camera is connected"]
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
@@ -137,8 +140,37 @@ def _lines(path: Path) -> list[str]:
         return lines
     if suffix in _WEIGHTS or path.name.endswith(".index.json"):
         return _weights(path, weights)
-    known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features or a head"
-    raise UserError(f"{path} has no known format. Known are {known}.")
+    if lines := _pictures(path):
+        return lines
+    known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features, a head"
+    raise UserError(f"{path} has no known format. Known are {known}, pictures and films.")
+
+
+def _pictures(path: Path) -> list[str]:
+    """Return lines about a picture, a folder of pictures or a film, [] for anything else."""
+    import cv2
+
+    from anytouch_jax.data import images
+    from anytouch_jax.data.cameras import format_of
+
+    use = "use it with embed and view"
+    is_picture = path.suffix.lower() in images.SUFFIXES
+    if path.is_dir() or is_picture:
+        files = [path] if is_picture else images.list_images(path)[0]
+        height, width = images.decode(files[0]).shape[:2]
+        what = "a picture" if is_picture else f"a folder of {len(files)} pictures"
+        return [f"{path}: {what} of {width} x {height} pixels", use]
+    film = images.open_video(path)
+    names = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+    count, wide, high, rate = (film.get(name) for name in names)
+    codec, is_film = format_of(film), film.isOpened() and film.read()[0]
+    film.release()
+    if not is_film:
+        return []
+    frames = f"{count:.0f} frames" if count > 0 else "an unknown number of frames"
+    seconds = f", {count / rate:.1f} s at {rate:.4g} frames/s" if rate > 0 and count > 0 else ""
+    about = f"{wide:.0f} x {high:.0f} pixels, codec {codec or 'unknown'}"
+    return [f"{path}: a film of {frames}{seconds}, {about}", f"{use}, and with stream"]
 
 
 def _named(name: str) -> str:
@@ -152,13 +184,15 @@ def _named(name: str) -> str:
 
 def _folder(path: Path) -> list[str]:
     """Return lines about a run, or about the manifest in the folder: that called manifest, or the first."""
+    from anytouch_jax.data.images import SUFFIXES
     from anytouch_jax.data.manifest.schema import is_manifest
     from anytouch_jax.weights.checkpoint import steps
 
     tables = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
     tables.sort(key=lambda file: file.stem != "manifest")
     if steps(path / "checkpoints") or not tables:
-        return _run(path)
+        is_run = (path / "checkpoints").exists() or not any(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return _run(path) if is_run else _pictures(path)
     others = ", ".join(sorted(file.name for file in tables[1:]))
     return [*_manifest(tables[0]), *([f"other manifests in this folder: {others}"] if others else [])]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from anytouch_jax.cli.output import default_target, log
+from anytouch_jax.config.parsing import Count, Threads
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,8 @@ class PackOptions:
     manifests: Positional[tuple[Path, ...]]  # Manifests to pack into one (.csv, .parquet).
     out: Path | None = None
     """Folder for manifest.parquet and the shards (default: NAME_packed, next to the first manifest)."""
-    shard_mb: int = 256  # Size of a shard, MiB.
-    threads: int = 4  # Threads that read files.
+    shard_mb: Count[int] = 256  # Size of a shard, MiB.
+    threads: Threads = 4  # Threads that read files.
 
 
 def run(options: PackOptions) -> int:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_apart, check_folder, check_home, log, log_default, print_table, refuse_unused
-from anytouch_jax.config.parsing import Count, NotNegative, Range
+from anytouch_jax.config.parsing import Count, Finite, NotNegative, Range
 from anytouch_jax.errors import UserError
 
 Inner = Annotated[float, Range(0.001, 0.999, "between 0.001 and 0.999")]
@@ -44,7 +44,7 @@ class LabelOptions(ProbeOptions):
     the manifest has and that is not the label)."""
     leave_out: str | None = None
     """Leave out each value of this column in turn instead of using the splits, such as object for slip."""
-    where: tuple[str, float] | None = None  # Keep rows whose column is above a number.
+    where: Finite[tuple[str, float] | None] = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
     frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
     pooling: Literal["class", "mean", "both"] = "class"

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.bars import bar
 from anytouch_jax.cli.output import log
+from anytouch_jax.config.parsing import Below1, Count, NotNegative, Seed, Share, Threads
 
 if TYPE_CHECKING:
     from anytouch_jax.sim.scene import Scenes
@@ -28,25 +29,27 @@ class SimulateOptions:
     """
 
     out: Path  # Folder for images and manifest.parquet.
-    touches: int = 400  # Number of places to touch. Every sensor feels each place once.
+    touches: Count[int] = 400  # Number of places to touch. Every sensor feels each place once.
     sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
     """Sensors: gelsight, gelsight_mini, gelslim, digit, 9dtact, duragel, tac3d (a force field)."""
-    seed: int = 0  # Random seed.
+    seed: Seed = 0  # Random seed.
     grade: Literal["fine", "coarse"] = "fine"
     """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""
     fidelity: Literal["fast", "exact"] = "fast"  # Solve contact in a few rounds, or to convergence.
-    frames: int = 10  # Frames of a recording. They show a part of one gesture, with pauses and regrasps.
-    objects: int = 200  # Number of objects.
-    depth: tuple[float, float] = (0.3, 1.0)  # Range of the deepest press, mm.
-    vision: float = 0.7  # Share of the recordings with a photograph.
-    text: float = 0.7  # Share of the recordings with a caption.
-    held_out: float = 0.25  # Share of the objects in the test split, by pairs of primitive and texture.
-    first: int = 0  # Number of the first touch. Another number gives other touches of the same objects and splits.
+    frames: Count[int] = 10  # Frames of a recording. They show a part of one gesture, with pauses and regrasps.
+    objects: Count[int] = 200  # Number of objects.
+    depth: NotNegative[tuple[float, float]] = (0.3, 1.0)  # Range of the deepest press, mm.
+    vision: Share = 0.7  # Share of the recordings with a photograph.
+    text: Share = 0.7  # Share of the recordings with a caption.
+    held_out: Below1 = 0.25  # Share of the objects in the test split, by pairs of primitive and texture.
+    first: NotNegative[int] = (
+        0  # Number of the first touch. Another number gives other touches of the same objects and splits.
+    )
     fields: tuple[str, ...] = ()  # Fields to write as .npy: displacement, pressure, shear.
-    size: int = 224  # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
+    size: NotNegative[int] = 224  # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
     units: Literal["each", "one"] = "each"
     """each simulates a new device for every recording; one uses one device of each sensor, mounted straight."""
-    threads: int = 2  # Threads that render photographs and write files.
+    threads: Threads = 2  # Threads that render photographs and write files.
 
 
 def run(options: SimulateOptions) -> int:

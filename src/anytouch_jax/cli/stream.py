@@ -3,21 +3,41 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
+from anytouch_jax.config.parsing import Above0, Count, NotNegative
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
+    from anytouch_jax.data.cameras import CameraSettings
     from anytouch_jax.encoder.linear_head import LinearHead
     from anytouch_jax.encoder.stream import Embedded
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreamOptions(embed.FrameOptions):
+class CameraOptions:
+    """What a camera is asked for. The log says what it gives."""
+
+    camera_size: Count[tuple[int, int] | None] = None  # Camera: width and height of its pictures, pixels.
+    camera_fps: Above0[float | None] = None  # Camera: frames a second.
+    camera_format: str | None = None  # Camera: format, four letters such as MJPG or YUYV.
+
+    def settings(self) -> CameraSettings:
+        """Return the settings. Raises UserError for a format that is not four letters."""
+        from anytouch_jax.data.cameras import CameraSettings
+
+        form = self.camera_format
+        if form is not None and not (len(form) == 4 and form.isascii() and form.isalnum()):
+            raise UserError(f"--camera-format takes four letters such as MJPG or YUYV, not {form[:40]!r}.")
+        return CameraSettings(self.camera_size, self.camera_fps, form)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamOptions(CameraOptions, embed.FrameOptions):
     """Embed a camera or a video frame by frame, and report the latency of each part.
 
     Example: anytouch stream --data 0 --sensor digit --out -
@@ -26,31 +46,35 @@ class StreamOptions(embed.FrameOptions):
     frame for 2 seconds ends the stream with an error, after the features are saved.
     """
 
-    data: str  # Number of a camera, such as 0, or a video file.
+    data: str
+    """Camera or video file. A camera is a number such as 0, a part of its name, its serial, /dev/video0, or an address
+    http:// or rtsp://. `anytouch info cameras` lists them."""
     out: Path  # The .npz to write, or - for one JSON line per frame on standard output.
     engine: Literal["xla", "onnxruntime", "openvino"] | None = None
     """What runs the encoder: xla, or for an .onnx file of `anytouch export` onnxruntime. The others need the extra
     engines, and export the encoder first."""
-    stride: int = 1  # Frames from one frame of a clip to the next, as in the training data.
-    reuse: float = 0.0
+    stride: Count[int] = 1  # Frames from one frame of a clip to the next, as in the training data.
+    reuse: NotNegative[float] = 0.0
     """Reuse features while no place changes by more than so many times the camera's noise (0: while frames are
     equal)."""
 
 
 def run(options: StreamOptions) -> int:
     """Embed frame by frame, write features or JSON lines, then print the latency."""
-    lines = str(options.out) == "-"
+    lines, settings = str(options.out) == "-", options.settings()
     data = Path(options.data)
     if not lines:
         check_folder(options.out, read=(options.model, data), suffix=".npz")
     if options.frames == 1:
         refuse_unused(options, ("stride",), "on single frames. Ask for clips with --frames, or")
-    encoder, pooling, head = embed.load_inputs(options)
     from anytouch_jax.encoder import stream
     from anytouch_jax.encoder.embed import Features
     from anytouch_jax.encoder.encoder import on_engine
 
-    source, live = stream.open_source(data)
+    source, live = stream.open_source(options.data, settings, log)  # first: it fails within a second
+    if not live:
+        refuse_unused(options, [field.name for field in fields(CameraOptions)], "with a film")
+    encoder, pooling, head = embed.load_inputs(options)
     encoder = on_engine(encoder, options.engine, options.frames, pooling)
     known = encoder.gels if head is None else head.gels
     row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
@@ -69,7 +93,7 @@ def run(options: StreamOptions) -> int:
             )
         embed.log_if_cut(data, int(result.numbers[-1]) + 1)
     if not lines:
-        about |= {"stride": str(options.stride), "pooling": pooling, "input": str(data)}
+        about |= {"stride": str(options.stride), "pooling": pooling, "input": options.data}
         if live and len(result.numbers):
             about |= {"started": f"{result.started:.6f}"}
             about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}

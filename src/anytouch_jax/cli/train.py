@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Literal, NamedTuple, get_type_hints
 
-from anytouch_jax.cli.arguments import option_of, parse_options, spelled
+from anytouch_jax.cli.arguments import is_option, options_of, parse_options, spelled
 from anytouch_jax.cli.output import log
 from anytouch_jax.config import (
     Config,
@@ -21,10 +20,11 @@ from anytouch_jax.config import (
     PresetName,
     RunConfig,
     SimulatedConfig,
+    check_spelling,
     preset,
     presets,
 )
-from anytouch_jax.config.parsing import NotNegative
+from anytouch_jax.config.parsing import Count, NotNegative, Seed
 from anytouch_jax.errors import UserError
 
 # Fields that one stage alone reads.
@@ -56,11 +56,11 @@ class TrainOptions:
     baseline: str = "anytouch"  # Train a baseline or an ablation: unitouch, tlv_link, t3, static_only, no_matching, ...
     init: Path | None = None  # Start from this stage-1 run or weights file: AnyTouch, DINOv2, ViT-MAE, ViT or CLIP.
     clip_weights: Path | None = None  # CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json.
-    steps: int | None = None  # Steps of the whole schedule (default: 1000).
+    steps: Count[int | None] = None  # Steps of the whole schedule (default: 1000).
     stop_after: NotNegative[int | None] = None  # Stop after this many steps, without changing the schedule.
-    save_every: int | None = None  # Steps between checkpoints (default: 200).
-    batch: int | None = None  # Samples per step (default: the preset's).
-    seed: int = 0  # Random seed.
+    save_every: NotNegative[int | None] = None  # Steps between checkpoints (default: 200).
+    batch: Count[int | None] = None  # Samples per step (default: the preset's).
+    seed: Seed = 0  # Random seed.
     on_bad_sample: Literal["error", "skip"] = "error"  # Stop at a sample that cannot be read, or replace and count it.
     tensorboard: bool = False  # Also write TensorBoard events.
     curve: bool = False  # Draw the loss in the terminal while training.
@@ -92,19 +92,15 @@ def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequ
     """
     list_all = "--help-all" in args
     plain, sections = _split_sections([arg for arg in args if arg != "--help-all"])
-    _suggest_section(plain)
-    options = parse_options(kind, name, plain, TrainOptions((), Path("runs/stage1")) if list_all else None)
+    defaults = TrainOptions((), Path("runs/stage1")) if list_all else None
+    options = parse_options(kind, name, plain, defaults, others=_section_options())
     config = _configure(options)
     if not sections and not list_all:
         return TrainRequest(options, config)
     default = Sections(*(getattr(config, section) for section in get_type_hints(Sections)))
     help_name, words = "train [the options of --help]", ["--help"] if list_all else sections
-    try:
-        section = parse_options(Sections, help_name, words, default, add_help=list_all)
-    except SystemExit:
-        if not list_all:
-            print("For every field of the configuration, run anytouch train --help-all", file=sys.stderr)
-        raise
+    plain_names = {option.name: option.name for option in options_of(TrainOptions)}
+    section = parse_options(Sections, help_name, words, default, add_help=list_all, others=plain_names)
     return TrainRequest(options, replace(config, **vars(section)))
 
 
@@ -152,6 +148,8 @@ def _configure(options: TrainOptions) -> Config:
 
 def _refuse_unread(options: TrainOptions, config: Config) -> None:
     """Raise UserError for options that do not go together, and for settings that this stage does not read."""
+    for name in config.model.sensors:
+        check_spelling(name)
     baseline = presets.find_baseline(options.baseline)
     if options.stage == 2 and options.init and not baseline.starts_from_stage1:
         raise UserError(f"baseline {baseline.name} has no stage 1. Remove --init.")
@@ -178,17 +176,13 @@ def _split_sections(args: Sequence[str]) -> tuple[list[str], list[str]]:
     section: list[str] = []
     target = plain
     for arg in args:
-        if arg.startswith("-") and not arg.lstrip("-").replace(".", "", 1).isdigit():
+        if is_option(arg):
             target = section if "." in arg.partition("=")[0] else plain
         target.append(arg)
     return plain, section
 
 
-def _suggest_section(args: Sequence[str]) -> None:
-    """Raise UserError for an option that only a section has, with the section's name (--optim.learning-rate)."""
-    known = set(get_type_hints(TrainOptions))
-    homes = {field: home for home, kind in get_type_hints(Sections).items() for field in get_type_hints(kind)}
-    for option in map(option_of, args):
-        field = option.removeprefix("--").replace("-", "_")
-        if option.startswith("--") and field in homes and field not in known:
-            raise UserError(f"there is no {option}. Use --{homes[field]}.{option.removeprefix('--')}.")
+def _section_options(default: Sections | None = None) -> dict[str, str]:
+    """Return the options of the sections by their names, and by their names without the section."""
+    names = [option.name for option in options_of(Sections, default)]
+    return {f"--{name.rpartition('.')[2]}": name for name in reversed(names)} | {name: name for name in names}

@@ -8,6 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from anytouch_jax.cli.output import check_apart, check_folder, check_new, log, write_new
+from anytouch_jax.config.parsing import Threads
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
@@ -30,7 +31,7 @@ class VerifyOptions:
     """With --repair: exchange touch image and photograph in these datasets. Look at them first."""
     decode: bool = True  # Decode every picture. --no-decode only checks that the files exist.
     objects: bool = False  # Report an object in two splits as an error.
-    threads: int = 4  # Threads that read files.
+    threads: Threads = 4  # Threads that read files.
     out: Path | None = None  # Write the report as JSON too.
 
 

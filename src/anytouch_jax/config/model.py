@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from anytouch_jax.config.parsing import Above0, NotNegative, Range, check
-from anytouch_jax.errors import ConfigError
+from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check
+from anytouch_jax.errors import ConfigError, letters_apart
+from anytouch_jax.shown import shown_short
 
 UNIVERSAL = "universal"
 SENSORS = (
@@ -18,26 +19,40 @@ _MOST = 1 << 20  # of every size: a damaged configuration must not ask for the w
 Size = Annotated[int, Range(1, _MOST, f"1 to {_MOST}")]
 Number = Annotated[int, Range(0, _MOST, f"0 to {_MOST}")]
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
+OTHER_SENSORS = ("dtact", "tactip")  # sensors without tokens whose names are nearly those of others
+_LETTERS = 2  # by which a misspelt name differs from the right one
 
 
 class SpellingError(ConfigError):
-    """A sensor name that differs from a known one only in spelling."""
+    """A sensor name that is nearly a known one."""
 
 
 def check_spelling(name: str, known: Iterable[str] = ()) -> None:
-    """Raise SpellingError for a name that differs from a known one only by case, or by - or a blank instead of _.
+    """Raise SpellingError for a name within two letters of a known one; case, - and blanks do not count as letters.
 
-    Known are SENSORS, FIELD_SENSORS and `known`.
+    Known are SENSORS, FIELD_SENSORS and `known`. A name with more digits, such as digit_2, is a new one. So are
+    OTHER_SENSORS.
     """
 
     def plain(sensor: str) -> str:
         return sensor.lower().replace("-", "_").replace(" ", "_")
 
-    names = {plain(sensor): sensor for sensor in (*known, *FIELD_SENSORS, *SENSORS)}
-    if names.get(plain(name), name) != name and name not in known:
-        raise SpellingError(f"sensor {name!r}: it is called {names[plain(name)]}")
+    def digits(sensor: str) -> int:
+        return sum(map(str.isdecimal, sensor))
+
+    names, word = {*known, *FIELD_SENSORS, *SENSORS}, plain(name)
+    if name in names or word in OTHER_SENSORS:
+        return
+    alike = [sensor for sensor in sorted(names) if abs(len(sensor) - len(name)) <= _LETTERS]
+    apart, nearest = min(((letters_apart(word, plain(one)), one) for one in alike), default=(_LETTERS + 1, ""))
+    if apart <= _LETTERS and digits(word) <= digits(nearest):
+        raise SpellingError(
+            f"sensor {name!r} is not known: did you mean {nearest}? The name of a new sensor differs from it by more "
+            f"than {_LETTERS} letters"
+        )
 
 
+@shown_short
 @dataclass(frozen=True)
 class Stack:
     """A stack of transformer blocks."""
@@ -53,6 +68,7 @@ class Stack:
             raise ConfigError(f"width {self.width} must be a multiple of heads {self.heads}")
 
 
+@shown_short
 @dataclass(frozen=True)
 class TextTower:
     """CLIP's text tower."""
@@ -60,12 +76,13 @@ class TextTower:
     stack: Stack
     vocab: Size = 49408  # Tokens of the vocabulary.
     length: Size = 77  # Tokens of a caption, with start and end.
-    end_token: int | None = None  # Token to pool, at its first position. None pools the largest id (CLIP).
+    end_token: NotNegative[int | None] = None  # Token to pool, at its first position. None pools the largest id (CLIP).
 
     def __post_init__(self) -> None:
         check(self, "--model.text.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class ModelConfig:
     """Everything that decides the shapes and the arithmetic of the network.
@@ -92,7 +109,7 @@ class ModelConfig:
     fields: Number = 0  # Channels of the decoder of depth, shear, contact and force. 0: none.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
     lora_rank: Number = 0  # Rank of the image tower's LoRA. 0: off.
-    lora_alpha: float = 16.0  # Scale of LoRA, divided by its rank.
+    lora_alpha: Finite[float] = 16.0  # Scale of LoRA, divided by its rank.
     temperature: Above0[float] = 0.07  # Temperature of InfoNCE at the start. It is learned.
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # Type of the arithmetic. Parameters are float32.
     attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"  # Implementation. auto takes the fastest here.

@@ -8,6 +8,7 @@ import json
 import math
 import types
 import typing
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from anytouch_jax.errors import ConfigError
@@ -24,12 +25,15 @@ class Range(NamedTuple):
 T = TypeVar("T")
 # Annotations of fields that `check` compares with their range, as in `steps: Count[int]`.
 Count = Annotated[T, Range(1, math.inf, "1 or more")]
+Finite = Annotated[T, Range(-math.inf, math.inf, "a number")]
+Threads = Annotated[int, Range(1, 1024, "1 to 1024")]
 NotNegative = Annotated[T, Range(0, math.inf, "0 or more")]
 Above0 = Annotated[T, Range(math.ulp(0.0), math.inf, "above 0")]
 Share = Annotated[float, Range(0, 1, "0 to 1")]
 Seed = Annotated[int, Range(0, 2**32 - 1, "0 to 4294967295")]
 Below1 = Annotated[float, Range(0, math.nextafter(1, 0), "0 or more and below 1")]
 _FLOAT32 = 3.4e38  # larger numbers are infinite in float32
+_LARGEST = 2**32  # of whole numbers: no setting needs more, and larger ones overflow somewhere
 _JSON_BYTES, _JSON_DEPTH, _JSON_DIGITS = 1 << 26, 64, 40
 
 
@@ -93,9 +97,20 @@ def check(settings: Any, prefix: str = "") -> None:
         if has_choices:
             read_value(hint, value, where)
         for low, high, words in bounds:
-            for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not (low <= number <= high and number < _FLOAT32):
-                    raise ConfigError(f"{where} must be {words}, not {number}")
+            for number in _numbers(value):
+                if not (low <= number <= high and abs(number) < _FLOAT32):
+                    raise ConfigError(f"{where} must be {words}, not {str(number)[:40]}")
+                if isinstance(number, int) and number > _LARGEST:
+                    raise ConfigError(f"{where} must be at most {_LARGEST}, not {str(number)[:40]}")
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """Yield the numbers in a value, which may be a tuple of numbers, texts and tuples of them."""
+    if isinstance(value, tuple):
+        for one in value:
+            yield from _numbers(one)
+    elif isinstance(value, int | float):
+        yield value
 
 
 @functools.cache

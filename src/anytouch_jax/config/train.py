@@ -15,6 +15,7 @@ from anytouch_jax.config import parsing
 from anytouch_jax.config.model import ModelConfig
 from anytouch_jax.config.parsing import Above0, Below1, Count, NotNegative, Range, Seed, Share, check
 from anytouch_jax.errors import ConfigError
+from anytouch_jax.shown import shown_short
 
 Recipe = Literal["paper", "release"]
 Towers = Literal["none", "scratch", "pretrained"]
@@ -25,6 +26,7 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
 
+@shown_short
 @dataclass(frozen=True)
 class LossConfig:
     """Weights and choices of the losses (Sec. 3.2 to 3.6 and appendix)."""
@@ -53,6 +55,7 @@ class LossConfig:
         return 1.0 - self.mask_ratio
 
 
+@shown_short
 @dataclass(frozen=True)
 class OptimConfig:
     """AdamW and its schedule (appendix "Implementation details")."""
@@ -73,6 +76,7 @@ class OptimConfig:
         check(self, "--optim.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class DataConfig:
     """Reading and augmentation of the data."""
@@ -82,7 +86,9 @@ class DataConfig:
     batch_size: Count[int] = 64  # Samples of a step (--batch).
     clip_share: Share = 0.5  # Share of clips. The rest are stills.
     order: Literal["alternate", "random"] = "alternate"  # Batches of stills and clips: in turn, or mixed (release).
-    weights: tuple[tuple[str, float], ...] | None = None  # Dataset and how often an epoch draws it. 0: never.
+    weights: NotNegative[tuple[tuple[str, float], ...] | None] = (
+        None  # Dataset and how often an epoch draws it. 0: never.
+    )
     negatives: Literal["any", "same_sensor"] = "any"  # Sensors of the negatives of matching: any, or the positive's.
     parts: NotNegative[int] = 0
     """Cut large data into this many parts of whole shards. A slot of a batch draws from its own part, so that a host
@@ -108,6 +114,7 @@ class DataConfig:
         check(self, "--data.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class SimulatedConfig:
     """Simulated touches that training draws from (--data simulated). No data set is written."""
@@ -119,7 +126,7 @@ class SimulatedConfig:
     """Sensors that are simulated."""
     coarse: Share = 0.4  # Share of touches at which each sensor touches as by hand.
     wild: Share = 0.0  # Share of touches by sensors that mix two others, for the universal tokens.
-    depth: tuple[float, float] = (0.15, 1.0)  # Range of the deepest press, mm.
+    depth: NotNegative[tuple[float, float]] = (0.15, 1.0)  # Range of the deepest press, mm.
     vision: Share = 0.4  # Share of touches with a photograph.
     text: Share = 0.7  # Share of touches with a caption.
     places: Count[int] = 4  # Photographed places of each object.
@@ -146,6 +153,7 @@ class RunConfig:
         check(self, "--run.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class Config:
     """A whole run. Build one with `preset(...)`, change it with `dataclasses.replace`."""

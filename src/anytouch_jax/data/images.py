@@ -117,13 +117,13 @@ def decode(path: str | Path) -> np.ndarray:
     return decode_bytes(data, path)
 
 
-def decode_bytes(data: bytes, name: str | Path) -> np.ndarray:
-    """Return the image in `data` as `decode` does; `name` is for errors."""
+def decode_bytes(data: bytes, name: str | Path, *, as_stored: bool = False) -> np.ndarray:
+    """Return the image in `data` as `decode` does, or its pixels before any scaling; `name` is for errors."""
     try:
         pixels = _unpack(data)
     except (ValueError, EOFError, MemoryError) as error:
         raise ImageError(f"{name} cannot be read: {error}") from None
-    return to_rgb(pixels, name)
+    return pixels if as_stored else to_rgb(pixels, name)
 
 
 def encode(picture: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:

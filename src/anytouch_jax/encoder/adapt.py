@@ -18,22 +18,24 @@ import optax
 import pyarrow as pa
 
 from anytouch_jax.bars import tracked
-from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, from_json, to_json
+from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, check_spelling, to_json
 from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.base import precision
 from anytouch_jax.encoder.embed import Log, embed_rows
-from anytouch_jax.encoder.encoder import load_encoder
+from anytouch_jax.encoder.encoder import find_tokenizer, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder, atomic_write
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
-from anytouch_jax.weights import checkpoint, compatible
-from anytouch_jax.weights.load import load_model
+from anytouch_jax.shown import shown_short
+from anytouch_jax.weights import checkpoint, compatible, registry
+from anytouch_jax.weights.families import load_family
+from anytouch_jax.weights.load import Loaded, load_model
 
 Params = dict[str, Any]
 Loss = Callable[[Params, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32)
@@ -42,6 +44,7 @@ MEASURED = 64  # frames on which the loss is measured before and after
 PROTOTYPE_ROWS = 1000  # frames of the known sensors for the prototypes of the classes
 
 
+@shown_short
 class Adapted(NamedTuple):
     """A model with a fitted row of tokens, and how well it fits.
 
@@ -64,22 +67,22 @@ def adapt(
 ) -> Adapted:  # fmt: skip
     """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split train.
 
-    The tokens start as the universal ones, and stay so with 0 frames. The embedding of each frame is drawn to the
-    prototype of its class in the column `labels`: the mean embedding of the known sensors' frames of that class. Raises
-    UserError.
+    `run` is what `load_encoder` takes: a name, a run folder, a weights file or an address. The tokens
+    start as the universal ones, and stay so with 0 frames. The embedding of each frame is drawn to the prototype of its
+    class in the column `labels`: the mean embedding of the known sensors' frames of that class. Raises UserError.
     """
     if frames < 0 or steps < 1:
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")
     if frames and labels is None:
         raise UserError("the tokens are fitted to classes; name a column with --labels, or copy with --frames 0")
-    params, text, stored = checkpoint.load_params(run)
-    config, params, row = _with_row(from_json(text), params, stored, sensor, run, log)
+    loaded, params = _read_model(run)
+    stored = loaded.metadata if loaded.from_run else {}
+    config, params, row = _with_row(loaded, params, sensor, str(run), log)
     source = {"run": str(run), "sensor": sensor, "frames": frames, "labels": labels, "manifest": manifest.content_hash}
     metadata: dict[str, Any] = {name: stored[name] for name in ("preprocessing", "data") if name in stored}
     metadata |= {"sensors": list(config.model.sensors), "source": source}
-    metadata |= {"seen": [*stored["seen"], sensor]} if "seen" in stored else {}
+    metadata |= {} if loaded.trained_sensors is None else {"seen": [*loaded.trained_sensors, sensor]}
     if labels is None or not frames:
-        load_model(run)  # refuses arrays that do not fit or are not finite, as the encoder below does
         return Adapted(config, params, (), float("nan"), float("nan"), "fitted", metadata)
     with precision(config):
         classes, prototypes = _classes(run, manifest, sensor, labels, log)
@@ -115,12 +118,12 @@ def check_empty(out: Path) -> None:
 def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
     """Write a run folder for embed, probe and retrieve, whole or not at all. Raises UserError if `out` is not empty."""
     check_empty(Path(out))
-    text, tokenizer = to_json(adapted.config), Path(run) / "tokenizer.json"
+    text, tokenizer = to_json(adapted.config), find_tokenizer(registry.locate(run))
     touch = dict(adapted.params["touch"])
     trainable = {"touch": {"sensor_tokens": touch.pop("sensor_tokens")}}
     with atomic_folder(Path(out)) as folder:
         atomic_write(folder / "config.json", text + "\n")
-        if tokenizer.exists():
+        if tokenizer is not None:
             shutil.copyfile(tokenizer, folder / tokenizer.name)
         lines = (json.dumps({"step": step, "loss": loss}) + "\n" for step, loss in enumerate(adapted.losses))
         atomic_write(folder / "metrics.jsonl", "".join(lines))
@@ -153,11 +156,20 @@ def choose_frames(
     return np.sort(rows[np.argsort(turn, kind="stable")[:count]])
 
 
-def _with_row(
-    config: Config, params: Params, metadata: dict[str, Any], sensor: str, run: str | Path, log: Log
-) -> tuple[Config, Params, int]:
+def _read_model(run: str | Path) -> tuple[Loaded, Params]:
+    """Return the model, and its stored parameters. Raises UserError for an encoder of another family."""
+    path = registry.locate(run)
+    family, weights = load_family(path)
+    if family is not None:
+        raise UserError(f"{run} is {family.family.title}, which has no tokens to fit; name an encoder of AnyTouch")
+    loaded = load_model(path, stored_rows=True, weights=weights)
+    return loaded, checkpoint.load_params(path)[0] if loaded.from_run else loaded.params
+
+
+def _with_row(loaded: Loaded, params: Params, sensor: str, run: str, log: Log) -> tuple[Config, Params, int]:
     """Return the model with a row for `sensor` that equals the universal tokens, and the row."""
-    model, trained = config.model, metadata.get("seen", ())
+    config, model, trained = loaded.config, loaded.config.model, loaded.trained_sensors
+    check_spelling(sensor, model.sensors)
     if sensor in FIELD_SENSORS or sensor == UNIVERSAL:
         why = "they serve all sensors" if sensor == UNIVERSAL else "it has no images"
         raise UserError(f"{sensor!r} has no tokens to fit: {why}; name a camera-based sensor")
@@ -165,12 +177,11 @@ def _with_row(
         raise UserError(f"{run} has no touch encoder; give a stage-1 or stage-2 run")
     if not model.sensor_tokens or model.patch_encoder == "sensor":
         raise UserError(f"{run} distinguishes sensors without tokens, so none can be fitted; give another run")
-    if sensor in trained:
+    if sensor in (trained or ()):
         raise UserError(f"{run} was trained on {sensor}; name a new sensor")
-    if sensor in model.sensors and "seen" not in metadata:
+    if sensor in model.sensors and trained is None:
         log(f"{run} does not store its trained sensors: the tokens of {sensor} start from the universal ones")
-    drawn = config.objective.universal_start + config.objective.universal_end > 0
-    served = compatible.serve_unseen(params["touch"], model, trained, universal_drawn=drawn)
+    served = compatible.serve_unseen(params["touch"], model, trained or (), universal_drawn=loaded.universal_drawn)
     start = np.asarray(served["sensor_tokens"])[model.universal_row]
     tokens = np.asarray(params["touch"]["sensor_tokens"])
     if sensor not in model.sensors:

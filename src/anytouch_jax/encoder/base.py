@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -28,12 +29,13 @@ from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_image, normalise_touch
 from anytouch_jax.ops import losses
+from anytouch_jax.shown import count_of, described, leaves
 
 Params = dict[str, Any]
 _PART_NAMES = {"image": "image tower", "text": "text tower", "matcher": "matching head", "logit_scale": "temperature"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Encoder:
     """A touch encoder with its parameters, and the image and text towers if the weights have them.
 
@@ -52,6 +54,25 @@ class Encoder:
     others: Params = field(default_factory=dict, repr=False)
     tokenizer_file: Path | None = field(default=None, repr=False)
     metadata: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def __repr__(self) -> str:
+        return described(f"{type(self).__name__} {self.source}", **self.about())
+
+    def about(self) -> dict[str, str]:
+        """Return what a user wants to know: family, parameters, input, background, features and sensors."""
+        model, count = self.config.model, sum(math.prod(leaf.shape) for leaf in leaves(self.params))
+        towers = [_PART_NAMES[name] for name in ("image", "text") if name in self.others]
+        trained = self.trained_sensors
+        background = "subtracted if it is given" if self.subtracts else "not used"
+        return {
+            "family": f"AnyTouch, width {model.touch.width}, depth {model.touch.depth}, {model.touch.heads} heads"
+            + (f", with {' and '.join(towers)}" if towers else ""),
+            "parameters": count_of(count) + (" of the touch encoder" if towers else "") if count else "",
+            "input": f"uint8 RGB {model.image_size} x {model.image_size}, 1 frame or clips of {model.frames} or more",
+            "background": "needed, the picture of the untouched gel" if self.needs_background else background,
+            "features": str(model.embed),
+            "sensors": f"trained on {', '.join(trained)}" if trained else ", ".join(model.sensors),
+        }
 
     @cached_property
     def net(self) -> Net:
@@ -335,6 +356,13 @@ class Preprocess:
     def estimated(self) -> bool:
         """Whether the background is a running estimate that is not settled."""
         return self._background is None and self._running is not None and not self._running.settled
+
+    def __repr__(self) -> str:
+        gel, encoder = self._background, getattr(self._prepare, "__self__", None)
+        known = "the first frame" if gel is None else f"a picture of {gel.shape[1]} x {gel.shape[0]}"
+        used = f"minus {known}" if self._subtracts else "without a background"
+        turned = " ".join(f"{name}={value!r}" for name, value in self._orient.keywords.items())
+        return f"Preprocess(frames of {getattr(encoder, 'source', 'an encoder')}, {used}, {turned})"
 
     def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
         """Return a frame as RGB u8 (size, size, 3), or as an encoder of another family reads it.

@@ -18,6 +18,7 @@ from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, read_arrays
+from anytouch_jax.shown import shown_short
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
@@ -59,6 +60,7 @@ def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: i
     return np.concatenate(values) if values else np.zeros(0, np.float32)
 
 
+@shown_short
 @dataclass(frozen=True)
 class Features:
     """Features f32 (n, d), their `rows` i64 (n,) and further `keys` (n,).

@@ -28,6 +28,7 @@ from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
+from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import load, registry
 from anytouch_jax.weights.families import Size, load_family
 
@@ -76,7 +77,7 @@ def load_encoder(
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class EngineEncoder(Encoder):
     """An exported encoder on an engine: for one number of frames and one pooling. It has no parameters."""
 
@@ -143,6 +144,7 @@ def find_tokenizer(path: Path) -> Path | None:
     return next((folder / "tokenizer.json" for folder in folders if (folder / "tokenizer.json").is_file()), None)
 
 
+@shown_short
 class ExampleTouch(NamedTuple):
     """A touch by one sensor: `frame` and `background` are RGB u8 (h, w, 3), `press` names the touched place."""
 

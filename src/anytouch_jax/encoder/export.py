@@ -26,6 +26,7 @@ from anytouch_jax.encoder import engines
 from anytouch_jax.encoder.arrays import rows_of_sensors, unit_rows
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
+from anytouch_jax.shown import described
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Join, Pooling
@@ -62,6 +63,15 @@ class Exported:
 
     about: dict[str, Any]
     _run: Any = field(repr=False)
+
+    def __repr__(self) -> str:
+        return described(
+            f"Exported {self.about.get('source', 'encoder')}",
+            input=str(self.about.get("input", "")),
+            features=f"{self.about['features']}, pooling {self.about['pooling']}",
+            background=str(self.about["background"]),
+            sensors=", ".join(self.about["sensors"]),
+        )
 
     def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
         """Return features f32 (B, E) of touches (B, T, H, W, 3), u8 RGB or as another family prepares them.

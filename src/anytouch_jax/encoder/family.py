@@ -32,7 +32,7 @@ _FALLBACK = "gs_green"  # the file that T3's authors take for a sensor without a
 _CALIBRATIONS = {4: (1, 3, 7, 9), 8: (1, 3, 7, 9, 10, 12, 16, 18), 9: tuple(range(1, 10))}  # SITR's choices of its 18
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FamilyEncoder(Encoder):
     """An encoder of another family.
 
@@ -45,6 +45,15 @@ class FamilyEncoder(Encoder):
     preparation: Preparation = field(kw_only=True)
     image_size: Size = field(kw_only=True)
     calibration: np.ndarray | None = field(default=None, kw_only=True, repr=False)
+
+    def about(self) -> dict[str, str]:
+        """Return what a user wants to know, from `describe_family`."""
+        title, *lines = describe_family(self)
+        family, _, rest = title.partition(": ")
+        count, _, form = rest.partition(" parameters, ")
+        more = dict(line.split(": ", 1) for line in lines if ": " in line)
+        shown = ("input", "features", "sensors")
+        return {"family": f"{family}, {form}", "parameters": count, **{name: more[name] for name in shown}}
 
     @property
     def part(self) -> Part:
@@ -71,7 +80,9 @@ class FamilyEncoder(Encoder):
     def contract(self) -> str:
         """Everything but the parameters that decides its features, as text."""
         calibration = None if self.calibration is None else self.calibration.tobytes()
-        return repr((super().contract, self.family.name, self.form, self.preparation, self.image_size, calibration))
+        return repr(
+            (super().contract, self.family.name, asdict(self.form), self.preparation, self.image_size, calibration)
+        )
 
     def untrained(self, seed: int = 0) -> Encoder:
         """Return an untrained encoder of the same form and preparation."""
@@ -84,6 +95,7 @@ class FamilyEncoder(Encoder):
     def sensor_row(self, name: str, log: Log = warn) -> int:
         """Return the row of a sensor. A family without sensors ignores it, which is logged once."""
         names, name = self.config.model.sensors, families.ALIASES.get(str(name), str(name))
+        check_spelling(name, names)
         if len(names) == 1:
             if name != UNIVERSAL and "sensor" not in self._logged:
                 self._logged.add("sensor")
@@ -91,7 +103,6 @@ class FamilyEncoder(Encoder):
             return 0
         if name in names and (name != UNIVERSAL or self.form.model.sensor_tokens):
             return names.index(name)
-        check_spelling(name, names)
         if self.form.model.sensor_tokens:
             log(f"sensor {name!r} has no tokens in {self.source}: using the universal tokens")
             return names.index(UNIVERSAL)

@@ -14,6 +14,7 @@ from anytouch_jax.encoder import novelty
 from anytouch_jax.encoder.novelty import Assessment, Calibration
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, check_array, read_arrays
+from anytouch_jax.shown import described
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Pooling
@@ -42,6 +43,16 @@ class LinearHead:
     fingerprint: str
     calibration: Calibration | None = None
     gels: dict[str, Array] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        classes, more = self.classes.tolist(), len(self.classes) - 8
+        return described(
+            f"LinearHead for {self.label}",
+            classes=f"{len(classes)}: {', '.join(classes[:8])}{f' and {more} more' if more > 0 else ''}",
+            input=f"features of {len(self.mean)}, pooling {self.pooling}, frames {self.frames}",
+            encoder=self.fingerprint,
+            calibration="; ".join(self.promises()) or "none",
+        )
 
     def __call__(self, features: npt.ArrayLike) -> tuple[Array, Array]:
         """Return the likeliest class (n,) str and probabilities f32 (n, K) of features (n, d)."""

@@ -21,6 +21,7 @@ from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import check_array
+from anytouch_jax.shown import shown_short
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.base import Preprocess
@@ -34,6 +35,7 @@ _FEWEST, _OTHERS = 8, 0.5  # frames, and share of them that look like another se
 _CHUNK = 1024
 
 
+@shown_short
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """What a head knows about its own errors.
@@ -109,6 +111,7 @@ class Calibration:
         return ""
 
 
+@shown_short
 class Assessment(NamedTuple):
     """Predictions for n touches: likeliest class (n,) str, `p` f32 (n, K), conformal sets bool (n, K), novelty (n,).
 

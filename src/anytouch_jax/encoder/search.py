@@ -16,6 +16,7 @@ import numpy.typing as npt
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.embed import read_npz
 from anytouch_jax.errors import UserError
+from anytouch_jax.shown import described
 
 Array = npt.NDArray[Any]
 _OF_CELL, _LOOKED_INTO = 64, 64  # features of a cell that k-means reads, and cells that a search looks into
@@ -63,6 +64,14 @@ class TouchIndex:
     source: str = "the index"
     cells: Any = field(default=None, repr=False)
     gels: dict[str, Array] = field(default_factory=dict, repr=False)
+
+    def __repr__(self) -> str:
+        return described(
+            f"TouchIndex {self.source}",
+            touches=f"{len(self.values):,}, features of {self.values.shape[1]}",
+            keys=", ".join(self.keys),
+            **{name: self.about[name] for name in ("encoder", "pooling", "frames", "input") if name in self.about},
+        )
 
     def search(self, features: Array, count: int = 10) -> tuple[Array, Array]:
         """Return row numbers i64 (m, count) and cosines f32 (m, count) of the nearest, nearest first, of (m, d).

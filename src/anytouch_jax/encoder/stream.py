@@ -15,18 +15,19 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.data.images import QUIET, frame_time, open_video, to_rgb
+from anytouch_jax.data.cameras import open_source as open_source  # callers find it next to `stream`
+from anytouch_jax.data.images import QUIET, frame_time, to_rgb
 from anytouch_jax.encoder.base import Preprocess, precision
 from anytouch_jax.encoder.embed import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
 from anytouch_jax.errors import UserError
+from anytouch_jax.shown import shown_short
 
 PARTS = ("decode", "resize", "copy", "encoder")
 KEPT = 100_000  # last frames whose times are stored if their features are not
@@ -47,6 +48,7 @@ class CameraError(UserError):
     """A camera that delivers no frames any more."""
 
 
+@shown_short
 class Frame(NamedTuple):
     """Pixels RGB u8 (h, w, 3) of frame `number`, the clock when it was `read`, and the seconds of decoding.
 
@@ -63,6 +65,7 @@ class Frame(NamedTuple):
     missed: int = 0
 
 
+@shown_short
 class Clip(NamedTuple):
     """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN.
 
@@ -76,6 +79,7 @@ class Clip(NamedTuple):
     estimated: bool = False
 
 
+@shown_short
 class Embedded(NamedTuple):
     """Features f32 (E,) of the clip that ends with frame `number`.
 
@@ -141,24 +145,6 @@ class Mailbox:
         with self._changed:
             self.is_closed, self._error = True, self._error or error
             self._changed.notify_all()
-
-
-def open_source(name: str | Path) -> tuple[Source, bool]:
-    """Return the source, and whether it is a camera, of a camera's number or a video file. Raises UserError."""
-    live = str(name).isdecimal() and not Path(name).exists()
-    if not live and not Path(name).is_file():
-        raise UserError(f"there is no video {name}; give a video file, or the number of a camera, such as 0")
-    with QUIET:
-        source = cv2.VideoCapture(int(str(name))) if live else open_video(name)
-    if not source.isOpened():
-        raise UserError(
-            f"camera {name} cannot be opened; check its number and its cable"
-            if live
-            else f"{name} is not a video that can be read; convert it first"
-        )
-    if live:
-        source.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the driver's own queue would hold old frames
-    return source, live
 
 
 def stream(
@@ -381,6 +367,7 @@ class _Watch:
         return "ok"
 
 
+@shown_short
 class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 

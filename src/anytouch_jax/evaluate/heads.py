@@ -23,6 +23,7 @@ from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.search import nearest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import Array
+from anytouch_jax.shown import shown_short
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import Pooling
@@ -77,6 +78,7 @@ class ProbeHead:
             object.__setattr__(self, "options", tuple(sorted(set(map(float, self.options)), reverse=True)))
 
 
+@shown_short
 class FittedHead(NamedTuple):
     """A fit for each option; `models` are those of logistic regression, empty for the other heads."""
 
@@ -85,6 +87,7 @@ class FittedHead(NamedTuple):
     models: Sequence[LinearModel] = ()
 
 
+@shown_short
 class LinearModel(NamedTuple):
     """Standardised logistic regression: features (m, d) -> class numbers (m,)."""
 

@@ -37,6 +37,7 @@ from anytouch_jax.evaluate.splits import SIDES, LabelledFeatures, RowRoles, Sele
 from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows
 from anytouch_jax.files import atomic_write
+from anytouch_jax.shown import shown_short
 
 Subsets = Mapping[str, Array]
 Log = Callable[[str], None]
@@ -60,6 +61,7 @@ class SubsetResult:
     n_test: int
 
 
+@shown_short
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """The test rows, whether each was right, and its group; `fitted`: the linear model and the names of its classes."""
@@ -70,6 +72,7 @@ class Outcome:
     fitted: tuple[Any, Array] | None = None
 
 
+@shown_short
 @dataclass(frozen=True)
 class ProbeResult:
     """The score of a head fitted on all of train, on the test rows. Shares are in 0..1.

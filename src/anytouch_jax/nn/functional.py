@@ -20,10 +20,12 @@ from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.nn.fields import FieldOutput
 from anytouch_jax.ops import tokens
+from anytouch_jax.shown import shown_short
 
 Params = dict[str, Any]
 
 
+@shown_short
 @dataclass(frozen=True)
 class Net:
     """The network of a model configuration, as functions of a plain nested dict of arrays."""

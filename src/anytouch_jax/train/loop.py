@@ -19,6 +19,7 @@ from jax.sharding import Mesh
 
 from anytouch_jax.config import Config, to_json
 from anytouch_jax.errors import UserError
+from anytouch_jax.shown import shown_short
 from anytouch_jax.train.distributed import Ballot, broadcast, check_shared, gather
 from anytouch_jax.train.mesh import (
     batch_sharding,
@@ -44,6 +45,7 @@ Batches = Callable[[int, int], Iterator[Item]]
 Report = Callable[[int, Tree, Any], None]
 
 
+@shown_short
 @dataclass(frozen=True)
 class FitResult:
     """The result of a run or a part of one: the state after `step` steps and the last line of metrics."""

@@ -12,6 +12,7 @@ import optax
 from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError
+from anytouch_jax.shown import shown_short
 from anytouch_jax.train.optim import global_norm, match_rules, optimizer, packing
 from anytouch_jax.weights.tree import flatten, nest
 
@@ -25,6 +26,8 @@ TrainedFn = Callable[[Any], Sequence[tuple[str, bool]]]
 StepFn = Callable[..., tuple["TrainState", dict[str, Array]]]
 
 
+@shown_short
+@shown_short
 class TrainState(NamedTuple):
     """The state of training: `step` i32 (), trainable and frozen parameters as nested dicts, the optimiser's state."""
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from anytouch_jax.config import UNIVERSAL
+from anytouch_jax.data.cameras import CameraSettings, open_source
 from anytouch_jax.data.images import encode, open_video
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
@@ -30,7 +31,7 @@ from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.encoder.linear_head import LinearHead
-from anytouch_jax.encoder.stream import Embedded, open_source, stream
+from anytouch_jax.encoder.stream import Embedded, stream
 from anytouch_jax.errors import UserError
 from anytouch_jax.view.space import FeatureMap
 from anytouch_jax.view.tables import scale_down, touch_panels
@@ -80,13 +81,14 @@ class Live:
 
     def __init__(
         self, source: str, encoder: Encoder, *, sensor: str | None, head: LinearHead | None = None,
-        space: FeatureMap | None = None, out: Path | None = None, log: Callable[[str], None] = print,
+        space: FeatureMap | None = None, out: Path | None = None, camera: CameraSettings | None = None,
+        log: Callable[[str], None] = print,
     ) -> None:  # fmt: skip
         if space is not None:
             space.index.check(encoder.source, encoder.fingerprint)
         self.name, self._source = Path(source).name, source
         self._encoder, self._head, self._space = encoder, head, space
-        self._sensor, self._log = sensor, log
+        self._sensor, self._camera, self._log = sensor, camera, log
         self._row = encoder.sensor_row(sensor or UNIVERSAL, log)
         self._rotate = 0
         self._flip: Flip = "none"
@@ -111,8 +113,8 @@ class Live:
 
     def start(self) -> None:
         """Open the source and begin. Raises UserError if it cannot be opened."""
-        source, live = open_source(self._source)
-        if not live:
+        source, live = open_source(self._source, self._camera, self._log)
+        if not live and Path(self._source).is_file():
             source.release()
             source = LoopedFilm(Path(self._source))
         self._thread = threading.Thread(target=self._run, args=(source,), daemon=True)

@@ -64,7 +64,7 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
     features: list[Path] = []
     for path in paths:
         if not path.exists():
-            raise UserError(f"There is nothing at {path}. Name a manifest, a folder, a film, features or a run.")
+            raise UserError(f"There is nothing at {path}. Name a manifest, folder, film, features, run or camera.")
         if path.suffix.lower() == ".npz":
             features.append(path)
         elif path.is_dir() and (path / "metrics.jsonl").is_file():

@@ -14,6 +14,7 @@ import numpy as np
 from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
+from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import checkpoint, compatible, registry
 from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
 from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layout, refuse_unknown, to_params
@@ -41,6 +42,7 @@ _PREFIX = re.compile(r"(module|_orig_mod|model)\.")  # DistributedDataParallel, 
 _INNER = re.compile(r"(^|\.)(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
 
 
+@shown_short
 @dataclass(frozen=True)
 class Loaded:
     """Parameters from a run or a weights file, with every part it has: touch, decoder, image, text and others.

@@ -217,7 +217,9 @@ def test_sensor_rows(tmp_path):
     assert ids.tolist() == [1, -1, 9, 6] and any("universal" in note for note in notes)
     other = m.read(_file(tmp_path, text.replace("digit", "DIGIT")))
     for unknown in ("error", "skip", "universal"):
-        with pytest.raises(m.ManifestError, match=r"line 2 of .*column 'sensor': sensor 'DIGIT': it is called digit"):
+        with pytest.raises(
+            m.ManifestError, match=r"line 2 of .*column 'sensor': sensor 'DIGIT' is not known: did you mean digit"
+        ):
             m.sensor_rows(other, model, unknown=unknown)
     ids, notes = m.sensor_rows(got, model, np.array([0, 3]))
     assert ids.tolist() == [1, -1, -1, 6] and notes == []

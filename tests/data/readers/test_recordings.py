@@ -222,7 +222,7 @@ def test_videos_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, m
 
 def test_mistakes(tmp_path, read):
     fill(tmp_path, ["a/0.png"])
-    with pytest.raises(UserError, match="sensor 'DIGIT': it is called digit"):
+    with pytest.raises(UserError, match="sensor 'DIGIT' is not known: did you mean digit"):
         read("recordings", sensor="DIGIT")
     for sensor in (None, "tac3d", "universal"):
         with pytest.raises(UserError, match="--sensor: gelsight"):

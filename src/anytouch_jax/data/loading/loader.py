@@ -77,6 +77,10 @@ class Loader:
         self._text_length, self._align_share = self._caption_length(), self._share_of_align_steps()
         self._align, self._match = StepSchedule(self._align_kinds), StepSchedule(self._match_kinds)
 
+    def __repr__(self) -> str:
+        rows, data = len(self.manifest), self.config.data
+        return f"Loader(stage {self.config.stage}, split {data.split} of {rows:,} rows, batches of {data.batch_size})"
+
     def kind(self, step: int) -> Literal["still", "clip"]:
         """Return whether the batch of `step` holds stills or clips."""
         align, match = self._align.at(step)[0], self._match.at(step)[0]

@@ -6,7 +6,6 @@ One row is one tactile frame (the columns are in `schema.py`), and row numbers c
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, ModelConfig, SpellingError, check_spelling
+from anytouch_jax.config import FIELD_SENSORS, ModelConfig, SpellingError, check_spelling
 from anytouch_jax.data.manifest.content import Summary, clip_windows, content_digest, summarise, table_blocks
 from anytouch_jax.data.manifest.remote import is_remote, local_copy
 from anytouch_jax.data.manifest.schema import (
@@ -42,6 +41,7 @@ from anytouch_jax.data.manifest.schema import (
 )
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.files import atomic_path
+from anytouch_jax.shown import described
 
 _LONGEST_PATH = 4000  # bytes, on Linux
 KEYS = ("sequence", "touch", "grasp_group")  # columns whose values belong to their file
@@ -62,6 +62,17 @@ class Manifest:
 
     def __len__(self) -> int:
         return int(self.table.num_rows)
+
+    def __repr__(self) -> str:
+        counts = {}
+        for name in ("split", "sensor"):
+            most = sorted(pc.value_counts(self.column(name)).to_pylist(), key=lambda entry: -entry["counts"])
+            counts[f"{name}s"] = listed([f"{entry['values']} {entry['counts']:,}" for entry in most])
+        recordings = len(np.unique(self.codes("sequence", own=True)))
+        return described(
+            f"Manifest {self._name}", rows=f"{len(self):,} in {recordings:,} recordings", **counts,
+            columns=listed(self.table.column_names),
+        )  # fmt: skip
 
     def where(self, row: int) -> str:
         """Return "line 5 of /data/m.csv", or "row 3 of /data/m.parquet", for errors."""
@@ -364,17 +375,11 @@ def sensor_rows(
 
 def misspelt_sensors(manifest: Manifest) -> Iterator[tuple[Literal["error", "warning"], str, np.ndarray]]:
     """Yield (level, sentence, row ids i64) for sensor names that are nearly known names. New names are no fault."""
-    known = (*(name for name in SENSORS if name != UNIVERSAL), *FIELD_SENSORS)
-    groups = {manifest.value(rows[0], "sensor"): rows for rows in manifest.groups("sensor")}
-    for name in sorted(groups.keys() - set(known)):
-        count = f"{groups[name].size} rows are of"
+    for rows in sorted(manifest.groups("sensor"), key=lambda rows: str(manifest.value(rows[0], "sensor"))):
         try:
-            check_spelling(name)
+            check_spelling(str(manifest.value(rows[0], "sensor")))
         except SpellingError as error:
-            yield "error", f"{count} {error}", groups[name]
-            continue
-        if near := difflib.get_close_matches(name[:50].lower(), known, 1, 0.8):
-            yield "warning", f"{count} sensor {shown(name)}, which is not known: did you mean {near[0]}?", groups[name]
+            yield "error", f"{rows.size} rows are of {error}", rows
 
 
 def resolve_path(root: str | Path, relative: str | None) -> Path:

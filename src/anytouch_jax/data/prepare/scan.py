@@ -15,7 +15,7 @@ import numpy as np
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
-from anytouch_jax.data.images import ImageError, decode_bytes
+from anytouch_jax.data.images import ImageError, decode_bytes, to_rgb
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.files import Files, distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -36,7 +36,8 @@ class Scan(NamedTuple):
 
     `state` u8 (n,) indexes STATES. `size` i32 (n, 2) is width and height, 0 if not decoded. `digest` S32 (n,) is the
     first half of the SHA-256 in hex. `colours` is u8 (n, 48). `looks` f32 (n, 5) are the measures of `_looks`, and
-    `pixels` u32 (n,) is a checksum of the pixels. `reasons` explains the first thousand bad files.
+    `pixels` u32 (n,) is a checksum of the pixels. `bits` u8 (n,) are those that a picture of 16 bits uses, else 0.
+    `reasons` explains the first thousand bad files.
     """
 
     files: Files
@@ -46,6 +47,7 @@ class Scan(NamedTuple):
     colours: np.ndarray
     looks: np.ndarray
     pixels: np.ndarray
+    bits: np.ndarray
     reasons: dict[int, str]
 
     def states(self, column: str) -> np.ndarray:
@@ -93,6 +95,7 @@ class _FileState(NamedTuple):
     colours: np.ndarray | None = None
     looks: np.ndarray | None = None
     pixels: int = 0
+    bits: int = 0
     reason: str = ""
 
 
@@ -106,7 +109,7 @@ def scan(manifest: Manifest, *, decode: bool = True, threads: int = 4) -> Scan:
     result = Scan(
         files, np.zeros(count, np.uint8), np.zeros((count, 2), np.int32), np.zeros(count, "S32"),
         np.zeros((count, 3 * FIELDS * FIELDS), np.uint8), np.zeros((count, 5), np.float32),
-        np.zeros(count, np.uint32), {},
+        np.zeros(count, np.uint32), np.zeros(count, np.uint8), {},
     )  # fmt: skip
 
     def inspect(file: int) -> _FileState:
@@ -132,7 +135,7 @@ def scan(manifest: Manifest, *, decode: bool = True, threads: int = 4) -> Scan:
             result.size[file], result.digest[file] = state.size, state.digest
             if state.colours is not None:
                 result.colours[file], result.looks[file] = state.colours, state.looks
-                result.pixels[file] = state.pixels
+                result.pixels[file], result.bits[file] = state.pixels, state.bits
             if state.reason and len(result.reasons) < _MAX_REASONS:
                 result.reasons[file] = state.reason
     return result
@@ -143,13 +146,16 @@ def _judge(data: bytes, path: Path, is_image: bool) -> _FileState:
     if not is_image:
         return _FileState("ok", digest=digest)
     try:
-        pixels = decode_bytes(data, path)
+        stored = decode_bytes(data, path, as_stored=True)
+        pixels = to_rgb(stored, path)
     except ImageError as error:
         reason = str(error).removeprefix(f"{path} ").removeprefix("cannot be read: ")
         return _FileState("truncated" if "cut short" in reason else "unreadable", digest=digest, reason=reason)
     height, width = pixels.shape[:2]
+    colour = stored[..., :3] if stored.ndim == 3 else stored  # alpha is full
+    bits = int(colour.max()).bit_length() if stored.dtype.kind == "u" and stored.itemsize == 2 else 0
     colours = cv2.resize(pixels, (FIELDS, FIELDS), interpolation=cv2.INTER_AREA).reshape(-1)
-    return _FileState("ok", (width, height), digest, colours, _looks(pixels), zlib.crc32(pixels.data))
+    return _FileState("ok", (width, height), digest, colours, _looks(pixels), zlib.crc32(pixels.data), bits)
 
 
 def _looks(pixels: np.ndarray) -> np.ndarray:

@@ -38,6 +38,7 @@ from anytouch_jax.data.prepare.scan import (
     finding,
     scan,
 )
+from anytouch_jax.shown import shown_short
 
 _SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
 _LISTED = 1000  # rows of a finding that are written to JSON
@@ -48,6 +49,7 @@ _WIDER = 1.5  # touch images may spread this much more than photographs before t
 _CERTAIN = 0.95  # share of the rows that must resemble the background images to call a dataset swapped
 
 
+@shown_short
 @dataclass(frozen=True)
 class VerifyReport:
     """The result of `verify`. `shares` holds, for each dataset and column, the share of rows that have a value."""
@@ -407,6 +409,7 @@ def _swapped(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 # Pictures that decode but cannot be right: of one colour, cut, noise, repeated, turned, or unlike their recording.
 # Cameras, disks and scripts leave them behind. A picture is judged alone, or by the other frames of its sequence.
 _FEWEST = 5  # frames of a sequence that show what is usual in it
+_NARROW = 14  # bits of 16: more may be all that a dark picture uses
 _FROZEN = 3  # equal pictures in a row: cameras have noise
 _LAGS = (2, 3, 4)  # pictures of so many sensors may take turns in a sequence
 _ALONE = (
@@ -428,12 +431,23 @@ _IN_SEQUENCE = (
 
 def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield the kinds of pictures that cannot be right."""
-    looks = scanned.looks
-    flat = looks[:, SPREAD] < 1
+    looks, narrow = scanned.looks, np.zeros(len(scanned.bits), bool)
+    source = np.stack([manifest.codes("dataset"), manifest.codes("sensor")], 1)
+    for column, code in scanned.files.code.items():
+        rows = np.flatnonzero((code >= 0) & (scanned.bits[code] > 0))
+        for group in group_rows(rows, source[rows]):
+            files = code[group]
+            if (bits := int(scanned.bits[files].max())) <= _NARROW:
+                narrow[files] = True
+                scaled = f"cv2.imread(file, cv2.IMREAD_UNCHANGED) * {2 ** (16 - bits)}"
+                words = f"rows whose {column} has values that use {bits} of 16 bits, and looks black. Scale it: "
+                words += f"cv2.imwrite(file, {scaled})"
+                yield from finding(manifest, "bits", "warning", group, words, column)
+    flat = (looks[:, SPREAD] < 1) & ~narrow
     alone = {
-        "flat": flat, "cut": ~flat & (looks[:, BOTTOM] > 0.1), "border": ~flat & (looks[:, BORDER] > 0.03),
-        "noise": ~flat & (looks[:, NOISE] > 0.6),
+        "flat": flat, "cut": looks[:, BOTTOM] > 0.1, "border": looks[:, BORDER] > 0.03, "noise": looks[:, NOISE] > 0.6
     }  # fmt: skip
+    alone = {kind: wrong & ~narrow & (~flat | (kind == "flat")) for kind, wrong in alone.items()}
     for column, code in scanned.files.code.items():
         for kind, words in _ALONE:
             rows = np.flatnonzero((code >= 0) & (scanned.decoded & alone[kind])[code])

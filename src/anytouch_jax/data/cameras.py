@@ -1,0 +1,235 @@
+"""Cameras: those that are connected, with their names, sizes and rates, and opening of one by what a user calls it.
+
+Linux lists them in a folder, and their drivers answer questions of V4L2 (linux/videodev2.h) without starting them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+
+from anytouch_jax.data.images import QUIET, open_video
+from anytouch_jax.errors import UserError
+
+SYSTEM, DEVICES = Path("/sys/class/video4linux"), Path("/dev")
+ADDRESSES = ("http://", "https://", "rtsp://", "rtmp://", "udp://", "tcp://")
+_FORMATS, _SIZES, _INTERVALS = 0xC0405602, 0xC02C564A, 0xC034564B  # VIDIOC_ENUM_FMT, _FRAMESIZES, _FRAMEINTERVALS
+_CAPTURE, _DISCRETE = 1, 1  # a buffer of pictures; a size or interval that is one of a list
+_PATIENCE = 10_000  # milliseconds to wait for an address
+_OTHERS = 10  # numbers that are tried where no folder lists the cameras
+
+
+class CameraSettings(NamedTuple):
+    """What a camera is asked for: width and height in pixels, frames a second, and four letters such as MJPG."""
+
+    size: tuple[int, int] | None = None
+    fps: float | None = None
+    format: str | None = None
+
+
+class Mode(NamedTuple):
+    """A size that a camera has in a format, with its rates in frames a second."""
+
+    format: str
+    width: int
+    height: int
+    rates: tuple[float, ...]
+
+
+class Camera(NamedTuple):
+    """A connected camera; `modes` are empty if its driver does not list them."""
+
+    number: int
+    name: str
+    serial: str
+    modes: tuple[Mode, ...]
+
+    def __str__(self) -> str:
+        return f"{self.number} ({self.name}{f', serial {self.serial}' if self.serial else ''})"
+
+    def lines(self) -> list[str]:
+        """Return a line with its name, and one for each of its formats."""
+        lines = [f"camera {self}"]
+        for form in dict.fromkeys(mode.format for mode in self.modes):
+            sizes = (
+                f"{mode.width} x {mode.height}"
+                + (f" at {', '.join(f'{rate:g}' for rate in mode.rates)} frames/s" if mode.rates else "")
+                for mode in self.modes
+                if mode.format == form
+            )
+            lines.append(f"  {form}: {'; '.join(sizes)}")
+        return lines
+
+
+def list_cameras() -> list[Camera]:
+    """Return the cameras that are connected. A device that only gives metadata is left out."""
+    if sys.platform != "linux" and not SYSTEM.is_dir():
+        return [Camera(number, "unknown", "", ()) for number in range(_OTHERS) if _opens(number)]
+    found = []
+    for place in SYSTEM.glob("video*"):
+        modes, digits = tuple(_modes(DEVICES / place.name)), place.name.removeprefix("video")
+        if digits.isdecimal() and (modes or _text(place / "index") in ("", "0")):
+            device = (place / "device").resolve()  # of USB an interface, in the folder of its device
+            serial = _text(device / "serial") or _text(device.parent / "serial")
+            found.append(Camera(int(digits), _text(place / "name") or place.name, serial, modes))
+    return sorted(found)
+
+
+def camera_of(source: str | Path) -> int | str | None:
+    """Return the number or the address of a camera, None for a film.
+
+    `source` is a file, a number, /dev/videoN or a link to it, an address (ADDRESSES), the serial number of a camera, or
+    a part of its name. A file comes first. Raises UserError for a name that several cameras have.
+    """
+    text, path = str(source), Path(source)
+    if text.lower().startswith(ADDRESSES):
+        return text
+    if path.is_char_device():
+        path = path.resolve()
+    elif path.exists():
+        return None
+    if number := re.fullmatch(r"(?:/dev/video)?(\d{1,6})", str(path)):
+        return int(number[1])
+    word = text.strip().lower()
+    cameras = [one for one in list_cameras() if word and (word in one.name.lower() or word == one.serial.lower())]
+    if len(cameras) > 1:
+        raise UserError(f"{text} is the name of {len(cameras)} cameras, {_listed(cameras)}: give a number or a serial")
+    return cameras[0].number if cameras else None
+
+
+def open_source(
+    name: str | Path, asked: CameraSettings | None = None, log: Callable[[str], None] | None = None
+) -> tuple[Any, bool]:
+    """Return a cv2.VideoCapture of what `camera_of` takes or of a film, and whether it is a camera.
+
+    A camera is `asked` for settings, and `log` gets a sentence on what it really gives. Raises UserError.
+    """
+    camera = camera_of(name)
+    if camera is None and not Path(name).is_file():
+        raise UserError(f"there is no video and no camera {name}; {_connected()}")
+    with QUIET:
+        if isinstance(camera, str):
+            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _PATIENCE, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _PATIENCE]
+            source = cv2.VideoCapture(camera, cv2.CAP_FFMPEG, limits)
+        else:
+            source = open_video(name) if camera is None else cv2.VideoCapture(camera)
+    if not source.isOpened():
+        if camera is None:
+            raise UserError(f"{name} is not a video that can be read; convert it first")
+        if isinstance(camera, str):
+            raise UserError(f"{name} cannot be opened; check the address, and that its server is on")
+        device = DEVICES / f"video{camera}"
+        advice = _connected()
+        if device.exists() and not os.access(device, os.R_OK | os.W_OK):
+            advice = f"you may not read {device}: become a member of the group video"
+        raise UserError(f"camera {name} cannot be opened; {advice}")
+    if camera is None or (isinstance(camera, str) and source.get(cv2.CAP_PROP_FRAME_COUNT) > 0):
+        return source, False
+    if isinstance(camera, int):
+        source.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the driver's own queue would hold old frames
+        _ask(source, asked or CameraSettings())
+    if log is not None:
+        log(f"camera {name}: {_given(source, camera, asked or CameraSettings())}")
+    return source, True
+
+
+def format_of(source: Any) -> str:
+    """Return the four letters of a source's format, "" if it does not have them."""
+    code = source.get(cv2.CAP_PROP_FOURCC)
+    letters = int(code).to_bytes(4, "little").decode("latin1").strip() if 0 < code < 2**32 else ""
+    return letters if letters.isascii() and letters.isprintable() else ""
+
+
+def _ask(source: Any, asked: CameraSettings) -> None:
+    if asked.format is not None:  # first: it decides which sizes and rates there are
+        source.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*asked.format.upper()))
+    if asked.size is not None:
+        for name, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), asked.size, strict=True):
+            source.set(name, value)
+    if asked.fps is not None:
+        source.set(cv2.CAP_PROP_FPS, asked.fps)
+
+
+def _given(source: Any, camera: int | str, asked: CameraSettings) -> str:
+    """Return what a camera gives, where that is not what it was asked for, and a format that is faster."""
+    width, height, rate = (
+        source.get(name) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+    )
+    size, form = (int(width), int(height)), format_of(source)
+    words = f"{size[0]} x {size[1]} pixels" + (f", {rate:g} frames/s" if rate > 0 else "") + (f", {form}" * bool(form))
+    missed = []
+    if asked.size is not None and asked.size != size:
+        missed.append(f"{asked.size[0]} x {asked.size[1]} pixels")
+    if asked.fps is not None and abs(asked.fps - rate) > 0.5:
+        missed.append(f"{asked.fps:g} frames/s")
+    if asked.format is not None and asked.format.upper() != form:
+        missed.append(asked.format.upper())
+    words += f", not {' and '.join(missed)} as asked for" if missed else ""
+    modes = _modes(DEVICES / f"video{camera}") if isinstance(camera, int) else ()
+    others = [(max(mode.rates), mode.format) for mode in modes if mode.rates and size == (mode.width, mode.height)]
+    fastest, best = max(others, default=(0.0, ""))
+    return words + (f". With format {best} it gives {fastest:g}" if best != form and fastest > rate + 1 else "")
+
+
+def _connected() -> str:
+    cameras = list_cameras()
+    return f"connected are {_listed(cameras)}" if cameras else "no camera is connected"
+
+
+def _listed(cameras: list[Camera]) -> str:
+    return ", ".join(map(str, cameras))
+
+
+def _text(file: Path) -> str:
+    """Return the text of a file of the system, "" if it cannot be read."""
+    try:
+        return file.read_text(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def _opens(number: int) -> bool:
+    with QUIET:
+        source = cv2.VideoCapture(number)
+    is_open = bool(source.isOpened())
+    source.release()
+    return is_open
+
+
+def _modes(device: Path) -> Iterator[Mode]:
+    """Yield what the driver of a device lists: formats, their sizes, and the rates of each."""
+    try:
+        handle = os.open(device, os.O_RDWR | os.O_NONBLOCK)
+    except OSError:
+        return
+    try:
+        for form in _answers(handle, _FORMATS, _CAPTURE):
+            letters = form[11].to_bytes(4, "little").decode("latin1").strip()
+            for size in _answers(handle, _SIZES, form[11]):
+                width, height = size[3:5] if size[2] == _DISCRETE else (size[4], size[7])  # the largest of a range
+                intervals = _answers(handle, _INTERVALS, form[11], width, height)
+                rates = {round(one[6] / one[5], 2) for one in intervals if one[5]}  # of a range the fastest
+                yield Mode(letters, width, height, tuple(sorted(rates, reverse=True)))
+    finally:
+        os.close(handle)
+
+
+def _answers(handle: int, code: int, *question: int) -> Iterator[tuple[int, ...]]:
+    """Yield the answers of a driver as words of 32 bits, number 0 first, until there are no more."""
+    import fcntl
+
+    count = (code >> 16 & 0x3FFF) // 4
+    for number in range(256):
+        words = bytearray(struct.pack("=64I", number, *question, *[0] * (63 - len(question)))[: 4 * count])
+        try:
+            fcntl.ioctl(handle, code, words)
+        except OSError:
+            return
+        yield struct.unpack(f"={count}I", words)

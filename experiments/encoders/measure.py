@@ -24,7 +24,7 @@ import numpy as np
 import optax
 
 from anytouch_jax.batch import FieldBatch
-from anytouch_jax.config import Config, SimulatedConfig, preset
+from anytouch_jax.config import Config, SimulatedConfig
 from anytouch_jax.nn.fields import FORCE, LENGTH, TORQUE
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
@@ -60,7 +60,9 @@ def world_of(split: Any, variants: int = 1) -> endless.World:
 
 def batches(world: endless.World, config: Config, count: int, seed: int, **options: float) -> Iterator[FieldBatch]:
     """Yield batches of stills and of clips in turn, with normalised pixels and sensor rows."""
-    rows = np.array([config.model.sensor_row(name) for name in SimulatedConfig().sensors] + [config.model.universal_row])
+    rows = np.array(
+        [config.model.sensor_row(name) for name in SimulatedConfig().sensors] + [config.model.universal_row]
+    )
 
     @partial(jax.jit, static_argnums=(2,))
     def make(key: jax.Array, world: endless.World, frames: int) -> FieldBatch:

@@ -205,7 +205,11 @@ def choose_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
 
 def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.ndarray:
     """Return photographs u8 (objects, places, size, size, 3) of the places (objects, places, 2) mm of each object."""
-    jobs = [(thing, place, (thing.seed, scene.PHOTO)) for thing, spots in zip(things, places, strict=True) for place in spots]
+    jobs = [
+        (thing, place, (thing.seed, scene.PHOTO))
+        for thing, spots in zip(things, places, strict=True)
+        for place in spots
+    ]
     pictures = endless.over_cores(partial(seeded_photograph, size=size), jobs)
     return np.stack(pictures).reshape(*places.shape[:2], size, size, 3)
 

@@ -138,7 +138,17 @@ def test_shares_of_photographs_and_captions():
 def gesture(motion, slide=(0.0, 0.0), twist=0.0, shown=1.0, middle=0.5, lift=-1.0):
     """A gesture whose phases lift 10 %, press 20 %, pause 10 %, move 30 %, pause 10 %, release 10 % and lift 10 %."""
     phases = np.array([1, 2, 1, 3, 1, 1, 1]) / 10
-    return Gesture(0.8, scene.MOTIONS.index(motion), np.asarray(slide), twist, phases, shown, middle, lift, np.array([1.0, 0.0, 0.1]))
+    return Gesture(
+        0.8,
+        scene.MOTIONS.index(motion),
+        np.asarray(slide),
+        twist,
+        phases,
+        shown,
+        middle,
+        lift,
+        np.array([1.0, 0.0, 0.1]),
+    )
 
 
 @pytest.mark.parametrize("motion", ["hold", "slide", "twist"])

@@ -181,9 +181,7 @@ def simulate(clip: ClipInput, numbers: Family, pitch: Array, sampling: Sampling)
     """Return the simulated clip of one take by a sensor of these numbers, on a grid of `pitch` mm."""
     side = (sampling.field_size, sampling.field_size)
     view = View((GRID, GRID), pitch, (sampling.size, sampling.size), numbers.photometry, True, side)
-    return simulate_clip(
-        clip, sensor=as_sensor(numbers), fidelity=sampling.fidelity, fields=sampling.fields, view=view
-    )
+    return simulate_clip(clip, sensor=as_sensor(numbers), fidelity=sampling.fidelity, fields=sampling.fields, view=view)
 
 
 def _draw(
@@ -241,14 +239,18 @@ def _draw(
 def _cropped(rng: Draws) -> Array:
     """Return the share (2,) of the field's height and width that is shown: a camera may cut one side."""
     share = jnp.where(rng.uniform() < 0.5, rng.uniform(0.7, 1.0), 1.0)
-    return jnp.where(rng.uniform() < 0.5, jnp.stack([share, jnp.ones_like(share)]), jnp.stack([jnp.ones_like(share), share]))
+    return jnp.where(
+        rng.uniform() < 0.5, jnp.stack([share, jnp.ones_like(share)]), jnp.stack([jnp.ones_like(share), share])
+    )
 
 
 def wild(one: Family, other: Family, rng: Draws) -> Family:
     """Return a family between two, with lights of other colours, and dots of another size, distance and ink."""
     share = rng.uniform()
     mixed: Family = jax.tree.map(lambda a, b: share * a + (1 - share) * b, one, other)
-    turn = jnp.asarray(_ORDERS)[rng.integers(len(_ORDERS))] * rng.choice([-1.0, 1.0])  # lights that change places, or a side
+    turn = jnp.asarray(_ORDERS)[rng.integers(len(_ORDERS))] * rng.choice(
+        [-1.0, 1.0]
+    )  # lights that change places, or a side
     photometry = mixed.photometry._replace(normal=mixed.photometry.normal @ turn, halo=mixed.photometry.halo @ turn)
     pitch = rng.uniform(0.9, 2.6)
     radius = pitch * rng.uniform(0.08, 0.28)

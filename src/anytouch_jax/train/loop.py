@@ -162,7 +162,9 @@ class _Loop:
         step_fn, sharding = self.compile(state, loss_fn, trained), batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
-        step_fn = self.ahead(step_fn, [lambda one=one: (state, put_batch(one(), sharding), seed_key) for one in examples])
+        step_fn = self.ahead(
+            step_fn, [lambda one=one: (state, put_batch(one(), sharding), seed_key) for one in examples]
+        )
         done, saved, reported, placed = start, start, start, None
         with contextlib.closing(self.awaited(batches, start, stop)) as feed:
             for step, batch, info in feed:

@@ -47,9 +47,7 @@ def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
     return round(sensor.field[0] * scale), round(sensor.field[1] * scale)
 
 
-def picture_view(
-    sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False
-) -> PictureView:
+def picture_view(sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False) -> PictureView:
     """Return the part of the field in an image of (height, width): the largest of its shape, zoomed and mirrored.
 
     If `stretched`, the whole field fills the image, whose pixels need not be square: what `encoder.preprocess` makes.

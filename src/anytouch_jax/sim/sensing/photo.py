@@ -33,7 +33,9 @@ class CameraView:
 def seeded_photograph(job: tuple[Object, Any, Sequence[int]], size: int) -> np.ndarray:
     """Return `photograph` of an object, a place and a seed, for a pool of processes."""
     thing, place, seed = job
-    return photograph(thing, place, np.random.default_rng([*seed, *np.asarray(place, np.float32).view(np.uint32)]), size)
+    return photograph(
+        thing, place, np.random.default_rng([*seed, *np.asarray(place, np.float32).view(np.uint32)]), size
+    )
 
 
 def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224) -> np.ndarray:

@@ -103,14 +103,14 @@ def train(model: str, minutes: float, out: Path) -> None:
         updates, state = tx.update(gradient, state)
         return jax.tree.map(lambda p, u: p - rate * u, fields, updates), state, metrics
 
-    begun, number, saved = None, 0, time.monotonic()
+    begun, saved = None, time.monotonic()
     count = BATCH["cpu" if jax.default_backend() == "cpu" else "gpu"]
     sums: dict[str, float] = {}
-    for batch in batches(world_of("train", 2), config, count, seed, wild=0.2, free=0.06):
+    source = batches(world_of("train", 2), config, count, seed, wild=0.2, free=0.06)
+    for number, batch in enumerate(source, 1):
         share = 0.0 if begun is None else min((time.monotonic() - begun) / max(end - begun, 1e-3), 1.0)
         rate = RATE * min(share / WARMUP, 1.0) * (0.5 + 0.5 * np.cos(np.pi * share))
         fields, state, metrics = step(fields, state, batch, jnp.float32(rate))
-        number += 1
         if number == 2:
             jax.block_until_ready(metrics)
             begun = time.monotonic()
@@ -144,7 +144,7 @@ def finish(loaded: Any, config: Config, out: Path, name: str) -> None:
 
 
 def collect(params: Any, config: Config, split: str, count: int, size: int = 32) -> dict[str, dict[str, np.ndarray]]:
-    """Return errors and predicted deviations of every quantity, in units of the outputs, over new touches of a split."""
+    """Return errors and deviations of every quantity, in units of the outputs, over new touches of a split."""
     net = build(config.model)
     measure = jax.jit(net.measure)
     errors: dict[str, dict[str, list[np.ndarray]]] = {name: {"error": [], "deviation": []} for name in QUANTITIES}

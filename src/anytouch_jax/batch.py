@@ -17,10 +17,10 @@ Array = Any  # a numpy or a jax array
 class FieldBatch(NamedTuple):
     """Touches with exact fields of their last frame (h, w), free of scale as in `nn.fields`.
 
-    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `aspect` f32 (B,) logarithm of height over width, `depth` (B, h, w) and
-    `shear` (B, h, w, 2) shares of the picture's width, `pressure` (B, h, w) over the gel's modulus, `force` (B, 3)
-    tangential x and y and normal over modulus times width squared, `torque` (B,) over modulus times width cubed, `slip`
-    (B,) share of the contact that slides.
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `aspect` f32 (B,) logarithm of height over width. `depth` (B, h, w)
+    and `shear` (B, h, w, 2) are shares of the picture's width, `pressure` (B, h, w) is over the gel's modulus. `force`
+    (B, 3), tangential x and y and normal, is over modulus times width squared, `torque` (B,) over modulus times width
+    cubed. `slip` (B,) is the share of the contact that slides.
     """
 
     clip: Array
@@ -36,7 +36,7 @@ class FieldBatch(NamedTuple):
 
 @shown_short
 class TouchBatch(NamedTuple):
-    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table, and touches with fields or None."""
+    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table, touches with fields or None."""
 
     clip: Array
     sensor: Array

@@ -120,7 +120,7 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
 
     depth = (out.depth - batch.depth) / LENGTH
     shear = (out.shear - batch.shear) / LENGTH
-    slopes = sum(jnp.mean(jnp.abs(jnp.diff(depth, axis=axis))) for axis in (1, 2))
+    slopes = jnp.mean(jnp.abs(jnp.diff(depth, axis=1))) + jnp.mean(jnp.abs(jnp.diff(depth, axis=2)))
     pressure = jnp.abs(out.pressure - batch.pressure) / STRESS
     ratio = jnp.log((out.force[:, 2] + LEAST_FORCE) / (batch.force[:, 2] + LEAST_FORCE))
     sideways = (out.force[:, :2] - batch.force[:, :2]) / FORCE
@@ -144,7 +144,7 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
         "depth_error": LENGTH * jnp.sum(jnp.abs(depth) * touched) / jnp.maximum(jnp.sum(touched), 1),
         "force_error": jnp.sum(jnp.abs(ratio) * pressed) / jnp.maximum(jnp.sum(pressed), 1),
     }
-    return sum(terms.values(), jnp.zeros(())), metrics
+    return jnp.sum(jnp.stack(list(terms.values()))), metrics
 
 
 def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tuple[str, bool], ...]:

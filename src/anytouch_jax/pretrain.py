@@ -181,10 +181,10 @@ def _choose_tokenizer(
     elif config.data.tokenizer is None and config.towers == "pretrained":
         file = (Path(clip) if Path(clip).is_dir() else Path(clip).parent) / TOKENIZER
     if simulates:
-        tokenizer = simulated.choose_tokenizer(config, manifest) if file is None else load_tokenizer(file)
+        own = simulated.choose_tokenizer(config, manifest) if file is None else load_tokenizer(file)
         if config.towers == "pretrained":
-            return config, tokenizer
-        return config.with_settings({"model.text": replace(config.model.text, vocab=tokenizer.vocab_size)}), tokenizer
+            return config, own
+        return config.with_settings({"model.text": replace(config.model.text, vocab=own.vocab_size)}), own
     rows, most = manifest.rows_of(config.data.split), min(SCRATCH_VOCABULARY, config.model.text.vocab)
     tokenizer, _ = pools.choose_tokenizer(manifest, rows, config, file=file, vocabulary=most)
     if tokenizer is None or config.towers == "pretrained":

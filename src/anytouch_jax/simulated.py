@@ -76,9 +76,10 @@ class Texts(NamedTuple):
 
 
 class SimulatedLoader:
-    """Batches for `config.stage` with the interface of `data.loading.Loader`; `manifest` has real recordings or is None.
+    """Batches for `config.stage` with the interface of `Loader`. `manifest` has real recordings, or is None.
 
-    A text tower needs the `tokenizer` of `choose_tokenizer`. Raises UserError for settings that simulation does not serve, and for more real frames than fit.
+    A text tower needs the `tokenizer` of `choose_tokenizer`. Raises UserError for settings that simulation does not
+    serve, and for more real frames than fit.
     """
 
     def __init__(
@@ -350,7 +351,7 @@ def _assemble(
 
 def _simulated_captions(texts: Texts | None, real: Real) -> Array:
     """Return the number of simulated captions, after which those of real rows begin."""
-    return 0 if texts is None else len(texts.ids) - 1 - (jnp.max(real.caption, initial=-1) + 1)
+    return jnp.int32(0) if texts is None else len(texts.ids) - 1 - (jnp.max(real.caption, initial=-1) + 1)
 
 
 def _joined(one: _Touches, other: _Touches) -> _Touches:
@@ -405,7 +406,7 @@ def _warped(clip: Array, draw: Array, affine: tuple[float, float, float]) -> Arr
     source = source / (zoom * jnp.stack([stretch**0.5, stretch**-0.5]))[:, None, None]
     source = source + jnp.array([(height - 1) / 2, (width - 1) / 2])[:, None, None]
     planes = jnp.moveaxis(clip, -1, 1).reshape(-1, height, width).astype(jnp.float32)
-    warped = jax.vmap(lambda plane: map_coordinates(plane, source, order=1, mode="mirror"))(planes)
+    warped = jax.vmap(lambda plane: map_coordinates(plane, list(source), order=1, mode="mirror"))(planes)
     warped = jnp.round(warped).astype(jnp.uint8).reshape(clip.shape[0], 3, height, width)
     return jnp.moveaxis(warped, 1, -1)
 

@@ -65,8 +65,9 @@ class Sampling:
     """What to sample: clips of `frames` frames of `size` pixels, by `takes` sensors for each touch.
 
     `coarse` is the share of touches at which every sensor touches as by hand, `free` the share of takes without
-    contact, `vision` the share of touches at a place of which there is a photograph, and `wild` the share of takes by a sensor that mixes two families, with other lights and markers.
-    `fields` are those of `recorder.simulate_clip`, at `field_size` pixels, of the last frame.
+    contact, and `vision` the share of touches at a place of which there is a photograph. `wild` is the share of takes
+    by a sensor that mixes two families, with other lights and markers. `fields` are those of `recorder.simulate_clip`,
+    at `field_size` pixels, of the last frame.
     """
 
     frames: int = 1
@@ -110,10 +111,9 @@ def family(sensor: Sensor) -> Family:
     lattice = (markers.pitch, markers.radius, markers.aspect, markers.share, markers.bend)
     widest = np.minimum(photometry.widest, 1e3)
     numbers = (sensor.field, (sensor.gel.modulus, sensor.gel.thickness), shade, lattice, markers.ink)
-    return Family(
-        *(np.asarray(x, np.float32) for x in numbers),
-        jax.tree.map(lambda x: np.asarray(x, np.float32), photometry._replace(widest=widest)), gels,
-    )  # fmt: skip
+    field, gel, shades, dots, ink = (np.asarray(x, np.float32) for x in numbers)
+    light = jax.tree.map(lambda x: np.asarray(x, np.float32), photometry._replace(widest=widest))
+    return Family(field, gel, shades, dots, ink, light, gels)
 
 
 def as_sensor(numbers: Family) -> Sensor:
@@ -239,9 +239,7 @@ def _draw(
 def _cropped(rng: Draws) -> Array:
     """Return the share (2,) of the field's height and width that is shown: a camera may cut one side."""
     share = jnp.where(rng.uniform() < 0.5, rng.uniform(0.7, 1.0), 1.0)
-    return jnp.where(
-        rng.uniform() < 0.5, jnp.stack([share, jnp.ones_like(share)]), jnp.stack([jnp.ones_like(share), share])
-    )
+    return jnp.where(rng.uniform() < 0.5, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])) * (share - 1) + 1
 
 
 def wild(one: Family, other: Family, rng: Draws) -> Family:

@@ -98,8 +98,8 @@ def gel_motion(clip: ClipInput) -> Array:
 class View(NamedTuple):
     """How a sensor is solved and shown: the grid (rows, columns), its `pitch` mm, and the image (height, width).
 
-    `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields` is the (height, width)
-    of the requested fields, that of the image if None.
+    `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields` is the (height,
+    width) of the requested fields, that of the image if None.
     """
 
     grid: tuple[int, int]
@@ -143,13 +143,12 @@ def simulate_clip(
     shown: dict[str, Any] = {"sensor": sensor, "unit": clip.unit, "stretched": view.stretched}
     behind = optics.backdrop(resolution=view.image, **shown)
     look = {"resolution": view.image, "photometry": view.photometry, "behind": behind} | shown
-    draw = partial(optics.render, pitch=pitch, **look)
-    image = jax.vmap(lambda u, t, key, drift: draw(u, t, key=key, drift=drift))(
+    image = jax.vmap(lambda u, t, key, drift: optics.render(u, t, pitch, key=key, drift=drift, **look))(
         contact.displacement, sheared.displacement, keys[1:], clip.drift
     )
     background = optics.background(key=keys[0], **look)
-    mapped = _fields(fields, contact, sheared,
-                     partial(optics.onto_picture, pitch=pitch, resolution=view.fields or view.image, **shown))  # fmt: skip
+    onto_picture = partial(optics.onto_picture, pitch=pitch, resolution=view.fields or view.image, **shown)
+    mapped = _fields(fields, contact, sheared, onto_picture)
     return ClipOutput(image, background, mapped, labels)
 
 

@@ -86,9 +86,9 @@ def fit(
     of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
     `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
     `until` ends the run at that time of `time.monotonic`: the schedule then follows the time that has passed since the
-    first step, in place of `run.steps`. `examples` make a batch of each structure, for which the step is compiled before
-    the first one, side by side. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes gets the signal, all stop a step
-    later. Raises UserError for settings that changed since the start, too many skipped steps in a row, a full disk, an
+    first step, in place of `run.steps`. `examples` make a batch of each structure, for which the step is compiled
+    before the first one, side by side. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes
+    gets the signal, all stop a step later. Raises UserError for settings that changed since the start, too many skipped steps in a row, a full disk, an
     unreadable checkpoint, and a folder that some process cannot see.
     """
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
@@ -162,9 +162,7 @@ class _Loop:
         step_fn, sharding = self.compile(state, loss_fn, trained), batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
-        step_fn = self.ahead(
-            step_fn, [lambda one=one: (state, put_batch(one(), sharding), seed_key) for one in examples]
-        )
+        step_fn = self.ahead(step_fn, state, seed_key, examples)
         done, saved, reported, placed = start, start, start, None
         with contextlib.closing(self.awaited(batches, start, stop)) as feed:
             for step, batch, info in feed:
@@ -199,15 +197,17 @@ class _Loop:
             self.log(f"stopped by {signalled.name} after step {done} and saved, the same command continues from here")
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
-    def ahead(self, step_fn: Any, examples: Sequence[Callable[[], tuple[Any, ...]]]) -> Callable[..., Any]:
-        """Return the step, compiled for the arguments of each example at the same time. Others compile when they come."""
+    def ahead(
+        self, step_fn: Any, state: TrainState, seed_key: jax.Array, examples: Sequence[Callable[[], Any]]
+    ) -> Callable[..., Any]:
+        """Return the step, compiled for the batch of each example side by side. Others compile when they come."""
 
         def form(batch: Any) -> Any:
             return jax.tree.structure(batch), tuple((x.shape, x.dtype) for x in jax.tree.leaves(batch))
 
-        def build(example: Callable[[], tuple[Any, ...]]) -> tuple[Any, Any]:
-            arguments = example()
-            return form(arguments[1]), step_fn.lower(*arguments, *self.progress()).compile()
+        def build(example: Callable[[], Any]) -> tuple[Any, Any]:
+            batch = put_batch(example(), batch_sharding(self.mesh))
+            return form(batch), step_fn.lower(state, batch, seed_key, *self.progress()).compile()
 
         if len(examples) < 2:
             return step_fn

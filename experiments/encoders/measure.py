@@ -59,7 +59,7 @@ def world_of(split: Any, variants: int = 1) -> endless.World:
 
 
 def batches(world: endless.World, config: Config, count: int, seed: int, **options: float) -> Iterator[FieldBatch]:
-    """Yield batches of stills and of clips in turn, with normalised pixels and sensor rows."""
+    """Yield batches with normalised pixels and sensor rows: three of stills, which cost less, then one of clips."""
     rows = np.array(
         [config.model.sensor_row(name) for name in SimulatedConfig().sensors] + [config.model.universal_row]
     )
@@ -75,7 +75,7 @@ def batches(world: endless.World, config: Config, count: int, seed: int, **optio
 
     number = 0
     while True:
-        yield make(jax.random.fold_in(jax.random.key(seed), number), world, (1, config.model.frames)[number % 2])
+        yield make(jax.random.fold_in(jax.random.key(seed), number), world, config.model.frames if number % 4 == 3 else 1)
         number += 1
 
 

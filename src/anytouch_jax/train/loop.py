@@ -88,8 +88,8 @@ def fit(
     `until` ends the run at that time of `time.monotonic`: the schedule then follows the time that has passed since the
     first step, in place of `run.steps`. `examples` make a batch of each structure, for which the step is compiled
     before the first one, side by side. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes
-    gets the signal, all stop a step later. Raises UserError for settings that changed since the start, too many skipped steps in a row, a full disk, an
-    unreadable checkpoint, and a folder that some process cannot see.
+    gets the signal, all stop a step later. Raises UserError for settings that changed since the start, too many skipped
+    steps in a row, a full disk, an unreadable checkpoint, and a folder that some process cannot see.
     """
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
     log, lead = log or to_stderr, jax.process_index() == 0

@@ -75,7 +75,8 @@ def batches(world: endless.World, config: Config, count: int, seed: int, **optio
 
     number = 0
     while True:
-        yield make(jax.random.fold_in(jax.random.key(seed), number), world, config.model.frames if number % 4 == 3 else 1)
+        frames = config.model.frames if number % 4 == 3 else 1
+        yield make(jax.random.fold_in(jax.random.key(seed), number), world, frames)
         number += 1
 
 

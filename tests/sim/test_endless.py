@@ -1,0 +1,133 @@
+"""Touches as a pure function of a key: the distributions of data sets, the program of data sets, held-out objects."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim import endless, scene
+from anytouch_jax.sim.draws import Draws
+from anytouch_jax.sim.recorder import View, simulate_clip
+from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.sim.sensing.sensors import SENSORS, bases, draw_drift, draw_unit, look
+
+SCENES = Scenes(objects=60, seed=41, depth=(0.15, 1.0))
+COUNT = 3000
+
+
+def by_numpy(draw):
+    return jax.tree.map(lambda *x: np.stack(x), *(draw(np.random.default_rng([5, n])) for n in range(COUNT)))
+
+
+def by_jax(draw, most):
+    keys = jax.random.split(jax.random.key(3), COUNT)
+    return jax.device_get(jax.jit(jax.vmap(lambda key: draw(Draws(key, most))))(keys))
+
+
+def flat(tree):
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
+
+
+def gesture(rng):
+    one = scene.draw_gesture(SCENES.depth, rng)
+    return one, scene.draw_place(rng), scene.draw_by_hand(SCENES.depth, rng, one, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("draw", "most"),
+    [
+        (partial(draw_unit, SENSORS["gelsight_mini"]), 2048),
+        (gesture, 128),
+        (partial(draw_drift, 3), 128),
+    ],
+    ids=["unit", "gesture", "drift"],
+)
+def test_both_kinds_of_draws_have_one_distribution(draw, most):
+    ours, theirs = flat(by_jax(draw, most)), flat(by_numpy(draw))
+    assert ours.keys() == theirs.keys()
+    for name, values in ours.items():
+        one, other = (np.asarray(x, np.float64).reshape(COUNT, -1) for x in (values, theirs[name]))
+        for column in range(0, one.shape[1], max(1, one.shape[1] // 6)):
+            p = stats.ks_2samp(one[:, column], other[:, column]).pvalue
+            assert p > 1e-5, (name, column, p, one[:, column].mean(), other[:, column].mean())
+
+
+@pytest.fixture(scope="module")
+def world():
+    return endless.make_world(endless.objects_of(SCENES)[:3], ("digit", "gelsight_mini"), places=2)
+
+
+SAMPLING = endless.Sampling(frames=1, takes=2, size=32, vision=0.5, fields=("displacement",), field_size=16)
+
+
+@pytest.fixture(scope="module")
+def touches(world):
+    return jax.device_get(jax.jit(endless.sample, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12))
+
+
+def test_touches_have_their_shapes_and_a_key_decides_them(world, touches):
+    assert touches.clip.shape == (12, 2, 1, 32, 32, 3) and touches.clip.dtype == np.uint8
+    assert touches.fields.shape == (12, 2, 16, 16, 1)
+    assert set(touches.sensor.ravel()) == {0, 1} and set(touches.object) <= {0, 1, 2}
+    assert set(touches.photo) == {-1, 0, 1}
+    assert np.all(touches.labels["depth"].max(-1) > 0), "every still shows a touch"
+    photographed = touches.photo >= 0
+    place = touches.inputs[0].place[photographed]
+    np.testing.assert_array_equal(
+        place[:, 0], world.places[touches.object[photographed], touches.photo[photographed]]
+    )
+
+
+def test_one_program_for_all_sensors_equals_the_program_of_a_sensor(touches):
+    """The numbers of the sensor are traced in the one, and constants of `SENSORS` in the other."""
+    for row, take in ((0, 0), (1, 1), (2, 0)):
+        clip, numbers, pitch = jax.tree.map(lambda x, at=(row, take): x[at], touches.inputs)
+        name = ("digit", "gelsight_mini")[touches.sensor[row, take]]
+        field = tuple(float(x) for x in numbers.field)
+        sensor = replace(SENSORS[name], field=field)
+        view = View((endless.GRID,) * 2, float(pitch), (32, 32), look(SENSORS[name]), True, (16, 16))
+        out = jax.jit(partial(simulate_clip, sensor=sensor, fidelity="fast", fields=("displacement",), view=view))(clip)
+        np.testing.assert_allclose(out.field[-1], touches.fields[row, take], atol=2e-5)
+        assert np.abs(np.asarray(out.image, int) - touches.clip[row, take]).max() <= 1
+        np.testing.assert_allclose(out.labels["force"], touches.labels["force"][row, take], rtol=1e-3, atol=1e-5)
+
+
+def test_kinds_that_are_held_out_never_occur():
+    kinds = {
+        split: {thing.kind for thing in endless.objects_of(SCENES, split, variants=3)} for split in ("train", "test")
+    }
+    assert kinds["train"] and kinds["test"] and not kinds["train"] & kinds["test"]
+    own, more = endless.objects_of(SCENES), endless.objects_of(SCENES, variants=2)
+    assert more[: len(own)] == own and {thing.name for thing in more} >= {thing.name for thing in own}
+    assert len({thing.seed for thing in more}) == len(more)
+    with pytest.raises(UserError, match="no object of 5"):
+        endless.objects_of(Scenes(objects=5), "test")
+
+
+def test_the_family_of_a_sensor_has_its_numbers():
+    for name in endless.CAMERAS:
+        numbers, sensor = endless.family(SENSORS[name]), SENSORS[name]
+        again = endless.as_sensor(numbers)
+        np.testing.assert_allclose([float(x) for x in again.field], sensor.field, rtol=1e-6)
+        assert float(again.halo) == pytest.approx(sensor.halo) and float(again.noise) == pytest.approx(sensor.noise)
+        assert (numbers.gels.max((1, 2, 3)) > 0).sum() == len(bases(sensor))
+
+
+def test_a_wild_family_lies_between_two_and_keeps_its_places():
+    one, other = (jax.tree.map(jnp.asarray, endless.family(SENSORS[name])) for name in ("digit", "gelslim"))
+    mixed = endless.wild(one, other, Draws(jax.random.key(0)))
+    low, high = np.minimum(one.gel, other.gel), np.maximum(one.gel, other.gel)
+    assert np.all(mixed.gel >= low - 1e-3) and np.all(mixed.gel <= high + 1e-3)
+    assert mixed.photometry.normal.shape == one.photometry.normal.shape
+
+
+def test_draws_refuse_more_than_their_block():
+    rng = Draws(jax.random.key(0), 4)
+    rng.normal(size=3)
+    with pytest.raises(ValueError, match="larger block"):
+        rng.normal(size=2)

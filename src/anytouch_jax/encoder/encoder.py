@@ -26,6 +26,7 @@ from anytouch_jax.encoder.base import Encoder, check_frames, random_encoder, tou
 from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
+from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 from anytouch_jax.shown import shown_short
@@ -52,8 +53,9 @@ def load_encoder(
     Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
     are .pth, .bin, .safetensors or .npz. `step` chooses a checkpoint of a run, the latest by default. Image and text
     towers are loaded too, if there are any. Raises UserError for weights without a touch encoder, or with values that
-    are not finite.
+    are not finite, and in a process that was forked from one that has used jax.
     """
+    refuse_forked()
     name, path, names = str(path), registry.locate(path), set[str]()
     if path.suffix == ".npz":
         with suppress(OSError, ValueError):  # the reader of weights reports a damaged file

@@ -100,8 +100,11 @@ def test_a_forked_process_computes_or_says_why_it_cannot(workers):
 def test_few_numbers_of_rows_are_compiled_and_features_are_equal(workers, part, monkeypatch):
     encoder, exported = workers["encoder"][0], workers["exported"][0]
     encoder, shapes = pickle.loads(pickle.dumps(encoder)), set()
-    words = SimpleNamespace(vocab_size=9, encode=lambda texts, length: (np.array([[int(t) % 9] * length for t in texts]),
-                                                                        np.ones((len(texts), length), bool)))  # fmt: skip
+
+    def ids(texts, length):
+        return np.array([[int(one) % 9] * length for one in texts]), np.ones((len(texts), length), bool)
+
+    words = SimpleNamespace(vocab_size=9, encode=ids)
     encoder.__dict__["tokenizer"] = words
     pictures, z = RNG.integers(0, 256, (70, 28, 28, 3), np.uint8), RNG.standard_normal((2, 70, 12))
     run = {

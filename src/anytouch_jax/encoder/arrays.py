@@ -20,6 +20,16 @@ def binary_scale(values: np.ndarray, axis: int | None = None) -> np.ndarray:
     return np.frexp(np.abs(values).max(axis=axis, keepdims=True, initial=0.0))[1]
 
 
+def as_array(values: Any, name: str) -> np.ndarray:
+    """Return an array of an array-like. Raises UserError for lists of unequal lengths."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise UserError(
+            f"{name} must be one array; its parts differ in size, so bring them to one size first"
+        ) from None
+
+
 def filled(batch: np.ndarray) -> np.ndarray:
     """Return a batch (n, ...) with zeros up to the next of 1, 2, 4, ... 64, 128, 192, ... rows.
 

@@ -22,7 +22,7 @@ from anytouch_jax.data.gels import RunningGel, other_unit, same_unit, untouched_
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
-from anytouch_jax.encoder.arrays import filled, rows_of_sensors, unit_rows
+from anytouch_jax.encoder.arrays import as_array, filled, rows_of_sensors, unit_rows
 from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
@@ -189,9 +189,12 @@ class Encoder:
         frames = as_clips(frames)
         side = self.config.model.image_size
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
+            convert = (
+                "" if frames.dtype == np.uint8 else "convert values 0 to 255 by np.asarray(frames, np.uint8), and "
+            )
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {frames.dtype} "
-                f"{frames.shape}; resize each frame with encoder.preprocess(frame)"
+                f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
             )
         check_frames(self.config.model, frames.shape[1])
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
@@ -351,7 +354,7 @@ class Preprocess:
         self._running = RunningGel() if encoder.needs_background or self._known else None
         self._background = None if frames is None else untouched_gel(frames)
         if background is not None:
-            self._background = to_rgb(np.asarray(background), "the background")
+            self._background = to_rgb(as_array(background, "the background"), "the background")
         self._gel: tuple[np.ndarray | None, np.ndarray] = None, np.zeros((0, 0, 3), np.uint8)
 
     @property
@@ -376,7 +379,7 @@ class Preprocess:
 
         `frame` is RGB u8 (h, w, 3), or grey, RGBA, u16 or floats in 0..1. Raises ImageError for any other.
         """
-        frame = to_rgb(np.asarray(frame), "the frame")
+        frame = to_rgb(as_array(frame, "the frame"), "the frame")
         if self._background is None and self._known:
             known, self._known = self._known, {}
             gel, why = same_unit(known, frame)
@@ -409,8 +412,8 @@ def check_frames(model: ModelConfig, frames: int) -> None:
 
 
 def as_clips(frames: Any) -> np.ndarray:
-    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips (B, T, H, W, 3)."""
-    frames = np.asarray(frames)
+    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips. Raises UserError for frames of two sizes."""
+    frames = as_array(frames, "frames")
     return frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
 
 

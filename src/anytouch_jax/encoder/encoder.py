@@ -22,7 +22,7 @@ from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import export
 from anytouch_jax.encoder.arrays import rows_of_sensors
-from anytouch_jax.encoder.base import Encoder, check_frames, random_encoder, touch_features, touch_only
+from anytouch_jax.encoder.base import Encoder, as_clips, check_frames, random_encoder, touch_features, touch_only
 from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
@@ -109,8 +109,7 @@ class EngineEncoder(Encoder):
         self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
         join: Join = "mean",
     ) -> np.ndarray:  # fmt: skip
-        frames, about = np.asarray(frames), self.run.about
-        frames = frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+        frames, about = as_clips(frames), self.run.about
         if pooling != about["pooling"]:
             raise UserError(f"{self.source} has pooling {about['pooling']}, not {pooling}; export it again with that")
         rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))

@@ -24,7 +24,7 @@ from jax import export as jax_export
 from anytouch_jax.config import UNIVERSAL, parse_json, to_json
 from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.encoder import engines
-from anytouch_jax.encoder.arrays import filled, rows_of_sensors, unit_rows
+from anytouch_jax.encoder.arrays import as_array, filled, rows_of_sensors, unit_rows
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
@@ -100,7 +100,7 @@ class Exported:
         `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape or type, and for a sensor
         that the model does not know.
         """
-        frames = np.asarray(frames)
+        frames = as_array(frames, "frames")
         side, kind = self.about["image_size"], self.about.get("frame_dtype", "uint8")
         wanted = (self.about["frames"], *self.about.get("frame_shape", (side, side, 3)))
         if frames.dtype != kind or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):

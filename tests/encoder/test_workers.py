@@ -45,13 +45,15 @@ def workers(tmp_path_factory):
         "family": (other, lambda one: one.encode_touch(np.stack([one.preprocess(PICTURE)] * 3))),
         "preprocess": (Preprocess(encoder, PICTURE), lambda one: one(PICTURE)),
         "preprocess of a family": (Preprocess(other), lambda one: one(PICTURE)),
+        "preprocess of an engine": (Preprocess(load_encoder(folder / "touch.onnx")), lambda one: one(PICTURE)),
         "exported": (load(folder / "touch.bin"), lambda one: one(FRAMES[:3])),
         "engine": (load_encoder(folder / "touch.onnx"), lambda one: one.encode_touch(FRAMES[:3])),
         "the folder": (folder, lambda one: load_encoder(one / "touch.onnx")),
     }
 
 
-NAMES = ("encoder", "towers", "match", "family", "preprocess", "preprocess of a family", "exported", "engine")
+NAMES = ("encoder", "towers", "match", "family", "preprocess", "preprocess of a family", "preprocess of an engine",
+         "exported", "engine")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -87,7 +89,7 @@ def test_a_forked_process_computes_or_says_why_it_cannot(workers):
         for name in workers:
             assert ours.poll(30), f"{name} hangs"
             answer, seconds = ours.recv()
-            if name in ("engine", "preprocess", "preprocess of a family"):
+            if name == "engine" or "preprocess" in name:
                 assert answer.startswith("("), name
             else:
                 assert "forked" in answer and "spawn" in answer and seconds < 1, name

@@ -152,6 +152,10 @@ class Encoder:
         """Return an untrained encoder of the same form: the control of every probe."""
         return random_encoder(self.config, seed)
 
+    def bare(self) -> Encoder:
+        """Return what prepares frames, without parameters."""
+        return Encoder(self.config, {}, self.source)
+
     def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., jax.Array]:
         """Return the function from params, touches u8 (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
         return partial(touch_features, net=self.net, pooling=pooling, join=join)
@@ -347,7 +351,7 @@ class Preprocess:
     ) -> None:  # fmt: skip
         if background is not None and frames is not None:
             raise UserError("Give a background, or the frames that it is taken from, not both.")
-        self._prepare = replace(encoder, params={}, others={}).prepare  # workers get no parameters
+        self._prepare = encoder.bare().prepare  # workers get no parameters
         self._subtracts = encoder.subtracts
         self._orient = partial(orient_frame, rotate=rotate, flip=flip)
         self._known, self._log = dict(known or {}), log

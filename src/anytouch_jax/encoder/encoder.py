@@ -46,9 +46,9 @@ def load_encoder(
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
     An .onnx file of `anytouch export` runs on onnxruntime, see `load_engine`.
-    Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, ViT-MAE, ViT and DeiT). `heads` is
-    their number of attention heads, where neither the file nor a config.json next to it has it. `image_size` (a side,
-    or height and width) changes the size of their images. Then the result is a `FamilyEncoder`.
+    Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, DINOv3, SigLIP, ViT-MAE, ViT, DeiT).
+    `heads` is their number of attention heads, where neither the file nor a config.json next to it has it. `image_size`
+    (a side, or height and width) changes the size of their images. Then the result is a `FamilyEncoder`.
 
     Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
     are .pth, .bin, .safetensors or .npz. `step` chooses a checkpoint of a run, the latest by default. Image and text

@@ -92,6 +92,10 @@ class FamilyEncoder(Encoder):
         computed = {name: self.params[name] for name in ("frequency", "periods") if name in fresh}
         return replace(self, params=fresh | computed, source=f"random({seed})")
 
+    def bare(self) -> Encoder:
+        """Return what prepares frames, without parameters."""
+        return replace(self, params={})
+
     def sensor_row(self, name: str, log: Log = warn) -> int:
         """Return the row of a sensor. A family without sensors ignores it, which is logged once."""
         names, name = self.config.model.sensors, families.ALIASES.get(str(name), str(name))

@@ -217,8 +217,8 @@ _UNREAD = {  # an array of a relative of these families: why it is not read
     "fc_norm.weight": "was fine-tuned to classify by the mean of its patches (fc_norm), and has no norm of its tokens; "
     "give the pre-trained weights",
     **dict.fromkeys(
-        ("blocks.0.mlp.w1.weight", "blocks.0.mlp.w12.weight", "blocks.0.mlp.fc1_g.weight", "layer.0.mlp.gate_proj.weight",
-         "model.layer.0.mlp.gate_proj.weight", "encoder.layer.0.mlp.weights_in.weight"),
+        ("blocks.0.mlp.w1.weight", "blocks.0.mlp.w12.weight", "blocks.0.mlp.fc1_g.weight",
+         "layer.0.mlp.gate_proj.weight", "model.layer.0.mlp.gate_proj.weight", "encoder.layer.0.mlp.weights_in.weight"),
         "has gated MLPs (SwiGLU), as the largest DINOv2 and DINOv3 have; give a smaller one",
     ),
 }  # fmt: skip

@@ -81,6 +81,8 @@ TIMM, HF, SIGLIP = weights_of("timm DINOv2 with registers"), weights_of("HF DINO
     ("weights", "without", "words"),
     [
         (TIMM | {"fc_norm.weight": np.ones(16, "f4"), "head.weight": np.ones((3, 16), "f4")}, r"norm\.", "fine-tuned"),
+        (TIMM, r"cls_token|reg_token", "without a class token"),
+        (TIMM, r"norm\.|.*ls\d|reg_token", "no final norm"),
         (TIMM | {"fc_norm.weight": np.ones(16, "f4")}, r"norm\.|cls_token", "fine-tuned"),
         (TIMM | {"dist_token": np.ones((1, 1, 16), "f4")}, "reg_token", "distilled"),
         (TIMM | {"blocks.0.mlp.w12.weight": np.ones((3, 16), "f4")}, "nothing", "SwiGLU"),
@@ -93,4 +95,4 @@ def test_relatives_that_are_not_read_get_a_true_sentence(weights, without, words
     kept = {key: x for key, x in weights.items() if not re.match(without, key)}
     with pytest.raises(UserError, match=words) as error:
         load_encoder(written(tmp_path / "one", kept), heads=2)
-    assert "T3" not in str(error.value) and "Sparsh" not in str(error.value)
+    assert "Sparsh" not in str(error.value) and "is an encoder of T3" not in str(error.value)

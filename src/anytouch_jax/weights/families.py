@@ -214,8 +214,8 @@ class FamilyModel:
 
 _UNREAD = {  # an array of a relative of these families: why it is not read
     "dist_token": "is a distilled DeiT, which has a second class token; give a DeiT without distillation",
-    "fc_norm.weight": "was fine-tuned to classify by the mean of its patches (fc_norm), and has no norm of its tokens; "
-    "give the pre-trained weights",
+    "fc_norm.weight": "classifies by the mean of its patches (fc_norm) and has no norm of its tokens, as a fine-tuned "
+    "MAE does; give weights from before the fine-tuning",
     **dict.fromkeys(
         ("blocks.0.mlp.w1.weight", "blocks.0.mlp.w12.weight", "blocks.0.mlp.fc1_g.weight",
          "layer.0.mlp.gate_proj.weight", "model.layer.0.mlp.gate_proj.weight", "encoder.layer.0.mlp.weights_in.weight"),
@@ -226,16 +226,16 @@ _UNREAD = {  # an array of a relative of these families: why it is not read
 
 def _refuse_relatives(path: Path, weights: Weights) -> None:
     """Raise WeightsError for the file of a ViT whose form is not computed here."""
-    if "patch_embed.proj.weight" in weights or any("patch_embeddings." in key for key in weights):
-        for key in _UNREAD.keys() & weights.keys():
-            if key != "fc_norm.weight" or "norm.weight" not in weights:
-                raise WeightsError(f"{path} {_UNREAD[key]}")
-    if any(
-        key.endswith("vision_model.embeddings.patch_embedding.weight") and x.ndim == 2 for key, x in weights.items()
-    ):
-        raise WeightsError(
-            f"{path} is the NaFlex form of SigLIP 2, for pictures of any shape; give one of a fixed size"
-        )
+    timm, patch = weights.get("patch_embed.proj.weight"), "vision_model.embeddings.patch_embedding.weight"
+    reasons = [_UNREAD[key] for key in _UNREAD if key in weights and (key[0] != "f" or "norm.weight" not in weights)]
+    if any(key.endswith(patch) and x.ndim == 2 for key, x in weights.items()):
+        reasons = ["is the NaFlex form of SigLIP 2, for pictures of any shape; give one of a fixed size"]
+    elif timm is None and not any("patch_embeddings." in key for key in weights):
+        reasons = []
+    elif timm is not None and timm.ndim == 4 and timm.shape[1] == 3 and "cls_token" not in weights:
+        reasons.append("is a ViT of photographs without a class token; give one that has it")
+    if reasons:
+        raise WeightsError(f"{path} {reasons[0]}")
 
 
 def load_family(
@@ -259,7 +259,7 @@ def load_family(
             raise WeightsError(f"{file} is the trunk of T3 alone; give its folder, or encoders/SENSOR.pth")
         return read_family(file, weights, _folder(file), heads=heads, image_size=image_size), weights
     if trunk is None:
-        raise WeightsError(f"{file} is an encoder of T3 without its trunk.pth; put that beside it or into its parent")
+        raise WeightsError(f"{file} has no final norm; if it is an encoder of T3, put its trunk.pth into its folder")
     rest = {f"trunk.{key}": array for key, array in load.read_weights(trunk).items()}
     sensors = sensors or {ALIASES.get(file.stem, file.stem): file}
     names, models = (*sensors, UNIVERSAL), []

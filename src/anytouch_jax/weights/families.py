@@ -346,19 +346,16 @@ def _completed(
     width = len(first)
     quarter = width // _heads(width, heads, folder) // 4
     own.setdefault("periods", float(folder.get("rope_theta", 100)) ** (np.arange(quarter) / quarter))
-    for key in [key for key in own if key.endswith(("attn.q_bias", "attn.v_bias"))]:
-        stem = key[:-6]
-        parts = own.get(f"{stem}q_bias"), np.zeros(width), own.get(f"{stem}v_bias")
-        own[f"{stem}qkv.bias"] = np.concatenate([np.zeros(width) if part is None else part for part in parts])
-    for key in [key for key in own if key.endswith("attn.qkv.bias")]:
-        own[key] = np.concatenate([own[key][:width], np.zeros(width), own[key][2 * width :]])  # its mask: no key bias
-    own = {key: x for key, x in own.items() if not key.endswith(("attn.q_bias", "attn.v_bias"))}
-    stems = [row.key for row in family.table if row.key.endswith(".bias") and "{}" in row.key]
-    depth = find_depth(next(row.key for row in family.table if row.name == "blocks/norm1/scale"), own)
-    for stem in stems:
-        if not any(stem.format(layer) in own for layer in range(depth)):
-            kernels = (own[stem.format(layer).removesuffix("bias") + "weight"] for layer in range(depth))
-            own |= {stem.format(layer): np.zeros(len(kernel)) for layer, kernel in enumerate(kernels)}
+    for key in [key for key in own if key.endswith("attn.qkv.weight")]:
+        stem = key.removesuffix("qkv.weight")
+        bias = own.get(f"{stem}qkv.bias", np.zeros(3 * width))
+        parts = own.pop(f"{stem}q_bias", bias[:width]), np.zeros(width), own.pop(f"{stem}v_bias", bias[2 * width :])
+        own[f"{stem}qkv.bias"] = np.concatenate(parts)  # the authors mask the bias of keys
+    known = {re.sub(r"\d", "", key) for key in own}
+    for key in [key for key in own if re.fullmatch(r"layer\.\d+\.\w+\.\w+_proj\.weight", key)]:
+        bias = key.removesuffix("weight") + "bias"
+        if re.sub(r"\d", "", bias) not in known:
+            own[bias] = np.zeros(len(own[key]))
     return own
 
 

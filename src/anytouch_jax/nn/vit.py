@@ -205,7 +205,7 @@ class Vit(nnx.Module):
         assert self.periods is not None
         axes = [(np.arange(side, dtype=np.float32) + 0.5) / side * 2 - 1 for side in grid[1:]]
         places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2, 1)
-        return (2 * np.pi * places / self.periods[...][None, None]).reshape(len(places), -1)
+        return jnp.asarray(2 * np.pi * places / self.periods[...][None, None]).reshape(len(places), -1)
 
     def _positions(self, grid: tuple[int, ...]) -> Array:
         """Return positions of a grid (time, rows, columns), after that of the class token if they are stored."""

@@ -353,9 +353,9 @@ def _completed(
         own[f"{stem}qkv.bias"] = np.concatenate(parts)  # the authors mask the bias of keys
     known = {re.sub(r"\d", "", key) for key in own}
     for key in [key for key in own if re.fullmatch(r"layer\.\d+\.\w+\.\w+_proj\.weight", key)]:
-        bias = key.removesuffix("weight") + "bias"
-        if re.sub(r"\d", "", bias) not in known:
-            own[bias] = np.zeros(len(own[key]))
+        other = key.removesuffix("weight") + "bias"
+        if re.sub(r"\d", "", other) not in known:
+            own[other] = np.zeros(len(own[key]))
     return own
 
 

@@ -28,7 +28,7 @@ Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
 
 def _arrays(batch: Batch) -> Batch:
-    """Return a batch, or several, with arrays in the place of lists and numbers. Arrays and None stay as they are."""
+    """Return a batch, or several, with arrays in the place of lists and numbers. Arrays and None are kept."""
 
     def convert(x: Any) -> Any:
         return _arrays(x) if hasattr(x, "_fields") else x if x is None or hasattr(x, "shape") else jnp.asarray(x)

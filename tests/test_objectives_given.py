@@ -11,7 +11,7 @@ import pytest
 from tiny_models import tiny_config
 
 from anytouch_jax import objectives
-from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
+from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.step import init_state, make_step
 
@@ -61,6 +61,27 @@ def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeyp
     for result, given, (mean, std) in pairs:
         assert result.dtype == jnp.float32
         np.testing.assert_allclose(result, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5)
+
+
+def test_objectives_take_lists():
+    def lists(x):
+        return type(x)(*map(lists, x)) if hasattr(x, "_fields") else x if x is None else np.asarray(x).tolist()
+
+    text = np.ones((1, 8), np.int32), np.ones((1, 8), bool), np.asarray([1], np.int32)
+    align = AlignBatch(pixels(2, 3), SENSOR[:2], pixels(2), np.asarray([0, 2], np.int32), *text)
+    match = MatchBatch(pixels(2, 1), SENSOR[:2], pixels(2, 1), SENSOR[:2], pixels(2, 1), SENSOR[:2])
+    stages = (
+        (objectives.stage1_loss, TouchBatch(pixels(2, 4), SENSOR[:2])),
+        (objectives.stage2_loss, Stage2Batch(align, match)),
+    )
+    for stage, (loss, batch) in enumerate(stages, 1):
+        config = tiny_config(stage)
+        net = build(config.model)
+        for given, progress in ((batch, jnp.float32(0.5)), (lists(batch), 0.5)):
+            run = partial(loss, batch=given, key=jax.random.key(0), progress=progress, net=net, config=config)
+            value, metrics = jax.eval_shape(run, net.abstract())
+            assert value.shape == () and value.dtype == jnp.float32 and metrics
+            assert objectives.trained_by(given, config=config) == objectives.trained_by(batch, config=config)
 
 
 # Stage 2 ------------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ python integrations/unix_socket/touch_socket.py 0 digit /tmp/touch.sock gel.png
 
 import argparse
 import contextlib
+import errno
 import json
 import socket
 from pathlib import Path
@@ -13,10 +14,15 @@ from typing import Any
 
 def serve(embedded: Any, path: str) -> None:
     """Send each frame of a stream to all clients of the socket at `path`. A client that is too slow is dropped."""
-    clients: list[socket.socket] = []
+    clients, file = list[socket.socket](), Path(path)
+    if file.exists():
+        with socket.socket(socket.AF_UNIX) as old:
+            if not file.is_socket() or old.connect_ex(path) != errno.ECONNREFUSED:
+                raise SystemExit(f"{path} is in use. Stop the program that serves it, or choose another address.")
+        file.unlink()  # left by a program that was killed
     with socket.socket(socket.AF_UNIX) as server, contextlib.ExitStack() as stack:
         server.bind(path)
-        stack.callback(Path(path).unlink, missing_ok=True)
+        stack.callback(file.unlink, missing_ok=True)
         server.listen()
         server.setblocking(False)
         for frame in embedded:

@@ -1,13 +1,14 @@
 """Training objectives of both stages: Eq. 8 (stage 1) and Eq. 9 (stage 2), assembled from `ops` over a network.
 
 `*_terms` are deterministic: every random draw is an argument. The parity check runs them. `*_loss` normalise the
-pixels, draw masks and sensor tokens from a key, then call the terms. Training runs them.
+pixels, draw masks and sensor tokens from a key, then call the terms. Training runs them. Arrays may be numpy's, lists
+or numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,19 @@ Params = dict[str, Any]
 Metrics = dict[str, Array]
 
 
+Batch = TypeVar("Batch", bound=tuple[Any, ...])
+
+
+def _arrays(batch: Batch) -> Batch:
+    """Return a batch, or several, with arrays in the place of lists and numbers. Arrays and None are kept."""
+
+    def convert(x: Any) -> Any:
+        return _arrays(x) if hasattr(x, "_fields") else x if x is None or hasattr(x, "shape") else jnp.asarray(x)
+
+    parts: Any = [convert(x) for x in batch]
+    return type(batch)(*parts) if hasattr(batch, "_fields") else type(batch)(parts)
+
+
 def normalise_touch(clip: Array) -> Array:
     """Normalise uint8 RGB (..., 3) to float32 by ImageNet statistics (the release's choice for touch)."""
     return _normalise(clip, IMAGENET_MEAN, IMAGENET_STD)
@@ -34,6 +48,7 @@ def normalise_image(image: Array) -> Array:
 
 
 def _normalise(pixels: Array, mean: tuple[float, ...], std: tuple[float, ...]) -> Array:
+    pixels = jnp.asarray(pixels)
     shape = (1,) * (pixels.ndim - 1) + (3,)
     return (pixels.astype(jnp.float32) / 255.0 - jnp.asarray(mean).reshape(shape)) / jnp.asarray(std).reshape(shape)
 
@@ -48,6 +63,7 @@ def stage1_terms(
     rows of the token table, already drawn. `noise` (B, N) decides the masks. `decoder_sensor` i32 (B,): rows of the
     tokens that the decoder of the release gets.
     """
+    clip, sensor, noise = _arrays((clip, sensor, noise))
     if not config.objective.next_frame:
         clip = clip[:, : net.model.frames]
     pixels, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor)
@@ -65,6 +81,7 @@ def reconstruct(
 
     See `stage1_terms`. The encoder sees the first three frames only, whatever T is.
     """
+    clip, sensor, noise, decoder_sensor = _arrays((clip, sensor, noise, decoder_sensor))
     visible = tokens.count_visible(net.model.patches, config.objective.keep_ratio)
     keep_ids, restore_ids, hidden = tokens.random_mask(noise, visible)
     past = clip[:, : net.model.frames]
@@ -79,7 +96,7 @@ def stage1_loss(
 
     `progress` in [0, 1] drives p_u (Eq. 7).
     """
-    key_noise, key_universal = jax.random.split(key)
+    batch, (key_noise, key_universal) = _arrays(batch), jax.random.split(key)
     noise = jax.random.uniform(key_noise, (len(batch.sensor), net.model.patches))
     p_u, sensor = _draw_tokens(batch.sensor, key_universal, progress, net, config)
     clip = normalise_touch(batch.clip)
@@ -110,6 +127,7 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
     Every error has a predicted Laplace deviation (Kendall and Gal 2017, "What uncertainties do we need"). Pixels in
     contact weigh as much as all others together. `batch` has normalised pixels and drawn sensor rows.
     """
+    batch = _arrays(batch)
     out = net.measure(params, batch.clip, batch.sensor, batch.aspect)
     touched = (batch.pressure > TOUCHED).astype(jnp.float32)
     share = jnp.mean(touched)
@@ -152,6 +170,7 @@ def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tupl
 
     The first match decides. A parameter that is not trained has no gradient, and PyTorch's optimiser skips it.
     """
+    batch = _arrays(batch)
     align, match = (None, None) if isinstance(batch, TouchBatch) else batch[:2]
     pixels = batch if isinstance(batch, TouchBatch) else align if config.recipe == "release" else None
     frames = 0 if pixels is None else pixels.clip.shape[1]
@@ -192,6 +211,7 @@ def touch_embeddings(
     Batches of one shape share a pass of the encoder: one stack to compile and larger products. Their rows are
     interleaved, so that each row stays on its device. `keep_ids` (M, B, K): patches to keep of M batches.
     """
+    touches = [_arrays(touch) for touch in touches]
     z: list[Array] = [jnp.zeros(0)] * len(touches)
     for shape in {clip.shape: None for clip, _ in touches}:
         members = [i for i, (clip, _) in enumerate(touches) if clip.shape == shape]
@@ -214,6 +234,7 @@ def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Ne
     A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised floats. The content of
     an unused slot is replaced first: NaN would reach the gradients although the slot's value is dropped.
     """
+    batch, (touch,) = _arrays(batch), _arrays((touch,))
     image = text = has_image = has_text = None
     if batch.image.shape[0]:
         used = (batch.image_row < len(touch))[:, None, None, None]
@@ -221,7 +242,7 @@ def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Ne
         image, has_image = _scatter(packed, batch.image_row, len(touch))
     if batch.text.shape[0]:
         used = (batch.text_row < len(touch))[:, None]
-        ids, mask = jnp.where(used, batch.text, 0), batch.text_mask | ~used
+        ids, mask = jnp.where(used, batch.text, 0), batch.text_mask.astype(bool) | ~used
         packed = losses.normalise(net.encode_text(params, ids, mask))
         text, has_text = _scatter(packed, batch.text_row, len(touch))
     return Embeddings(touch, image, text, has_image, has_text)
@@ -243,7 +264,7 @@ def stage2_terms(
     release recipe adds the stage-1 loss of the align batch, if `noise` (B, N) is given. `match_noise` (M, B, N) decides
     which patches the M touches of matching keep; None keeps all.
     """
-    (align, match, _), objective = batch, config.objective
+    (align, match, _), objective = _arrays(batch), config.objective
     total, metrics = jnp.zeros(()), Metrics()
     aligned = [] if align is None else [(align.clip[:, : net.model.frames], align.sensor)]
     matched = [] if match is None else [(match.clip, match.sensor), (match.positive, match.positive_sensor)]
@@ -284,7 +305,7 @@ def stage2_loss(
 ) -> tuple[Array, Metrics]:
     """Return `stage2_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`; `progress` drives p_u."""
     key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
-    (align, match, fields), patches = batch, net.model.patches
+    (align, match, fields), patches = _arrays(batch), net.model.patches
     metrics, noise, own, match_noise = Metrics(), None, None, None
     if align is not None:
         own = align.sensor

@@ -63,7 +63,9 @@ def test_long_clips_are_segments_of_three(encoder, join, width):
 
 def test_what_cannot_be_embedded_is_one_sentence(encoder):
     for clips, word in (
-        (CLIPS.astype(np.float32), "float32"),
+        (CLIPS.astype(np.float32), r"float32.*np\.asarray\(frames, np\.uint8\)"),
+        (CLIPS[:, 0].tolist(), r"int64.*np\.asarray\(frames, np\.uint8\)"),
+        ([CLIPS[0, 0], CLIPS[0, 0, :5]], "differ in size"),
         (CLIPS[:, :, :27], "28 x 28"),
         (CLIPS[..., :1], r"preprocess"),
         (CLIPS[:, :0], "a clip needs 3 frames"),
@@ -358,8 +360,12 @@ def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
         np.testing.assert_array_equal(see(other), wanted)
     for other in (grey, grey[..., 0], grey[..., 0].astype(np.float64) / 255):
         np.testing.assert_array_equal(see(other), of_grey)
-    for bad in (rgb.astype(np.float32), rgb.astype(np.int32), rgb[None], np.zeros((0, 4, 3), np.uint8)):
-        with pytest.raises(UserError, match="the frame has"):
+    for bad, words in (
+        (rgb.astype(np.float32), "the frame has.*divide them by 255"), (rgb - 300.0, "the frame has.*scale them"),
+        (rgb.tolist(), r"the frame has.*np\.asarray\(frame, np\.uint8\)"), ([rgb[0], rgb[1, :3]], "differ in size"),
+        (rgb[None], "the frame has"), (np.zeros((0, 4, 3), np.uint8), "the frame has"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=words):
             see(bad)
     less = Preprocess(
         replace(encoder, config=replace(encoder.config, data=DataConfig(background="subtract"))), grey[..., 0]

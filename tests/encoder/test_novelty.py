@@ -62,8 +62,12 @@ def test_frames_of_one_recording_count_once():
 def test_too_few_recordings_promise_nothing(groups, is_finite):
     limit = novelty.conformal_limit(np.arange(groups, dtype=float), np.arange(groups), 0.9)
     assert np.isfinite(limit) == is_finite
-    with pytest.raises(UserError, match="between 0 and 1"):
-        novelty.conformal_limit(np.zeros(groups), np.arange(groups), 1.0)
+    for share in (0.0, 1.0, np.nan):
+        with pytest.raises(UserError, match="between 0 and 1"):
+            novelty.conformal_limit(np.zeros(groups), np.arange(groups), share)
+    for scores in ([], [np.nan] * groups, [0.5] * (groups - 1)):
+        with pytest.raises(UserError, match="without NaN"):
+            novelty.conformal_limit(scores, np.arange(len(scores) // groups * groups), 0.9)
 
 
 @pytest.mark.parametrize("columns", [1, 5])

@@ -70,6 +70,12 @@ def test_a_space_in_figures() -> None:
     assert describe(by_sensor, ["digit"] * 60, objects, touches).alignment is None  # no pair by two sensors
 
 
+@pytest.mark.parametrize("shape", [(9, 1), (3, 4), (9,), (0, 0)])
+def test_tsne_of_too_little_is_one_sentence(shape) -> None:
+    with pytest.raises(UserError, match="4 rows of 2 columns"):
+        tsne(np.ones(shape))
+
+
 def test_tsne_keeps_clusters_apart_and_repeats_itself() -> None:
     labels = np.repeat([0, 1, 2], 20)
     features = noise(60) * 0.2 + 5 * np.eye(8)[labels]

@@ -14,6 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from markdown_it import MarkdownIt
+from markdown_it.common.utils import escapeHtml
 from touch_world import SENSORS, make_touches
 
 from anytouch_jax.config import from_json, to_json
@@ -33,7 +35,7 @@ from anytouch_jax.evaluate.report import (
     write_report,
 )  # fmt: skip
 from anytouch_jax.evaluate.retrieval import MatchScore, cross_sensor_retrieval
-from anytouch_jax.evaluate.statistics import markdown_table
+from anytouch_jax.evaluate.statistics import as_text, markdown_table
 from anytouch_jax.weights import checkpoint
 
 NAMES = (RANDOM, "stage 1", "stage 2")
@@ -44,6 +46,39 @@ def pictures_of(report: Path) -> list[Path]:
     found = [report.parent / one for one in re.findall(r"!\[[^]]*\]\(([^)]+)\)", report.read_text())]
     assert all(cv2.imread(str(one)) is not None for one in found)
     return found
+
+
+HOSTILE = (
+    'a soft <img src=x onerror="document.title=1"> cup', "<script>alert(1)</script>", "edge a<b && b>a",
+    "a &lt;b&gt; c", "[here](javascript:alert(1)) and ![x](figures/secret.png)", "</title><b>x</b>",
+    "*a* __b__ `c` ~~d~~ my_cup e\\", "<!-- x -->", "<https://x.org>", "![x](figures/../secret.png)",
+    "two\nlines | and a bar",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_the_text_of_a_user_is_shown_as_text(text: str, tmp_path: Path) -> None:
+    (tmp_path / "secret.png").write_bytes(b"of another folder")
+    line = " ".join(text.split())
+    trusting = MarkdownIt("commonmark", {"html": True}).enable("table")  # as pages of the documentation are made
+    assert trusting.render(f"1. {as_text(text)}") == f"<ol>\n<li>{escapeHtml(line)}</li>\n</ol>\n"
+    table = trusting.render(markdown_table((text, "b"), [(text, 1)]))
+    assert set(re.findall(r"</?([a-z!]+)", table)) <= {
+        "table",
+        "thead",
+        "tbody",
+        "tr",
+        "th",
+        "td",
+        "em",
+        "strong",
+        "code",
+    }
+    write_report(tmp_path, [Section(text, text, markdown_table((text,), [(text,)]), notes=f"- {text}")], title=text)
+    page = (tmp_path / "report.html").read_text()
+    assert not re.search(r"<(script|b>|img [^>]*onerror|a [^>]*script|!--)", page) and "of another" not in page
+    policy = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]+)">', page)
+    assert policy and "default-src 'none'" in policy[1] and "script-src" not in policy[1]
 
 
 def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:

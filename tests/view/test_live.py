@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import http.client
 import json
+import socket
 import struct
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import uvicorn
 from starlette.testclient import TestClient
 from view_world import DEPTHS
 
@@ -38,13 +45,14 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
     live = Live(str(film), encoder, sensor="digit", out=tmp_path / "recorded", log=lambda _: None)
     page = TestClient(server.app([live]), "http://127.0.0.1", raise_server_exceptions=False)
     live.start()
+    runner = asyncio.Runner()
     try:
         packets = live.packets()
 
         def until(wanted) -> dict:
-            return next(about for about in (opened(next(packets))[0] for _ in range(500)) if wanted(about))
+            return next(about for about in (opened(runner.run(anext(packets)))[0] for _ in range(500)) if wanted(about))
 
-        first, jpeg = opened(next(packets))
+        first, jpeg = opened(runner.run(anext(packets)))
         assert first["contact"] is None and first["panels"] == 1 and jpeg[:2] == b"\xff\xd8"
         assert until(lambda about: about["frame"] > 15)["picture"] == "ok"  # the film begins again
         assert page.post("/api/0/control", json={"do": "background"}).status_code == 403  # another site
@@ -71,6 +79,49 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
     for row in range(len(table)):
         assert decode(table.file(row)).shape == decode(table.file(row, "background_path")).shape == (48, 48, 3)
     assert sorted(path.name[0] for path in (tmp_path / "recorded").iterdir()) == ["2", "2", "m"]  # nothing hidden
+
+
+def test_a_stopped_camera_does_not_stop_the_page(encoder, film):
+    live, open_streams = Live(str(film), encoder, sensor="digit"), set()
+    plain = live.packets
+
+    async def counted():
+        open_streams.add(me := object())
+        try:
+            async for packet in plain():
+                yield packet
+        finally:
+            open_streams.discard(me)
+
+    live.packets = counted
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    running = uvicorn.Server(uvicorn.Config(server.app([live]), log_level="error", lifespan="off"))
+    thread = threading.Thread(target=running.run, args=([listener],), daemon=True)
+    thread.start()
+
+    def wait_for(count: int) -> None:
+        end = time.monotonic() + 10
+        while len(open_streams) != count and time.monotonic() < end:
+            time.sleep(0.02)
+        assert len(open_streams) == count
+
+    request = f"GET /api/0/stream HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode()
+    try:
+        for packet in (b"", b"the last one"):  # before the first frame, and after the last
+            live._newest = (len(packet), packet)
+            with contextlib.ExitStack() as pages:
+                for _ in range(60):  # the server has 40 threads
+                    pages.enter_context(socket.create_connection(("127.0.0.1", port))).sendall(request)
+                wait_for(60)
+                page = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+                page.request("GET", "/")
+                assert page.getresponse().status == 200
+                page.close()
+            wait_for(0)  # streams end when their pages leave
+    finally:
+        running.should_exit = True
+        thread.join(10)
 
 
 def test_frames_before_a_full_disk_are_kept(tmp_path, monkeypatch):

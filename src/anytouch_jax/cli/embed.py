@@ -312,15 +312,16 @@ def _write_columns(root: Path, column: str, features: Features) -> None:
     """Write features into a LeRobot data set, a column for each camera. Raises UserError for another manifest."""
     import numpy as np
 
-    from anytouch_jax.data.readers.lerobot import write_features
+    from anytouch_jax.data.readers.lerobot import camera_names, write_features
 
     if "index" not in features.keys or not (root / "meta" / "info.json").is_file():
         raise UserError(f"--column is for a manifest that `data index lerobot` wrote into the data set, not in {root}")
-    units = np.unique(features.keys["unit"])
-    for unit in units:
-        own = features.keys["unit"] == unit
-        name = column if len(units) == 1 else f"{column}.{unit.rpartition('.')[2]}"
-        write_features(root, name, features.values[own], features.keys["index"][own])
+    unit, numbers = features.keys["unit"], features.keys["index"]
+    cameras = np.unique(unit).tolist()
+    names = [column] if len(cameras) == 1 else [f"{column}.{name}" for name in camera_names(cameras)]
+    rows = [unit == camera for camera in cameras]
+    write_features(root, {name: (features.values[own], numbers[own]) for name, own in zip(names, rows, strict=True)})
+    for name, own in zip(names, rows, strict=True):
         print(f"{root}: {own.sum()} features as {name}")
 
 

@@ -150,10 +150,14 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
         if np.isnan(low):
             raise ImageError(f"{path} has NaN pixels")
         if low < 0 or high > 1:
-            raise ImageError(f"{path} has float pixels in {low:g}..{high:g}; floats must lie in 0..1")
+            advice = "divide them by 255" if low >= 0 and high <= 255 else "scale them first"
+            raise ImageError(f"{path} has float pixels in {low:g}..{high:g}; floats must lie in 0..1: {advice}")
         pixels = np.rint(pixels.astype(np.float32) * 255).astype(np.uint8)
     elif pixels.dtype != np.uint8:
-        raise ImageError(f"{path} has pixels of type {pixels.dtype}; use uint8, uint16 or floats in 0..1")
+        raise ImageError(
+            f"{path} has pixels of type {pixels.dtype}; use uint8, uint16 or floats in 0..1, for a list "
+            "np.asarray(frame, np.uint8)"
+        )
     if pixels.shape[2] == 1:
         pixels = np.repeat(pixels, 3, axis=2)
     return np.ascontiguousarray(pixels)

@@ -20,6 +20,26 @@ def binary_scale(values: np.ndarray, axis: int | None = None) -> np.ndarray:
     return np.frexp(np.abs(values).max(axis=axis, keepdims=True, initial=0.0))[1]
 
 
+def as_array(values: Any, name: str) -> np.ndarray:
+    """Return an array of an array-like. Raises UserError for lists of unequal lengths."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise UserError(
+            f"{name} must be one array; its parts differ in size, so bring them to one size first"
+        ) from None
+
+
+def filled(batch: np.ndarray) -> np.ndarray:
+    """Return a batch (n, ...) with zeros up to the next of 1, 2, 4, ... 64, 128, 192, ... rows.
+
+    A program is compiled for each number of rows, for seconds. So every number would be too many.
+    """
+    count = len(batch)
+    size = 1 << max(count - 1, 0).bit_length() if count <= 64 else -(-count // 64) * 64
+    return batch if count == size else np.concatenate([batch, np.zeros((size - count, *batch.shape[1:]), batch.dtype)])
+
+
 def unit_rows(values: np.ndarray) -> np.ndarray:
     """Return rows (n, d) divided by their Euclidean norms, of any magnitude; a row of zeros stays zero."""
     values = np.ldexp(values, -binary_scale(values, 1))

@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -22,8 +22,9 @@ from anytouch_jax.data.gels import RunningGel, other_unit, same_unit, untouched_
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
-from anytouch_jax.encoder.arrays import rows_of_sensors
+from anytouch_jax.encoder.arrays import as_array, filled, rows_of_sensors, unit_rows
 from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
+from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
@@ -73,6 +74,9 @@ class Encoder:
             "features": str(model.embed),
             "sensors": f"trained on {', '.join(trained)}" if trained else ", ".join(model.sensors),
         }
+
+    def __getstate__(self) -> dict[str, Any]:  # compiled programs stay in their process
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def net(self) -> Net:
@@ -148,6 +152,10 @@ class Encoder:
         """Return an untrained encoder of the same form: the control of every probe."""
         return random_encoder(self.config, seed)
 
+    def bare(self) -> Encoder:
+        """Return what prepares frames, without parameters."""
+        return Encoder(self.config, {}, self.source)
+
     def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., jax.Array]:
         """Return the function from params, touches u8 (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
         return partial(touch_features, net=self.net, pooling=pooling, join=join)
@@ -185,22 +193,23 @@ class Encoder:
         frames = as_clips(frames)
         side = self.config.model.image_size
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
+            convert = (
+                "" if frames.dtype == np.uint8 else "convert values 0 to 255 by np.asarray(frames, np.uint8), and "
+            )
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {frames.dtype} "
-                f"{frames.shape}; resize each frame with encoder.preprocess(frame)"
+                f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
             )
         check_frames(self.config.model, frames.shape[1])
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
 
     def _encode(self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any) -> np.ndarray:
-        """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled once for each `key`."""
+        """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled for a few B and `key`s."""
         rows = rows_of_sensors(sensor, len(clips), self.sensor_row, len(self.config.model.sensors))
         if key not in self._compiled:
             self._compiled[key] = jax.jit(run)
-        if not (count := len(clips)):  # the network has no shape for nothing: embed one touch and return none
-            clips, rows = np.zeros((1, *clips.shape[1:]), clips.dtype), np.zeros(1, np.int32)
         with precision(self.config):
-            return np.asarray(self._compiled[key](self._placed, clips, rows))[:count]
+            return np.asarray(self._compiled[key](self._placed, filled(clips), filled(rows)))[: len(clips)]
 
     @cached_property
     def _placed(self) -> Params:
@@ -257,7 +266,7 @@ class Encoder:
         return self._embeddings(tower, zip(ids, mask, strict=True), batch)
 
     def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:
-        values = run_in_batches(tower, items, batch)
+        values = run_in_batches(lambda part: tower(jax.tree.map(filled, part)), items, batch)
         return values if len(values) else np.zeros((0, self.config.model.embed), np.float32)
 
     def similarity(
@@ -273,11 +282,11 @@ class Encoder:
         Raises UserError without a text tower. Training with `center_embeddings` subtracted the batch mean first.
         """
         embeddings = texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts)  # type: ignore[arg-type]
-        z_touch, z_text = _unit(touch), _unit(embeddings)
+        z_touch, z_text = np.asarray(touch, np.float32), np.asarray(embeddings, np.float32)
         if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
             width = z_text.shape[-1]
             raise UserError(f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}")
-        cosine = z_touch @ z_text.T
+        cosine = unit_rows(z_touch) @ unit_rows(z_text).T
         if not probabilities:
             return np.asarray(np.clip(cosine, -1, 1))
         scale = self._part("scale", lambda net, params: net.scale(params), "logit_scale")
@@ -286,14 +295,18 @@ class Encoder:
     def match(self, first: npt.ArrayLike, second: npt.ArrayLike) -> np.ndarray:
         """Return matching logits f32 (B,) of two sets of touch features (B, E), pooling class (Eq. 5).
 
-        A positive logit predicts the same place. Raises UserError without a matching head.
+        A positive logit predicts the same place. Raises UserError without a matching head, and for other shapes.
         """
 
         def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
             return net.match(params, losses.normalise(first), losses.normalise(second))
 
-        head = self._part("match", run, "matcher")
-        return np.asarray(head(np.asarray(first, np.float32), np.asarray(second, np.float32)))
+        head, one, other = self._part("match", run, "matcher"), *(np.asarray(x, np.float32) for x in (first, second))
+        if one.shape != other.shape or one.ndim != 2:
+            raise UserError(
+                f"match takes two sets of touch features (B, E) of one shape, not {one.shape}, {other.shape}"
+            )
+        return np.asarray(head(filled(one), filled(other)))[: len(one)]
 
     def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
         """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
@@ -338,13 +351,14 @@ class Preprocess:
     ) -> None:  # fmt: skip
         if background is not None and frames is not None:
             raise UserError("Give a background, or the frames that it is taken from, not both.")
-        self._prepare, self._subtracts = encoder.prepare, encoder.subtracts
+        self._prepare = encoder.bare().prepare  # workers get no parameters
+        self._subtracts = encoder.subtracts
         self._orient = partial(orient_frame, rotate=rotate, flip=flip)
         self._known, self._log = dict(known or {}), log
         self._running = RunningGel() if encoder.needs_background or self._known else None
         self._background = None if frames is None else untouched_gel(frames)
         if background is not None:
-            self._background = to_rgb(np.asarray(background), "the background")
+            self._background = to_rgb(as_array(background, "the background"), "the background")
         self._gel: tuple[np.ndarray | None, np.ndarray] = None, np.zeros((0, 0, 3), np.uint8)
 
     @property
@@ -369,7 +383,7 @@ class Preprocess:
 
         `frame` is RGB u8 (h, w, 3), or grey, RGBA, u16 or floats in 0..1. Raises ImageError for any other.
         """
-        frame = to_rgb(np.asarray(frame), "the frame")
+        frame = to_rgb(as_array(frame, "the frame"), "the frame")
         if self._background is None and self._known:
             known, self._known = self._known, {}
             gel, why = same_unit(known, frame)
@@ -386,12 +400,12 @@ class Preprocess:
         return self._prepare(frame, self._gel[1])
 
 
-def _unit(values: npt.ArrayLike) -> np.ndarray:
-    return np.asarray(losses.normalise(jnp.asarray(values, jnp.float32)))
-
-
 def precision(config: Config) -> AbstractContextManager[Any]:
-    """Return a context in which jax has 64 bits for a float64 model, and 32 for others, whatever JAX_ENABLE_X64 is."""
+    """Return a context in which jax has 64 bits for a float64 model, and 32 for others, whatever JAX_ENABLE_X64 is.
+
+    Raises UserError in a process that cannot use jax, see `refuse_forked`.
+    """
+    refuse_forked()
     return jax.enable_x64(config.model.dtype == "float64")
 
 
@@ -402,8 +416,8 @@ def check_frames(model: ModelConfig, frames: int) -> None:
 
 
 def as_clips(frames: Any) -> np.ndarray:
-    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips (B, T, H, W, 3)."""
-    frames = np.asarray(frames)
+    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips. Raises UserError for frames of two sizes."""
+    frames = as_array(frames, "frames")
     return frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
 
 

@@ -49,8 +49,7 @@ def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: i
 
     Items are arrays, which are stacked, or tuples of arrays, which are stacked one by one. The last batch is filled up
     with its last item, so that `function` is compiled for one shape. Fewer items than `size` are one batch of their
-    number. Without items the result is empty, of shape (0,). This is the only place that pads batches. Raises UserError
-    for results that are not finite.
+    number. Without items the result is empty, of shape (0,). Raises UserError for results that are not finite.
     """
     values, left = list[np.ndarray](), iter(items)
     while part := list(islice(left, size)):

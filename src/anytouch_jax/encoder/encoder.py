@@ -22,10 +22,11 @@ from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import export
 from anytouch_jax.encoder.arrays import rows_of_sensors
-from anytouch_jax.encoder.base import Encoder, check_frames, random_encoder, touch_features, touch_only
+from anytouch_jax.encoder.base import Encoder, as_clips, check_frames, random_encoder, touch_features, touch_only
 from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
+from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 from anytouch_jax.shown import shown_short
@@ -45,15 +46,16 @@ def load_encoder(
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
     An .onnx file of `anytouch export` runs on onnxruntime, see `load_engine`.
-    Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, ViT-MAE, ViT and DeiT). `heads` is
-    their number of attention heads, where neither the file nor a config.json next to it has it. `image_size` (a side,
-    or height and width) changes the size of their images. Then the result is a `FamilyEncoder`.
+    Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, DINOv3, SigLIP, ViT-MAE, ViT, DeiT).
+    `heads` is their number of attention heads, where neither the file nor a config.json next to it has it. `image_size`
+    (a side, or height and width) changes the size of their images. Then the result is a `FamilyEncoder`.
 
     Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
     are .pth, .bin, .safetensors or .npz. `step` chooses a checkpoint of a run, the latest by default. Image and text
     towers are loaded too, if there are any. Raises UserError for weights without a touch encoder, or with values that
-    are not finite.
+    are not finite, and in a process that was forked from one that has used jax.
     """
+    refuse_forked()
     name, path, names = str(path), registry.locate(path), set[str]()
     if path.suffix == ".npz":
         with suppress(OSError, ValueError):  # the reader of weights reports a damaged file
@@ -107,8 +109,7 @@ class EngineEncoder(Encoder):
         self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
         join: Join = "mean",
     ) -> np.ndarray:  # fmt: skip
-        frames, about = np.asarray(frames), self.run.about
-        frames = frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+        frames, about = as_clips(frames), self.run.about
         if pooling != about["pooling"]:
             raise UserError(f"{self.source} has pooling {about['pooling']}, not {pooling}; export it again with that")
         rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from base64 import b64decode, b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,7 +24,8 @@ from jax import export as jax_export
 from anytouch_jax.config import UNIVERSAL, parse_json, to_json
 from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.encoder import engines
-from anytouch_jax.encoder.arrays import rows_of_sensors, unit_rows
+from anytouch_jax.encoder.arrays import as_array, filled, rows_of_sensors, unit_rows
+from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
 from anytouch_jax.shown import described
@@ -62,7 +64,26 @@ class Exported:
     """An exported encoder. `about` is its JSON description; call it with touches and a sensor."""
 
     about: dict[str, Any]
-    _run: Any = field(repr=False)
+    _data: bytes = field(repr=False)
+    _engine: Engine | None = None
+
+    def __getstate__(self) -> dict[str, Any]:  # what runs stays in its process
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+    @cached_property
+    def _running(self) -> dict[int, Any]:
+        """What runs by the id of its process: a forked one has none of its threads."""
+        return {}
+
+    @property
+    def _run(self) -> Any:
+        if (process := os.getpid()) not in self._running:
+            if self.about["form"] == "onnx":
+                run: Any = engines.session(self._data, self._engine or "onnxruntime")
+            else:
+                run = jax.jit(jax_export.deserialize(bytearray(self._data)).call)
+            self._running[process] = run
+        return self._running[process]
 
     def __repr__(self) -> str:
         return described(
@@ -79,15 +100,18 @@ class Exported:
         `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape or type, and for a sensor
         that the model does not know.
         """
-        frames = np.asarray(frames)
+        frames = as_array(frames, "frames")
         side, kind = self.about["image_size"], self.about.get("frame_dtype", "uint8")
         wanted = (self.about["frames"], *self.about.get("frame_shape", (side, side, 3)))
         if frames.dtype != kind or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
             shape = ", ".join(str(size) for size in wanted)
             raise UserError(f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
         rows = rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
-        with jax.enable_x64(self.about["dtype"] == "float64"):
+        if self.about["form"] == "onnx":
             return np.asarray(self._run(frames, rows))
+        refuse_forked()
+        with jax.enable_x64(self.about["dtype"] == "float64"):
+            return np.asarray(self._run(filled(frames), filled(rows)))[: len(frames)]
 
     @property
     def gels(self) -> dict[str, np.ndarray]:
@@ -122,10 +146,9 @@ def load(path: str | Path, engine: Engine | None = None) -> Exported:
             f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs jax on {_here()}; "
             "export it again for this machine"
         )
+    exported = Exported(about, data, engine)
     try:
-        if form == "onnx":
-            return Exported(about, engines.session(data, engine or "onnxruntime"))
-        module = jax_export.deserialize(bytearray(data))
+        exported._run  # noqa: B018  a damaged file is found here
     except UserError:
         raise
     except Exception as error:  # its checksum is right, so it was written by another version
@@ -134,7 +157,7 @@ def load(path: str | Path, engine: Engine | None = None) -> Exported:
             f"{path} cannot be read by {reader}, it was exported by {about['jax']} "
             f"({' '.join(str(error).split())[:200]}); export it again"
         ) from None
-    return Exported(about, jax.jit(module.call))
+    return exported
 
 
 def export(

@@ -89,8 +89,12 @@ class FamilyEncoder(Encoder):
         with precision(self.config):
             fresh = self.part.init(jax.random.key(seed))
             fresh = jax.tree.map(lambda x, trained: jnp.broadcast_to(x, trained.shape), fresh, self.params)
-        computed = {name: self.params[name] for name in ("frequency",) if name in fresh}
+        computed = {name: self.params[name] for name in ("frequency", "periods") if name in fresh}
         return replace(self, params=fresh | computed, source=f"random({seed})")
+
+    def bare(self) -> Encoder:
+        """Return what prepares frames, without parameters."""
+        return replace(self, params={})
 
     def sensor_row(self, name: str, log: Log = warn) -> int:
         """Return the row of a sensor. A family without sensors ignores it, which is logged once."""
@@ -243,7 +247,7 @@ def pooled(family: Family, form: VitConfig, output: VitOutput, pooling: Pooling)
     own = {"class": output.normed, "mean": output.normed}.get(family.feature, output.projected)[:, 0]
     if family.feature == "unit":
         own = losses.normalise(own)
-    own = mean if family.feature == "mean" else own
+    own = mean if family.feature == "mean" or (family.feature == "pooled" and not form.pool) else own
     return {"class": own, "mean": mean}[pooling] if pooling != "both" else jnp.concatenate([own, mean], axis=-1)
 
 
@@ -310,7 +314,8 @@ def describe_family(encoder: FamilyEncoder) -> list[str]:
     frames = "one frame" if form.model.frames == 1 else f"{form.model.frames} frames, {steps.stride} apart,"
     names = ", ".join(name for name in form.model.sensors if name != UNIVERSAL)
     settings = (f"{name} {value}" for name, value in asdict(steps).items() if value not in (False, "none", None))
-    feature = {"mean": "the mean of its patch tokens", "unit": "a unit-norm embedding"}.get(encoder.family.feature)
+    kinds = {"mean": "the mean of its patch tokens", "unit": "a unit-norm embedding", "pooled": "from its pooling head"}
+    feature = kinds.get("mean" if encoder.family.feature == "pooled" and not form.pool else encoder.family.feature)
     return [
         f"{encoder.family.title}: {count:.1f} M parameters, width {form.model.touch.width}, depth "
         f"{form.model.touch.depth + form.trunk}, {form.model.touch.heads} heads",

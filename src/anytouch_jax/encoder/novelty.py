@@ -188,10 +188,15 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
 
     `scores` (n,) are calibration scores of rows in `groups` (n,), which have equal weight. The limit covers each group
     in turn by the others. At most it is the limit for groups of equal rows, with one more group that is infinite. It is
-    infinite below share / (1 - share) groups. Raises UserError for a `share` outside 0..1.
+    infinite below share / (1 - share) groups. Raises UserError for a `share` outside 0..1, no scores or NaN.
     """
+    scores, groups = np.asarray(scores, np.float64), np.asarray(groups)
     if not 0 < share < 1:
         raise UserError(f"A coverage must lie between 0 and 1, not {share:g}.")
+    if not scores.size or scores.shape != groups.shape or np.isnan(scores).any():
+        raise UserError(
+            f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape}, {groups.shape}."
+        )
     order = np.argsort(scores, kind="stable")
     scores, ids = scores[order], np.unique(groups, return_inverse=True)[1][order]
     count, weights = ids.max() + 1, group_weights(ids)

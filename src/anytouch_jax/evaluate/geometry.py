@@ -63,13 +63,13 @@ def silhouette(features: Array, labels: Any) -> float | None:
 
 
 def tsne(features: Array, *, seed: int = 0) -> Array:
-    """Return a t-SNE of features (n, d) by cosine distance, f32 (n, 2). Raises UserError below 4 rows."""
+    """Return a t-SNE of features (n, d) by cosine distance, f32 (n, 2). Raises UserError below 4 rows or 2 columns."""
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits
 
+    if (features := np.asarray(features)).ndim != 2 or features.shape[0] < 4 or features.shape[1] < 2:
+        raise UserError(f"A t-SNE needs 4 rows of 2 columns or more, not {features.shape}.")
     x = _unit(features)
-    if len(x) < 4:
-        raise UserError(f"A t-SNE needs 4 rows or more, not {len(x)}.")
     # Squared Euclidean distances of unit-norm rows are twice the cosine distances.
     model = TSNE(perplexity=min(30.0, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed)
     with threadpool_limits(1):  # its threads wait for each other at every step, very long on a busy machine

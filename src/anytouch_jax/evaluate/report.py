@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 import re
 import tempfile
@@ -86,18 +87,28 @@ def write_report(
 
 
 def html_page(text: str, folder: Path, title: str) -> str:
-    """Return Markdown as an HTML page of one file. Its pictures, whose paths are relative to `folder`, lie inside."""
+    """Return Markdown as an HTML page of one file. Pictures of `folder`/figures lie inside.
+
+    HTML in the Markdown is shown as text. The page runs no script and loads nothing.
+    """
     from markdown_it import MarkdownIt
 
     def inside(match: re.Match[str]) -> str:
-        return f'src="data:image/png;base64,{base64.b64encode((folder / match[1]).read_bytes()).decode()}"'
+        path = folder / "figures" / match[1]
+        data = path.read_bytes() if path.suffix == ".png" and path.is_file() else b""
+        return f'src="data:image/png;base64,{base64.b64encode(data).decode()}"'
 
-    body = re.sub(r'src="(figures/[^"]+)"', inside, MarkdownIt().enable("table").render(text))
+    body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
+    body = re.sub(r'src="figures/([^"/\\]+)"', inside, body)
     style = (
         "body{font:16px/1.5 sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}img{max-width:100%}"
         "table{border-collapse:collapse;display:block;overflow-x:auto}td,th{border:1px solid #ccc;padding:.2em .6em}"
     )
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>'
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+    head = (
+        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
+        f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+    )
     return f'<!doctype html>\n<html lang="en"><head>{head}<style>{style}</style></head>\n<body>{body}</body></html>\n'
 
 
@@ -161,7 +172,8 @@ def _lineage(stage1: Path, second: Encoder) -> str:
         return "Stage 2 started from no run, so this stage 1 is no part of it."
     began = Path(init)
     same = began.resolve() == stage1.resolve() or (not began.exists() and began.name == stage1.resolve().name)
-    return "" if same else f"Stage 2 started from another run ({began.name}), so this stage 1 is no part of it."
+    name = statistics.as_text(began.name)
+    return "" if same else f"Stage 2 started from another run ({name}), so this stage 1 is no part of it."
 
 
 def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Section:
@@ -208,9 +220,11 @@ def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[
         suffix = "".join(letter if letter.isalnum() else "_" for letter in f"_{grade}" if grade)
         path = folder / "figures" / f"samples{suffix}.png"
         plots.sample_grid(path, images, titles, [*names, "photograph"])
-        notes = "\n".join(f"{i + 1}. *{title}*: {captions[i]}" for i, title in enumerate(titles))
+        lines = zip(*(map(statistics.as_text, texts) for texts in (titles, captions)), strict=True)
+        notes = "\n".join(f"{i}. *{title}*: {caption}" for i, (title, caption) in enumerate(lines, 1))
         text = "Rows are touches, columns are sensors, each at the deepest frame. Captions are below."
-        sections.append(Section(f"Samples{', ' if grade else ''}{grade}", text, figure=path, notes=notes))
+        title = f"Samples{', ' if grade else ''}{statistics.as_text(grade)}"
+        sections.append(Section(title, text, figure=path, notes=notes))
     return sections
 
 
@@ -278,7 +292,7 @@ def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) 
     image = reconstruction_panels(params, batch.clip, batch.sensor, net=encoder.net, config=config)
     path = folder / "figures" / "reconstructions.png"
     atomic_write(path, encode(image))
-    names = ", ".join(manifest.text_column("sensor")[rows])
+    names = ", ".join(map(statistics.as_text, manifest.text_column("sensor")[rows]))
     share = f"{config.objective.keep_ratio:.0%}".replace("%", " %")
     text = f"Stage 1 reads {share} of the patches of a held-out object. From above: {names}."
     title, table = "Reconstructions", ""
@@ -517,7 +531,7 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
 
 
 def _listed(notes: Sequence[str]) -> str:
-    return "\n".join(f"- {note}" for note in notes)
+    return "\n".join(f"- {statistics.as_text(note)}" for note in notes)
 
 
 def _shares(value: float, low: float | None = None, high: float | None = None, sign: str = "") -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -133,8 +134,8 @@ def plain(value: Any) -> Any:
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]], align: str = "") -> str:
     """Return a Markdown table; use it wherever a page, a report or a command prints one.
 
-    Cells are converted to text; bars and line breaks in them are escaped. `align` has a letter per column, l or r for
-    left or right; without it the reader's program decides.
+    Cells are converted to text; bars, line breaks, HTML and links in them are escaped. `align` has a letter per
+    column, l or r for left or right; without it the reader's program decides.
 
     >>> print(markdown_table(("sensor", "recall@1"), [("digit", 0.5)], "lr"))
     | sensor | recall@1 |
@@ -143,5 +144,16 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]], align: 
     """
     marks = {"l": ":---", "r": "---:"}
     rule = [marks[letter] for letter in align] if align else ["---"] * len(header)
-    lines = [[" ".join(str(cell).split()).replace("|", "\\|") for cell in line] for line in (header, rule, *rows)]
+    lines = [[_without_html(cell).replace("|", "\\|") for cell in line] for line in (header, rule, *rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _without_html(value: Any) -> str:
+    """Return one line of Markdown without HTML and links, whatever the value says."""
+    text = re.sub(r"&(?=#?\w+;)", "&amp;", " ".join(str(value).split()))
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(")
+
+
+def as_text(value: Any) -> str:
+    """Return one line of Markdown that a reader sees as the value is written: for names and captions of a user."""
+    return re.sub(r"[\\`*\[\]~]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", _without_html(value).replace("]\\(", "]("))

@@ -17,6 +17,7 @@ from anytouch_jax.config import ModelConfig, Stack
 from anytouch_jax.nn.attention import attention
 
 Activation = Callable[[Array], Array]
+Turn = Callable[[Array], Array]
 
 
 def stored(dtype: DTypeLike) -> jnp.dtype:
@@ -200,9 +201,10 @@ class Block(nnx.Module):
         self.norm2 = LayerNorm(stack.width, eps, model.dtype)
         self.mlp = Mlp(stack.width, stack.mlp, model, act)
 
-    def __call__(self, x: Array, *, causal: bool = False, mask: Array | None = None) -> Array:
-        heads = self.attention.attend(*self._before(x), causal=causal, mask=mask)
-        return self._after(x, heads)
+    def __call__(self, x: Array, *, causal: bool = False, mask: Array | None = None, turn: Turn | None = None) -> Array:
+        q, k, v = self._before(x)
+        q, k = (q, k) if turn is None else (turn(q), turn(k))
+        return self._after(x, self.attention.attend(q, k, v, causal=causal, mask=mask))
 
     def first(self, x: Array) -> Array:
         """Return `__call__` for the first token of each row, (B, D). Other tokens need only keys and values."""
@@ -228,11 +230,16 @@ def stacked_blocks(
     return nnx.vmap(lambda: kind(stack, model, eps, act), axis_size=stack.depth)()
 
 
-def run_blocks(blocks: Block, x: Array, *, remat: bool, causal: bool = False, mask: Array | None = None) -> Array:
-    """Send `x` (B, S, D) through stacked blocks by lax.scan, so that compile time does not grow with depth."""
+def run_blocks(
+    blocks: Block, x: Array, *, remat: bool, causal: bool = False, mask: Array | None = None, turn: Turn | None = None
+) -> Array:
+    """Send `x` (B, S, D) through stacked blocks by lax.scan, so that compile time does not grow with depth.
+
+    `turn` changes queries and keys (B, S, H, D / H) in each block, by their places.
+    """
 
     def body(x: Array, block: Block) -> Array:
-        return block(x, causal=causal, mask=mask)
+        return block(x, causal=causal, mask=mask, turn=turn)
 
     body = nnx.remat(body) if remat else body
     return nnx.scan(body, in_axes=(nnx.Carry, 0), out_axes=nnx.Carry)(x, blocks)

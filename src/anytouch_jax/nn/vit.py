@@ -1,20 +1,25 @@
-"""Plain vision transformers, in the forms of other tactile encoders and of DINOv2, MAE and DeiT."""
+"""Plain vision transformers, in the forms of other tactile encoders and of DINOv2, DINOv3, SigLIP, MAE and DeiT."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
 
-from anytouch_jax.config import ModelConfig
+from anytouch_jax.config import ModelConfig, Stack
 from anytouch_jax.nn.layers import (
+    Activation,
+    Attention,
     Block,
     Dense,
     LayerNorm,
+    Mlp,
     gelu,
     lean,
     product,
@@ -52,6 +57,9 @@ class VitConfig:
     calibration: int = 0  # Images of one second patch kernel (SITR).
     outputs: int = 0  # Values of a projection of the normed tokens. 0: there is none.
     output_bias: bool = False
+    rotary: bool = False  # Patches turn queries and keys (DINOv3) and have no positions.
+    tanh: bool = False  # GELU by tanh.
+    pool: bool = False  # A learned query reads the normed tokens (SigLIP). Its output takes the place of a projection.
 
     @property
     def start(self) -> int:
@@ -92,6 +100,23 @@ class ScaledBlock(Block):
         return x + self.scale2(self.mlp(self.norm2(x)))
 
 
+class AttentionPool(nnx.Module):
+    """A learned query that attends to all tokens, then an MLP."""
+
+    def __init__(self, stack: Stack, model: ModelConfig, act: Activation) -> None:
+        self.probe = table(stack.width)
+        self.attention = Attention(stack, model)
+        self.norm = LayerNorm(stack.width, model.norm_eps, model.dtype)
+        self.mlp = Mlp(stack.width, stack.mlp, model, act)
+
+    def __call__(self, x: Array) -> Array:
+        """Return (B, 1, D) of tokens (B, S, D)."""
+        probe = jnp.broadcast_to(self.probe[...][None, None], (x.shape[0], 1, x.shape[2])).astype(x.dtype)
+        heads = self.attention.attend(*self.attention.project(probe, x), causal=False, mask=None)
+        y = self.attention.out(heads.reshape(probe.shape))
+        return y + self.mlp(self.norm(y))
+
+
 class TubePatch(nnx.Module):
     """Projection of a patch over `frames` frames: a kernel (frames, P*P*3, D)."""
 
@@ -115,7 +140,7 @@ class Vit(nnx.Module):
 
     def __init__(self, form: VitConfig) -> None:
         model, stack = form.model, form.model.touch
-        width, act, eps = stack.width, gelu, model.norm_eps
+        width, act, eps = stack.width, partial(jax.nn.gelu, approximate=True) if form.tanh else gelu, model.norm_eps
         kind = ScaledBlock if form.layer_scale else Block
         self.form = form
         self.patch = TubePatch(form.tubelet, model, bias=form.patch_bias)
@@ -123,7 +148,9 @@ class Vit(nnx.Module):
         self.registers = table(form.registers, width) if form.registers else None
         own = model.sensor_tokens and len(model.sensors) > 1
         self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width) if own else None
-        self.frequency = table(form.axes, -(-width // (2 * form.axes))) if form.grid is None else None
+        self.periods = table(width // stack.heads // 4) if form.rotary else None
+        computed = form.grid is None and not form.rotary
+        self.frequency = table(form.axes, -(-width // (2 * form.axes))) if computed else None
         self.position = table(int(np.prod(form.grid)) + form.class_token, width) if form.grid else None
         self.calibration = TubePatch(form.calibration, model) if form.calibration else None
         places = int(np.prod(form.grid)) if form.grid and form.calibration else 0
@@ -135,6 +162,7 @@ class Vit(nnx.Module):
         self.trunk = stacked_blocks(stack, model, eps, act, kind) if form.trunk else None
         self.post_norm = LayerNorm(width, eps, model.dtype)
         self.projection = Dense(width, form.outputs, model, bias=form.output_bias) if form.outputs else None
+        self.pool = AttentionPool(form.model.touch, model, act) if form.pool else None
 
     def __call__(self, clip: Array, sensor: Array, calibration: Array | None = None) -> VitOutput:
         """Return the tokens of prepared clips (B, T, H, W, 3) of sensor rows (B,).
@@ -144,11 +172,12 @@ class Vit(nnx.Module):
         form, remat = self.form, self.form.model.remat
         x = self.patch(clip)
         grid = (clip.shape[1] // form.tubelet, *(side // form.model.patch for side in clip.shape[2:4]))
-        position = self._positions(grid)
-        x = x + position[None, -x.shape[1] :].astype(x.dtype)
+        position = None if form.rotary else self._positions(grid)
+        x = x if position is None else x + position[None, -x.shape[1] :].astype(x.dtype)
         parts, batch = [], x.shape[0]
         if self.class_token is not None:
-            first = self.class_token[...] + (0 if self.position is None else position[0])
+            first = self.class_token[...]
+            first = first if self.position is None or position is None else first + position[0]
             parts.append(jnp.broadcast_to(first[None, None], (batch, 1, x.shape[-1])))
         if self.registers is not None:
             parts.append(jnp.broadcast_to(self.registers[...][None], (batch, *self.registers[...].shape)))
@@ -162,12 +191,21 @@ class Vit(nnx.Module):
             more = more + self.calibration_position[...][None].astype(more.dtype)
             x = jnp.concatenate([x, jnp.broadcast_to(more, (batch, *more.shape[1:]))], axis=1)
         x = x if self.pre_norm is None else self.pre_norm(x)
-        encoded = hidden = run_blocks(self.blocks, x, remat=remat)
+        turn = partial(_turned, angles=self._angles(grid)) if form.rotary else None
+        encoded = hidden = run_blocks(self.blocks, x, remat=remat, turn=turn)
         if self.trunk is not None:
             hidden = run_blocks(self.trunk, encoded, remat=remat)
         encoded, hidden = encoded[:, :length], hidden[:, :length]
         normed = self.post_norm(hidden)
-        return VitOutput(encoded, hidden, normed, normed if self.projection is None else self.projection(normed))
+        last = self.pool or self.projection
+        return VitOutput(encoded, hidden, normed, normed if last is None else last(normed))
+
+    def _angles(self, grid: tuple[int, ...]) -> Array:
+        """Return the angles f32 (N, D / H / 2) of patches: 2 pi by their places in -1..1, over the periods."""
+        assert self.periods is not None
+        axes = [(np.arange(side, dtype=np.float32) + 0.5) / side * 2 - 1 for side in grid[1:]]
+        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2, 1)
+        return jnp.asarray(2 * np.pi * places / self.periods[...][None, None]).reshape(len(places), -1)
 
     def _positions(self, grid: tuple[int, ...]) -> Array:
         """Return positions of a grid (time, rows, columns), after that of the class token if they are stored."""
@@ -188,6 +226,14 @@ class Vit(nnx.Module):
         first, table = jnp.split(stored, [len(stored) - time * rows * columns])
         table = jnp.einsum("ir,jc,trcd->tijd", *kernels, table.reshape(time, rows, columns, -1), precision="highest")
         return jnp.concatenate([first, table.reshape(-1, table.shape[-1])])
+
+
+def _turned(x: Array, angles: Array) -> Array:
+    """Return queries or keys (B, S, H, D) of which the last N tokens are turned by angles (N, D / 2)."""
+    first, patches = jnp.split(x, [x.shape[1] - len(angles)], axis=1)
+    cos, sin = (wave(angles)[None, :, None].astype(x.dtype) for wave in (jnp.cos, jnp.sin))
+    one, two = jnp.split(patches, 2, axis=-1)
+    return jnp.concatenate([first, jnp.concatenate([one * cos - two * sin, two * cos + one * sin], axis=-1)], axis=1)
 
 
 def cubic(old: int, new: int, resample: Resample = "bicubic") -> np.ndarray:

@@ -1,99 +1,135 @@
 """Losses of the paper as pure functions. All arithmetic is in float32 or wider, whatever the inputs are.
 
-B batch, N positions, T frames, C values of a patch, E embedding width.
+B batch, N positions, T frames, C values of a patch, E embedding width. Arrays may be numpy's, lists or numbers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 Metrics = dict[str, Array]
 
 
-def _wide(x: Array) -> Array:
-    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
+def _wide(*values: ArrayLike) -> list[Array]:
+    """Return arrays of one float type: float64 if a value has it, else float32. A Python number has no type."""
+    arrays = [jnp.asarray(value) for value in values]
+    pairs = zip(values, arrays, strict=True)
+    is_double = any(x.dtype == jnp.float64 and not isinstance(value, float) for value, x in pairs)
+    return [x.astype(jnp.float64 if is_double else jnp.float32) for x in arrays]
 
 
-def normalise(x: Array, eps: float = 1e-12) -> Array:
+def _mean(values: Array, count: Array | int | None = None) -> Array:
+    """Return the sum of `values` over their number or `count`. That of nothing is 0."""
+    count = values.size if count is None else count
+    return jnp.sum(values) / jnp.maximum(jnp.asarray(count, values.dtype), 1)
+
+
+def _equal_shapes(**arrays: Array) -> None:
+    """Raise ValueError for arrays of two shapes, which would be broadcast in silence."""
+    if len({x.shape for x in arrays.values()}) > 1:
+        raise ValueError(f"{', '.join(f'{name} {x.shape}' for name, x in arrays.items())} must have one shape")
+
+
+def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
     """Divide the last axis by its length, or by `eps` if that is larger, as torch's `normalize`.
 
     A power of two, which changes no digit, brings `x` to order one before it is squared: a length of 1e-7 or 1e20 is
     right too. The gradient at zero is 1 / eps.
     """
-    x = _wide(x)
+    (x,) = _wide(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=eps))
     scale = jnp.ldexp(jnp.ones_like(largest), jnp.clip(-jnp.frexp(largest)[1], -126, 126))
     x, least = x * scale, eps * scale
     return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=-1, keepdims=True), least * least))
 
 
-def normalise_patches(patches: Array) -> Array:
+def normalise_patches(patches: ArrayLike) -> Array:
     """Bring each patch (..., C) to zero mean and unit *unbiased* variance (`norm_pix_loss`, golden Q6)."""
-    patches = _wide(patches)
+    (patches,) = _wide(patches)
     centred = patches - jnp.mean(patches, axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1, keepdims=True) / max(patches.shape[-1] - 1, 1)
     return centred * jax.lax.rsqrt(variance + 1e-6)
 
 
-def reconstruction_loss(pred: Array, target: Array, hidden: Array, *, next_frame: bool) -> tuple[Array, Metrics]:
+def reconstruction_loss(
+    pred: ArrayLike, target: ArrayLike, hidden: ArrayLike, *, next_frame: bool
+) -> tuple[Array, Metrics]:
     """Return the loss of masked reconstruction and next-frame prediction (Eq. 1, 2), summed as in Eq. 8.
 
     `pred`, `target` (B, N, T, C); `hidden` (B, N) True on masked positions. With `next_frame` the last of the T
-    frames is the future one: it counts on every position, the others on the hidden positions only.
-    Returns the sum and {"reconstruction", "next_frame"}. A batch with nothing hidden has a reconstruction loss of 0.
+    frames is the future one: it counts on every position, the others on the hidden positions only. What does not count
+    may be garbage. Returns the sum and {"reconstruction", "next_frame"}. A batch with nothing hidden has a
+    reconstruction loss of 0. Raises ValueError for shapes that do not fit, and for a next frame without another.
     """
-    error = jnp.mean((_wide(pred) - _wide(target)) ** 2, axis=-1)  # (B, N, T)
-    present, future = (error[..., :-1], error[..., -1]) if next_frame else (error, None)
-    weight = hidden.astype(error.dtype)
-    loss = jnp.sum(jnp.mean(present, axis=-1) * weight) / jnp.maximum(jnp.sum(weight), 1)
+    (pred, target), hidden = _wide(pred, target), jnp.asarray(hidden, bool)
+    _equal_shapes(pred=pred, target=target)
+    if pred.ndim != 4 or hidden.shape != pred.shape[:2] or pred.shape[2] <= next_frame:
+        wanted = "(B, N, T, C) with T of 2 or more" if next_frame else "(B, N, T, C)"
+        raise ValueError(f"pred must be {wanted} and hidden (B, N), not {pred.shape} and {hidden.shape}")
+    frames = pred.shape[2] - next_frame
+    counts = hidden[..., None] | (jnp.arange(pred.shape[2]) >= frames)[None, None]  # (B, N, T)
+    error = jnp.mean(jnp.where(counts[..., None], pred - target, 0.0) ** 2, axis=-1)
+    loss = _mean(jnp.mean(error[..., :frames], axis=-1), jnp.sum(hidden))
     metrics = {"reconstruction": loss}
-    if future is not None:
-        metrics["next_frame"] = jnp.mean(future)
+    if next_frame:
+        metrics["next_frame"] = _mean(error[..., -1])
         loss = loss + metrics["next_frame"]
     return loss, metrics
 
 
-def info_nce(a: Array, b: Array, scale: Array, present: Array, *, groups: int = 1, place: Array | None = None) -> Array:
+def info_nce(
+    a: ArrayLike, b: ArrayLike, scale: ArrayLike, present: ArrayLike, *, groups: int = 1, place: ArrayLike | None = None
+) -> Array:
     """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
-    `scale` is 1 / tau. Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair
-    gives 0. With `groups` > 1 the batch is cut in that many shares, as by the devices of the release. Negatives come
-    from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,) are no negatives of each other.
+    `scale` is 1 / tau. A row is present where `present` is not 0. Absent rows are neither anchors nor negatives and may
+    hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that many shares, as by the devices
+    of the release. Negatives come from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,) are
+    no negatives of each other. Raises ValueError for shapes that do not fit, and for groups of unequal size.
     """
-    e = a.shape[-1]
-    present = present.reshape(groups, -1)
-    a = jnp.where(present[..., None], _wide(a).reshape(groups, -1, e), 0.0)
-    b = jnp.where(present[..., None], _wide(b).reshape(groups, -1, e), 0.0)
+    (a, b, scale), present = _wide(a, b, scale), jnp.asarray(present, bool)
+    _equal_shapes(a=a, b=b)
+    if a.ndim != 2 or present.shape != a.shape[:1]:
+        raise ValueError(f"a and b must be (B, E) and present (B,), not {a.shape} and {present.shape}")
+    rows, width = a.shape
+    if groups < 1 or rows % groups:
+        raise ValueError(f"{rows} rows cannot be cut into {groups} groups of equal size")
+    present = present.reshape(groups, rows // groups)
+    a, b = (jnp.where(present[..., None], x.reshape(*present.shape, width), 0.0) for x in (a, b))
     # The factor is up to 100: the reduced precision that accelerators use by default would show in the loss.
-    logits = _wide(scale) * jnp.einsum("gie,gje->gij", a, b, precision=jax.lax.Precision.HIGHEST)
+    logits = scale * jnp.einsum("gie,gje->gij", a, b, precision=jax.lax.Precision.HIGHEST)
     rivals = present[:, None, :]
     if place is not None:
-        place = place.reshape(groups, -1)
+        place = jnp.asarray(place).reshape(present.shape)
         rivals = rivals & ((place[:, :, None] != place[:, None, :]) | jnp.eye(place.shape[1], dtype=bool)[None])
     logits = jnp.where(rivals, logits, jnp.finfo(logits.dtype).min)
     own = jnp.diagonal(logits, axis1=1, axis2=2)
     loss = jnp.where(present, jax.nn.logsumexp(logits, axis=-1) - own, 0.0)
-    pairs = jnp.sum(present, axis=1)
+    pairs = jnp.sum(present, axis=1).astype(loss.dtype)
     return jnp.mean(jnp.sum(loss, axis=1) / jnp.maximum(pairs, 1))
 
 
-def centered(x: Array, present: Array) -> Array:
+def centered(x: ArrayLike, present: ArrayLike) -> Array:
     """Return unit vectors (B, E): `x` minus its mean over the rows that are `present` (B,), scaled to length 1."""
-    x = jnp.where(present[:, None], _wide(x), 0.0)
-    mean = jnp.sum(x, axis=0, keepdims=True) / jnp.maximum(jnp.sum(present), 1)
-    return normalise(jnp.where(present[:, None], x - mean, 0.0), eps=1e-3)  # a smaller spread is rounding
+    (x,), present = _wide(x), jnp.asarray(present, bool)[:, None]
+    x = jnp.where(present, x, 0.0)
+    mean = jnp.sum(x, axis=0, keepdims=True) / jnp.maximum(jnp.sum(present).astype(x.dtype), 1)
+    return normalise(jnp.where(present, x - mean, 0.0), eps=1e-3)  # a smaller spread is rounding
 
 
 def alignment_loss(
-    touch: Array,
-    image: Array | None,
-    text: Array | None,
-    has_image: Array | None,
-    has_text: Array | None,
-    scale: Array,
-    weights: tuple[float, float, float],
+    touch: ArrayLike,
+    image: ArrayLike | None,
+    text: ArrayLike | None,
+    has_image: ArrayLike | None,
+    has_text: ArrayLike | None,
+    scale: ArrayLike,
+    weights: Sequence[ArrayLike],
     *,
     groups: int = 1,
     center: bool = False,
@@ -104,18 +140,20 @@ def alignment_loss(
     the pairs (touch-vision, touch-text, vision-text) on the sum of both directions. A modality that is None is
     absent from the whole batch. `center` subtracts each modality's batch mean first. Untrained towers share one large
     direction, and without this the loss falls by growing it until all embeddings are equal. Returns the loss, its six
-    terms and the number of pairs of each kind.
+    terms and the number of pairs of each kind. Raises ValueError for shapes that do not fit.
     """
-    everyone = jnp.ones(touch.shape[0], bool)
-    z = {"touch": (touch, everyone)}
-    if image is not None:
-        z["vision"] = (image, everyone if has_image is None else has_image)
-    if text is not None:
-        z["text"] = (text, everyone if has_text is None else has_text)
+    everyone = jnp.ones(len(jnp.asarray(touch)), bool)
+    given = {"touch": (touch, None), "vision": (image, has_image), "text": (text, has_text)}
+    z = {
+        name: (jnp.asarray(x), everyone if has is None else jnp.asarray(has, bool))
+        for name, (x, has) in given.items() if x is not None
+    }  # fmt: skip
     if center:
         z = {name: (centered(x, has), has) for name, (x, has) in z.items()}
-    total = jnp.zeros((), jnp.promote_types(touch.dtype, jnp.float32))
-    metrics: Metrics = {}
+    if len(weights) != 3:
+        raise ValueError(f"weights are three factors, of touch-vision, touch-text and vision-text, not {len(weights)}")
+    scale, *weights = _wide(scale, *weights)
+    total, metrics = jnp.zeros((), _wide(touch)[0].dtype), Metrics()
     pairs = (("touch", "vision"), ("touch", "text"), ("vision", "text"))
     for (first, second), weight in zip(pairs, weights, strict=True):
         if first not in z or second not in z:
@@ -124,7 +162,7 @@ def alignment_loss(
         both = has_a & has_b
         forth = info_nce(a, b, scale, both, groups=groups)
         back = info_nce(b, a, scale, both, groups=groups)
-        total = total + weight * (forth + back)
+        total = total + weight.astype(forth.dtype) * (forth + back)
         metrics |= {
             f"{first}_to_{second}": forth,
             f"{second}_to_{first}": back,
@@ -134,38 +172,43 @@ def alignment_loss(
 
 
 def contrast_loss(
-    first: Array, second: Array, scale: Array, *, groups: int = 1, place: Array | None = None
+    first: ArrayLike, second: ArrayLike, scale: ArrayLike, *, groups: int = 1, place: ArrayLike | None = None
 ) -> tuple[Array, Array]:
     """InfoNCE matching between the two unit-norm touches (B, E) of each pair. Not in the paper.
 
     All other places of the batch are negatives, up to 2 B - 2 for each pair instead of one. `place` i32 (B,) is equal
     for pairs of one place; None means that no two are. Returns the mean of both directions, and the share of `first`
-    whose nearest `second` is of its place.
+    whose nearest `second` is of its place. Raises ValueError as `info_nce`.
     """
-    everyone = jnp.ones(first.shape[0], bool)
+    first, second, scale = _wide(first, second, scale)
+    everyone = jnp.ones(len(first), bool)
     forth = info_nce(first, second, scale, everyone, groups=groups, place=place)
     back = info_nce(second, first, scale, everyone, groups=groups, place=place)
-    place = jnp.arange(first.shape[0]) if place is None else place
-    right = place[jnp.argmax(_wide(first) @ _wide(second).T, axis=1)] == place
-    return (forth + back) / 2, jnp.mean(right.astype(jnp.float32))
+    place = jnp.arange(len(first)) if place is None else jnp.asarray(place)
+    nearest = jnp.argmax(first @ second.T, axis=1) if len(first) else place  # there is no largest of nothing
+    return (forth + back) / 2, _mean((place[nearest] == place).astype(jnp.float32))
 
 
-def matching_loss(positive_logit: Array, negative_logit: Array) -> Array:
-    """Return the binary cross-entropy of matching from logits (B,), each kind averaged over the batch (Eq. 6)."""
-    positive, negative = _wide(positive_logit), _wide(negative_logit)
-    return jnp.mean(jax.nn.softplus(-positive)) + jnp.mean(jax.nn.softplus(negative))
+def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array:
+    """Return the binary cross-entropy of matching from logits (B,), each kind averaged over the batch (Eq. 6).
+
+    Without pairs it is 0.
+    """
+    positive, negative = _wide(positive_logit, negative_logit)
+    return _mean(jax.nn.softplus(-positive)) + _mean(jax.nn.softplus(negative))
 
 
-def laplace_loss(error: Array, log_scale: Array) -> Array:
+def laplace_loss(error: ArrayLike, log_scale: ArrayLike) -> Array:
     """Return the negative log likelihood of errors under Laplace deviations exp(`log_scale`), element-wise.
 
     The logarithm is bent smoothly into -5..5, so that no deviation vanishes or explodes.
     """
-    log_scale = 5.0 * jnp.tanh(_wide(log_scale) / 5.0)
-    return jnp.abs(_wide(error)) * jnp.exp(-log_scale) + log_scale
+    error, log_scale = _wide(error, log_scale)
+    log_scale = 5.0 * jnp.tanh(log_scale / 5.0)
+    return jnp.abs(error) * jnp.exp(-log_scale) + log_scale
 
 
-def binary_loss(logit: Array, share: Array) -> Array:
+def binary_loss(logit: ArrayLike, share: ArrayLike) -> Array:
     """Return the cross-entropy between logits and shares in 0..1, element-wise."""
-    logit = _wide(logit)
+    logit, share = _wide(logit, share)
     return jnp.maximum(logit, 0) - logit * share + jnp.log1p(jnp.exp(-jnp.abs(logit)))

@@ -1,45 +1,62 @@
 """Images and clips as token sequences: patches, position tables, segments, sensor tokens (Sec. 3.1, 3.5), masking.
 
 B batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, K kept ones, D width. Masking is random
-(Sec. 3.2; He et al., 2022).
+(Sec. 3.2; He et al., 2022). Arrays may be numpy's, lists or numbers.
 """
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 
-def patchify(clip: Array, patch: int) -> Array:
+def patchify(clip: ArrayLike, patch: int) -> Array:
     """Cut `clip` (B, T, H, W, C) into patch vectors (B, N, T, P*P*C), each in the order (row, col, colour).
 
-    Raises ValueError when H or W is no multiple of `patch`.
+    Raises ValueError for another shape, and when H or W is no multiple of `patch`.
     """
-    b, t, h, w, c = clip.shape
-    if h % patch or w % patch:
+    b, t, h, w, c = _shape(clip := jnp.asarray(clip), "a clip", "B T H W C")
+    if patch < 1 or h % patch or w % patch:
         raise ValueError(f"a {h} x {w} image cannot be cut into patches of {patch} pixels")
-    grid = clip.reshape(b, t, h // patch, patch, w // patch, patch, c)
-    return grid.transpose(0, 2, 4, 1, 3, 5, 6).reshape(b, -1, t, patch * patch * c)
+    rows, columns = h // patch, w // patch
+    grid = clip.reshape(b, t, rows, patch, columns, patch, c)
+    return grid.transpose(0, 2, 4, 1, 3, 5, 6).reshape(b, rows * columns, t, patch * patch * c)
 
 
-def unpatchify(patches: Array, patch: int, height: int) -> Array:
-    """The exact inverse of `patchify`: (B, N, T, P*P*C) -> (B, T, H, W, C) with H = `height`."""
-    b, n, t, size = patches.shape
-    rows, colours = height // patch, size // patch**2
-    grid = patches.reshape(b, rows, n // rows, t, patch, patch, colours)
-    return grid.transpose(0, 3, 1, 4, 2, 5, 6).reshape(b, t, height, -1, colours)
+def unpatchify(patches: ArrayLike, patch: int, height: int) -> Array:
+    """The exact inverse of `patchify`: (B, N, T, P*P*C) -> (B, T, H, W, C) with H = `height`.
+
+    Raises ValueError for another shape, and for patches that do not make images of `height`.
+    """
+    b, n, t, size = _shape(patches := jnp.asarray(patches), "patches", "B N T P*P*C")
+    rows = 0 if patch < 1 or height % patch else height // patch
+    if rows < 1 or n % rows or size % patch**2:
+        raise ValueError(f"{n} patches of {size} values and {patch} pixels do not make images of height {height}")
+    columns, colours = n // rows, size // patch**2
+    grid = patches.reshape(b, rows, columns, t, patch, patch, colours)
+    return grid.transpose(0, 3, 1, 4, 2, 5, 6).reshape(b, t, height, columns * patch, colours)
+
+
+def _shape(x: Array, name: str, axes: str) -> tuple[int, ...]:
+    """Return the shape of an array. Raises ValueError for another number of axes."""
+    if x.ndim != len(axes.split()):
+        raise ValueError(f"{name} must be ({', '.join(axes.split())}), not {x.shape}")
+    return x.shape
 
 
 def sincos_table(width: int, grid: int) -> Array:
     """Fixed 2-D sine-cosine positions (1 + grid^2, width); row 0, the class token's, is zero (MAE, golden I).
 
     The first half of the channels encodes the column, the second the row, each as [sin | cos].
-    Raises ValueError when `width` is no multiple of 4.
+    Raises ValueError when `width` is no multiple of 4, or `grid` is negative.
     """
-    if width % 4:
-        raise ValueError(f"a sine-cosine table needs a width that is a multiple of 4, not {width}")
+    if width < 4 or width % 4 or grid < 0:
+        raise ValueError(
+            f"a sine-cosine table needs a width that is a multiple of 4, not {width}, and a grid of 0 or more"
+        )
     frequency = 10000.0 ** (-jnp.arange(width // 4) / (width // 4))
-    angle = jnp.arange(grid)[:, None] * frequency[None, :]
+    angle = jnp.arange(grid, dtype=frequency.dtype)[:, None] * frequency[None, :]
     axis = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=1)  # (grid, width / 2)
     cols = jnp.tile(axis, (grid, 1))
     rows = jnp.repeat(axis, grid, axis=0)
@@ -47,13 +64,15 @@ def sincos_table(width: int, grid: int) -> Array:
     return jnp.concatenate([jnp.zeros((1, width), table.dtype), table], axis=0)
 
 
-def segments(clip: Array, frames: int) -> Array:
+def segments(clip: ArrayLike, frames: int) -> Array:
     """Cut a long clip (B, T, ...) into S = ceil(T / frames) segments (B, S, frames, ...) (App. "frame number").
 
     The last segment ends with the last frame, so it overlaps its neighbour when T is no multiple of `frames`.
-    Raises ValueError when T is smaller than `frames`.
+    Raises ValueError when T is smaller than `frames`, or `frames` below 1.
     """
-    total = clip.shape[1]
+    total = (clip := jnp.asarray(clip)).shape[1]
+    if frames < 1:
+        raise ValueError(f"a segment has 1 frame or more, not {frames}")
     if total < frames:
         raise ValueError(
             f"a clip of {total} frames is shorter than a segment of {frames}; use a still or a longer clip"
@@ -62,43 +81,63 @@ def segments(clip: Array, frames: int) -> Array:
     return jnp.stack([clip[:, start : start + frames] for start in starts], axis=1)
 
 
-def universal_probability(progress: Array, start: float, end: float) -> Array:
-    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0 to 0.75)."""
-    return start + (end - start) * progress
+def universal_probability(progress: ArrayLike, start: float, end: float) -> Array:
+    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0 to 0.75).
+
+    Before 0 and after 1 it stays where it is.
+    """
+    return start + (end - start) * jnp.clip(jnp.asarray(progress, float), 0, 1)
 
 
-def draw_tokens(sensor: Array, uniform: Array, probability: Array, universal_row: int) -> Array:
+def draw_tokens(sensor: ArrayLike, uniform: ArrayLike, probability: ArrayLike, universal_row: int) -> Array:
     """Replace a sensor's row by the universal one where `uniform` < p_u: i ~ Bernoulli(p_u) (Eq. 7).
 
     `sensor` i32 (B,), `uniform` (B,) in [0, 1). Returns rows i32 (B,) of the sensor-token table.
     """
-    return jnp.where(uniform < probability, universal_row, sensor)
+    is_universal = jnp.asarray(uniform, float) < jnp.asarray(probability, float)
+    return jnp.where(is_universal, universal_row, jnp.asarray(sensor))
 
 
 def count_visible(positions: int, ratio: float) -> int:
-    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the release."""
+    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the release.
+
+    Raises ValueError for a negative number, and for a ratio outside 0 to 1.
+    """
+    if positions < 0 or not 0 <= ratio <= 1:
+        raise ValueError(f"a share between 0 and 1 of 0 or more positions stays visible, not {ratio} of {positions}")
     return int(positions * ratio)
 
 
-def random_mask(noise: Array, keep: int) -> tuple[Array, Array, Array]:
+def random_mask(noise: ArrayLike, keep: int) -> tuple[Array, Array, Array]:
     """Keep the `keep` positions of smallest noise, each sample by its own row of `noise` (B, N).
 
     Returns keep_ids (B, K) in ascending order of noise, restore_ids (B, N), and hidden (B, N). Position n is element
-    restore_ids[n] of [visible, hidden]. `hidden` is True where a position was removed (Omega_M of Eq. 1).
+    restore_ids[n] of [visible, hidden]. `hidden` is True where a position was removed (Omega_M of Eq. 1). Raises
+    ValueError for a number of positions to keep that is not 0 to N.
     """
+    _, count = _shape(noise := jnp.asarray(noise), "noise", "B N")
+    if not 0 <= keep <= count:
+        raise ValueError(f"0 to {count} of {count} positions can be kept, not {keep}")
     order = jnp.argsort(noise, axis=1)
     restore_ids = jnp.argsort(order, axis=1)
     return order[:, :keep], restore_ids, restore_ids >= keep
 
 
-def keep(x: Array, keep_ids: Array) -> Array:
+def keep(x: ArrayLike, keep_ids: ArrayLike) -> Array:
     """Return the positions `keep_ids` (B, K) of `x` (B, N, ...), as (B, K, ...)."""
+    x, keep_ids = jnp.asarray(x), jnp.asarray(keep_ids)
     ids = keep_ids.reshape(keep_ids.shape + (1,) * (x.ndim - 2))
     return jnp.take_along_axis(x, ids, axis=1)
 
 
-def restore(visible: Array, mask_token: Array, restore_ids: Array) -> Array:
-    """Put `visible` (B, K, D) back to its positions and the mask token (D,) everywhere else: (B, N, D)."""
-    batch, count, width = visible.shape
-    hidden = jnp.broadcast_to(mask_token.astype(visible.dtype), (batch, restore_ids.shape[1] - count, width))
+def restore(visible: ArrayLike, mask_token: ArrayLike, restore_ids: ArrayLike) -> Array:
+    """Put `visible` (B, K, D) back to its positions and the mask token (D,) everywhere else: (B, N, D).
+
+    Raises ValueError for more visible positions than there are.
+    """
+    batch, count, width = _shape(visible := jnp.asarray(visible), "visible", "B K D")
+    missing = (restore_ids := jnp.asarray(restore_ids)).shape[1] - count
+    if missing < 0:
+        raise ValueError(f"{count} visible positions do not fit into {restore_ids.shape[1]}")
+    hidden = jnp.broadcast_to(jnp.asarray(mask_token, visible.dtype), (batch, missing, width))
     return jnp.take_along_axis(jnp.concatenate([visible, hidden], axis=1), restore_ids[..., None], axis=1)

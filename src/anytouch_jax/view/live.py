@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import queue
@@ -11,7 +12,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +41,7 @@ Array = npt.NDArray[Any]
 _KEPT = 600  # frames whose times make p50 and p99, as on the page
 _SEARCH = 0.5  # seconds between searches for the nearest touches
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+_LOOK = 0.005  # seconds between looks for a new packet
 _WAITING = 64  # pictures that wait for the disk: more are dropped and counted
 
 
@@ -99,7 +101,7 @@ class Live:
         self._count = 0
         self._near: tuple[list[dict[str, Any]], float] = ([], 0.0)
         self._times: deque[tuple[float, float]] = deque(maxlen=_KEPT)
-        self._changed, self._packet, self._serial = threading.Condition(), b"", 0
+        self._newest = (0, b"")  # the number of a packet, and the packet
         self._stopped = False
         self._thread: threading.Thread | None = None
         self.recorder = None if out is None else LiveRecorder(out, sensor)
@@ -138,15 +140,19 @@ class Live:
         if self._raw:
             self.set_background(self._oriented(self._raw[-1][1]))
 
-    def packets(self) -> Iterator[bytes]:
-        """Yield each newest frame for one page: length u32, JSON, length u32, JPEG, little endian."""
+    async def packets(self) -> AsyncIterator[bytes]:
+        """Yield each newest frame for one page: length u32, JSON, length u32, JPEG, little endian.
+
+        It waits without a thread: pages that wait for a stopped camera must not take those of other requests.
+        """
         seen = 0
         while not self._stopped:
-            with self._changed:
-                if self._serial == seen and not self._changed.wait(1.0):
-                    continue
-                seen, packet = self._serial, self._packet
-            yield packet
+            number, packet = self._newest
+            if number == seen:
+                await asyncio.sleep(_LOOK)
+            else:
+                seen = number
+                yield packet
 
     def set_background(self, picture: Array | None) -> None:
         """Take a picture RGB u8 (h, w, 3) as the untouched gel, or go on without one."""
@@ -229,9 +235,7 @@ class Live:
     def _publish(self, about: dict[str, Any], picture: bytes) -> None:
         text = json.dumps(about | {"sent": 1e3 * time.time()}).encode()
         packet = struct.pack("<I", len(text)) + text + struct.pack("<I", len(picture)) + picture
-        with self._changed:
-            self._packet, self._serial = packet, self._serial + 1
-            self._changed.notify_all()
+        self._newest = (self._newest[0] + 1, packet)
 
 
 class LiveRecorder:

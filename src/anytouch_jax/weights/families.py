@@ -25,7 +25,7 @@ from anytouch_jax.weights.tree import flatten, nest
 Size = tuple[int, int]
 ALIASES = {"mini": "gelsight_mini"}  # names of T3's files
 SHARED = ("trunk", "post_norm")  # what T3's sensors have in common
-_HEADS = {192: 3} | VISION_HEADS
+_HEADS = {192: 3, 1152: 16} | VISION_HEADS
 _DECODER = Stack(512, 8, 16, 2048)  # a family has none
 
 
@@ -58,7 +58,7 @@ class Family:
 
     A file is of the family if, after one of the `prefixes`, it has all keys in `needs` and none in `lacks`, and
     `beside` without the prefix. The first of `needs` is the patch kernel, which has five axes in a family of `video`.
-    Keys in `unused` (a regex) are not read, and neither are those without the prefix.
+    Keys in `unused` (a regex) are not read, and neither are those without the prefix. `renamed` comes first.
     """
 
     name: str
@@ -78,8 +78,11 @@ class Family:
     frames: int = 1
     video: bool = False
     names: tuple[str, ...] = ()  # Sensors of the rows of tokens.
-    feature: Literal["class", "mean", "projected", "unit"] = "class"
+    feature: Literal["class", "mean", "projected", "unit", "pooled"] = "class"
     tokens: Literal["normed", "patches", "hidden"] = "normed"
+    renamed: tuple[tuple[str, str], ...] = ()  # Other spellings of keys: a regex, and the key of the table.
+    activation: str = "gelu"
+    bare_class: bool = False  # The stored positions have none of the class token.
 
     def weights(self, weights: Weights) -> dict[str, np.ndarray] | None:
         """Return the arrays of the encoder without their prefix, None if the file is of another family."""
@@ -87,6 +90,8 @@ class Family:
             return None
         for prefix in self.prefixes:
             own = {key.removeprefix(prefix): x for key, x in weights.items() if key.startswith(prefix)}
+            for spelling, ours in self.renamed:
+                own = {re.sub(spelling, ours, key): x for key, x in own.items()}
             if not own.keys() >= {*self.needs} or own.keys() & {*self.lacks}:
                 continue
             if (own[self.needs[0]].ndim == 5) == self.video:
@@ -101,6 +106,14 @@ _HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_to
 _PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"
 _PHOTO = Preparation(crop="centre", filter="bicubic", mean=IMAGENET_MEAN, std=IMAGENET_STD)
 _DINOV2: dict[str, Any] = {"unused": r"mask_token|embeddings\.mask_token", "image_size": (224, 224)}
+_DINOV3: dict[str, Any] = {
+    "unused": r"(embeddings\.)?mask_token|local_cls_norm\..*|.*\.bias_mask", "image_size": (224, 224), "eps": 1e-5,
+    "lacks": ("pos_embed",), "preparation": Preparation(filter="bicubic", mean=IMAGENET_MEAN, std=IMAGENET_STD),
+    "renamed": (
+        (r"rope_embed\.periods", "periods"), ("storage_tokens|reg_token", "register_tokens"),
+        (r"\.gamma_(\d)", r".ls\1.gamma"), (r"^model\.layer\.", "layer."),
+    ),
+}
 _HF_VIT: dict[str, Any] = {"prefixes": ("vit.", "deit.", ""), "unused": _PARTS, "eps": 1e-12, "resample": "bicubic"}
 FAMILIES = (
     *(
@@ -132,9 +145,36 @@ FAMILIES = (
         prefixes=("base_model.", ""), unused=r"decoder_pred\..*", eps=1e-5, feature="unit",
     ),
     Family(
+        "dinov3", "DINOv3 (Hugging Face)", "DINOv3 licence", _IMAGES,
+        layouts.HF_DINOV3, ("embeddings.patch_embeddings.weight", "embeddings.cls_token", "layer.0.norm1.weight"),
+        prefixes=("dinov3_vit.", ""), **_DINOV3,
+    ),
+    Family(
+        "dinov3", "DINOv3 (timm's or its authors' layout)", "DINOv3 licence", _IMAGES,
+        layouts.DINOV3, ("patch_embed.proj.weight", "cls_token", "register_tokens", "blocks.0.ls1.gamma"), **_DINOV3,
+    ),
+    Family(
+        "siglip", "SigLIP or SigLIP 2 (vision tower of Hugging Face)", _APACHE, _IMAGES,
+        layouts.SIGLIP, tuple(f"embeddings.{name}" for name in (
+            "patch_embedding.weight", "patch_embedding.bias", "position_embedding.weight")),
+        Preparation(filter="bicubic", mean=(0.5,) * 3, std=(0.5,) * 3), lacks=("embeddings.class_embedding",),
+        prefixes=("vision_model.", "model.vision_model.", ""), resample="bicubic", feature="pooled",
+        activation="gelu_pytorch_tanh",
+    ),
+    Family(
+        "vit", "DeiT III (timm's layout)", _APACHE, _IMAGES,
+        layouts.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "head.weight"), _PHOTO, lacks=("register_tokens",),
+        unused=_PARTS, resample="antialias", bare_class=True,
+    ),
+    Family(
         "dinov2", "DINOv2 (Hugging Face)", _APACHE, _IMAGES,
         layouts.HF_DINOV2, (*_HF_NEEDS, "encoder.layer.0.layer_scale1.lambda1"), _PHOTO,
         prefixes=("dinov2.", "dinov2_with_registers.", ""), resample="bicubic", **_DINOV2,
+    ),
+    Family(
+        "dinov2", "DINOv2 with registers (timm's layout)", _APACHE, _IMAGES,
+        layouts.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "register_tokens"), _PHOTO, beside="reg_token",
+        renamed=(("^reg_token$", "register_tokens"),), bare_class=True, **_DINOV2,
     ),
     Family(
         "dinov2", "DINOv2 (its authors' layout)", _APACHE, _IMAGES,
@@ -172,6 +212,32 @@ class FamilyModel:
     params: dict[str, np.ndarray] = field(repr=False)
 
 
+_UNREAD = {  # an array of a relative of these families: why it is not read
+    "dist_token": "is a distilled DeiT, which has a second class token; give a DeiT without distillation",
+    "fc_norm.weight": "classifies by the mean of its patches (fc_norm) and has no norm of its tokens, as a fine-tuned "
+    "MAE does; give weights from before the fine-tuning",
+    **dict.fromkeys(
+        ("blocks.0.mlp.w1.weight", "blocks.0.mlp.w12.weight", "blocks.0.mlp.fc1_g.weight",
+         "layer.0.mlp.gate_proj.weight", "model.layer.0.mlp.gate_proj.weight", "encoder.layer.0.mlp.weights_in.weight"),
+        "has gated MLPs (SwiGLU), as the largest DINOv2 and DINOv3 have; give a smaller one",
+    ),
+}  # fmt: skip
+
+
+def _refuse_relatives(path: Path, weights: Weights) -> None:
+    """Raise WeightsError for the file of a ViT whose form is not computed here."""
+    timm, patch = weights.get("patch_embed.proj.weight"), "vision_model.embeddings.patch_embedding.weight"
+    reasons = [_UNREAD[key] for key in _UNREAD if key in weights and (key[0] != "f" or "norm.weight" not in weights)]
+    if any(key.endswith(patch) and x.ndim == 2 for key, x in weights.items()):
+        reasons = ["is the NaFlex form of SigLIP 2, for pictures of any shape; give one of a fixed size"]
+    elif timm is None and not any("patch_embeddings." in key for key in weights):
+        reasons = []
+    elif timm is not None and timm.ndim == 4 and timm.shape[1] == 3 and "cls_token" not in weights:
+        reasons.append("is a ViT of photographs without a class token; give one that has it")
+    if reasons:
+        raise WeightsError(f"{path} {reasons[0]}")
+
+
 def load_family(
     path: Path, *, heads: int | None = None, image_size: Any = None
 ) -> tuple[FamilyModel | None, Weights | None]:
@@ -187,12 +253,13 @@ def load_family(
         sensors = {ALIASES.get(file.stem, file.stem): file for file in sorted(path.glob("encoders/*.pth"))}
     file = next(iter(sensors.values())) if sensors else load.find_weights_file(path)
     weights = load.read_weights(file)
+    _refuse_relatives(file, weights)
     if not weights.keys() >= {*_TIMM_NEEDS} or weights.keys() & {"norm.weight", "blocks.0.ls1.gamma"}:
         if file.name == "trunk.pth":
             raise WeightsError(f"{file} is the trunk of T3 alone; give its folder, or encoders/SENSOR.pth")
         return read_family(file, weights, _folder(file), heads=heads, image_size=image_size), weights
     if trunk is None:
-        raise WeightsError(f"{file} is an encoder of T3 without its trunk.pth; put that beside it or into its parent")
+        raise WeightsError(f"{file} has no final norm; if it is an encoder of T3, put its trunk.pth into its folder")
     rest = {f"trunk.{key}": array for key, array in load.read_weights(trunk).items()}
     sensors = sensors or {ALIASES.get(file.stem, file.stem): file}
     names, models = (*sensors, UNIVERSAL), []
@@ -239,7 +306,10 @@ def read_family(
     if (found := find_family(weights)) is None:
         return None
     family, own = found
+    vision = folder.get("vision_config")  # of Hugging Face's models with a text tower
+    folder = {**folder, **vision} if isinstance(vision, dict) else folder
     try:
+        own = _completed(family, own, folder, heads)
         size = image_size if image_size is None else (image_size,) * 2 if isinstance(image_size, int) else image_size
         form, size = form_of(family, own, folder, heads, size and tuple(size), sensors)
         settings = {**asdict(family.preparation), **folder.get("preparation", {})}
@@ -256,6 +326,37 @@ def read_family(
         ) from None
     load.check_finite(path, params)
     return FamilyModel(family, form, preparation, size, params)
+
+
+def _completed(
+    family: Family, weights: dict[str, np.ndarray], folder: Mapping[str, Any], heads: int | None
+) -> dict[str, np.ndarray]:
+    """Return the arrays of a file with those that its layout leaves out, because they are zero or computed.
+
+    They are biases of DINOv3, its periods, and the position of a class token.
+    """
+    own = dict(weights)
+    if family.bare_class:
+        own["pos_embed"] = np.concatenate([np.zeros_like(own["pos_embed"][:, :1]), own["pos_embed"]], axis=1)
+    if family.name == "siglip" and "head.attention.in_proj_weight" not in own:
+        own = {key: x for key, x in own.items() if not key.startswith("head.")}
+    if family.name != "dinov3":
+        return own
+    first = own[family.needs[0]]
+    width = len(first)
+    quarter = width // _heads(width, heads, folder) // 4
+    own.setdefault("periods", float(folder.get("rope_theta", 100)) ** (np.arange(quarter) / quarter))
+    for key in [key for key in own if key.endswith("attn.qkv.weight")]:
+        stem = key.removesuffix("qkv.weight")
+        bias = own.get(f"{stem}qkv.bias", np.zeros(3 * width))
+        parts = own.pop(f"{stem}q_bias", bias[:width]), np.zeros(width), own.pop(f"{stem}v_bias", bias[2 * width :])
+        own[f"{stem}qkv.bias"] = np.concatenate(parts)  # the authors mask the bias of keys
+    known = {re.sub(r"\d", "", key) for key in own}
+    for key in [key for key in own if re.fullmatch(r"layer\.\d+\.\w+\.\w+_proj\.weight", key)]:
+        other = key.removesuffix("weight") + "bias"
+        if re.sub(r"\d", "", other) not in known:
+            own[other] = np.zeros(len(own[key]))
+    return own
 
 
 def load_start(
@@ -286,7 +387,8 @@ def touch_of_photographs(
     Raises UserError for another family, and for a network of another form than the run's.
     """
     form, ours = model.form, config.model
-    if model.family.sensors != _IMAGES or form.model.touch.depth == 0:
+    has_tokens = {"position", "class_token"} <= model.params.keys() and not form.tanh
+    if model.family.sensors != _IMAGES or form.model.touch.depth == 0 or not has_tokens:
         raise UserError(
             f"{source} is an encoder of {model.family.title}; a run starts from weights of AnyTouch, DINOv2, ViT-MAE, "
             "ViT, DeiT or CLIP"
@@ -340,7 +442,7 @@ def form_of(
     patch, mlp = math.isqrt(pixels // 3), shape("blocks/mlp/up/kernel")[1]
     frames, size = max(family.frames, tubelet), image_size or family.image_size
     grid: tuple[int, int, int] | None = None
-    if not has("frequency"):
+    if not has("frequency") and not has("periods"):
         grid = _grid(shape("position")[0] - has("class_token"), family, frames // tubelet, image_size, patch)
         frames, native = grid[0] * tubelet, (grid[1] * patch, grid[2] * patch)
         size = (image_size if family.resample == "none" else size) or native
@@ -355,8 +457,10 @@ def form_of(
     eps = folder.get("layer_norm_eps", family.eps)
     if not isinstance(eps, float | int) or not 0 < eps < 1:
         raise WeightsError(f"layer_norm_eps of the config.json is {str(eps)[:40]}; correct it")
-    if (activation := folder.get("hidden_act", "gelu")) != "gelu":
-        raise WeightsError(f"hidden_act of the config.json is {str(activation)[:40]}; only gelu is computed here")
+    if (activation := folder.get("hidden_act", family.activation)) != family.activation:
+        raise WeightsError(
+            f"hidden_act of the config.json is {str(activation)[:40]}; only {family.activation} is computed here"
+        )
     return VitConfig(
         ModelConfig(
             image_size=max(size),
@@ -382,6 +486,9 @@ def form_of(
         calibration=shape("calibration/kernel")[0] if has("calibration/kernel") else 0,
         outputs=outputs,
         output_bias=has("projection/bias"),
+        rotary=has("periods"),
+        tanh=family.activation != "gelu",
+        pool=has("pool/probe"),
     ), size
 
 

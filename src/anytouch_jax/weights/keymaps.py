@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -51,26 +51,40 @@ def _read_patch(weight: np.ndarray) -> np.ndarray:  # golden Q1: (D, frame, colo
     return np.moveaxis(weight, (0, -3), (-1, -2)).reshape(*weight.shape[1:-3], -1, len(weight))
 
 
-def _frames(weight: np.ndarray) -> np.ndarray:  # (D, frame * colour, row, col) -> (D, frame, colour, row, col)
-    return weight.reshape(len(weight), -1, 3, *weight.shape[2:])
+def _read_frames(weight: np.ndarray) -> np.ndarray:  # from (D, frame * colour, row, col)
+    return _read_patch(weight.reshape(len(weight), -1, 3, *weight.shape[2:]))
 
 
-SAME: tuple[Conversion, Conversion] = (lambda x: x, lambda x: x)
-_TURNED: tuple[Conversion, Conversion] = (lambda x: x.T, lambda x: x.T)
+def _write_frames(kernel: np.ndarray) -> np.ndarray:
+    weight = _write_patch(kernel)
+    return weight.reshape(len(weight), -1, *weight.shape[3:])
+
+
+def _read_video(weight: np.ndarray) -> np.ndarray:  # from (D, colour, frame, row, col)
+    return _read_patch(weight.swapaxes(1, 2))
+
+
+def _write_video(kernel: np.ndarray) -> np.ndarray:
+    return _write_patch(kernel).swapaxes(1, 2)
+
+
+def _same(x: np.ndarray) -> np.ndarray:
+    return x
+
+
+# Named functions and not lambdas, so that an encoder of a family can be pickled.
+SAME: tuple[Conversion, Conversion] = (_same, _same)
+_TURNED: tuple[Conversion, Conversion] = (np.transpose, np.transpose)
+_LEADING = (partial(np.squeeze, axis=0), partial(np.expand_dims, axis=0))
+_TWO_LEADING = (partial(np.squeeze, axis=(0, 1)), partial(np.expand_dims, axis=(0, 1)))
 # kind of a row -> the arrays of such a layer: what is added to its key and to our name, the conversions, the third
 _KINDS: dict[str, list[tuple[Any, ...]]] = {
     "same": [("", "", *SAME)],
-    "row": [("", "", lambda x: x[0], lambda x: x[None])],
-    "token": [("", "", lambda x: x[0, 0], lambda x: x[None, None])],
+    "row": [("", "", *_LEADING)],
+    "token": [("", "", *_TWO_LEADING)],
     "patch": [(".weight", "/kernel", _read_patch, _write_patch)],
-    "frames": [
-        (".weight", "/kernel", lambda x: _read_patch(_frames(x)), lambda x: _joined(_write_patch(x))),
-        (".bias", "/bias", *SAME),
-    ],
-    "video": [  # (D, colour, frame, row, col)
-        (".weight", "/kernel", lambda x: _read_patch(x.swapaxes(1, 2)), lambda x: _write_patch(x).swapaxes(1, 2)),
-        (".bias", "/bias", *SAME),
-    ],
+    "frames": [(".weight", "/kernel", _read_frames, _write_frames), (".bias", "/bias", *SAME)],
+    "video": [(".weight", "/kernel", _read_video, _write_video), (".bias", "/bias", *SAME)],
     "kernel": [(".weight", "/kernel", *_TURNED)],
     "linear": [(".weight", "/kernel", *_TURNED), (".bias", "/bias", *SAME)],
     "norm": [(".weight", "/scale", *SAME), (".bias", "/bias", *SAME)],
@@ -84,10 +98,6 @@ _KINDS: dict[str, list[tuple[Any, ...]]] = {
         for kind, dot in (("qkv", "_"), ("fused", "."))
     },
 }
-
-
-def _joined(weight: np.ndarray) -> np.ndarray:  # the inverse of _frames
-    return weight.reshape(len(weight), -1, *weight.shape[3:])
 
 
 def rows(table: str, theirs: str = "", ours: str = "") -> tuple[Entry, ...]:

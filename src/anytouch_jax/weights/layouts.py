@@ -190,7 +190,39 @@ _HF_DINOV2 = """
     same    encoder.layer.{}.layer_scale1.lambda1         blocks/scale1/scale
     same    encoder.layer.{}.layer_scale2.lambda1         blocks/scale2/scale
 """
+_HF_DINOV3 = """
+    token   embeddings.cls_token                          class_token
+    row     embeddings.register_tokens                    registers
+    frames  embeddings.patch_embeddings                   patch
+    linear  layer.{}.attention.q_proj                     blocks/attention/query
+    linear  layer.{}.attention.k_proj                     blocks/attention/key
+    linear  layer.{}.attention.v_proj                     blocks/attention/value
+    linear  layer.{}.attention.o_proj                     blocks/attention/out
+    norm    layer.{}.norm1                                blocks/norm1
+    norm    layer.{}.norm2                                blocks/norm2
+    linear  layer.{}.mlp.up_proj                          blocks/mlp/up
+    linear  layer.{}.mlp.down_proj                        blocks/mlp/down
+    same    layer.{}.layer_scale1.lambda1                 blocks/scale1/scale
+    same    layer.{}.layer_scale2.lambda1                 blocks/scale2/scale
+    same    periods                                       periods
+    norm    norm                                          post_norm
+"""
+_SIGLIP = f"""
+    frames  embeddings.patch_embedding                    patch
+    same    embeddings.position_embedding.weight          position
+    {BLOCKS.strip()}
+    norm    post_layernorm                                post_norm
+    token   head.probe                                    pool/probe
+    qkv     head.attention.in_proj                        pool/attention
+    linear  head.attention.out_proj                       pool/attention/out
+    norm    head.layernorm                                pool/norm
+    linear  head.mlp.fc1                                  pool/mlp/up
+    linear  head.mlp.fc2                                  pool/mlp/down
+"""
 TIMM = rows(_TIMM)
+DINOV3 = (*TIMM, *rows("same periods periods"))
+HF_DINOV3 = rows(_HF_DINOV3)
+SIGLIP = rows(_SIGLIP)
 HF_VIT = (*rows(_HUGGING_FACE), *rows(_HF_VIT))
 HF_DINOV2 = (*rows(_HUGGING_FACE), *rows(_HF_DINOV2))
 SPARSH = (*TIMM, *rows("same pos_embed.frequency_bands frequency"))

@@ -15,7 +15,7 @@ import pytest
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.images import decode, frames_from_video
-from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.data.readers import IndexOptions, index, lerobot
 from anytouch_jax.errors import UserError
 from tests.data.manifest.test_containers import png
 from tests.weights.test_start import mae
@@ -158,6 +158,62 @@ def test_a_data_set_is_embedded_and_the_features_are_a_column(root, tmp_path, ca
     info = json.loads((root / "meta" / "info.json").read_text())
     assert info["features"]["observation.touch"] == {"dtype": "float32", "shape": [16], "names": None}
     assert main(list(map(str, words))) == 2 and "choose another name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("cameras", "names"),
+    [
+        (["observation.left.tactile", "observation.right.tactile"], ["left", "right"]),
+        ([GEL, FILM], ["gel", "tactile_film"]),
+        (["a.left.gel", "a.left.gel.back"], ["a.left.gel", "a.left.gel.back"]),
+        (["gel_left", "gel_right"], ["gel_left", "gel_right"]),
+        ([GEL], [GEL]),
+    ],
+)
+def test_the_columns_of_cameras_are_called_by_what_distinguishes_them(cameras, names):
+    assert lerobot.camera_names(cameras) == names
+
+
+def test_columns_of_two_cameras_are_written_with_their_statistics_or_not_at_all(root, monkeypatch):
+    def contents():
+        return {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+    (root / "meta" / "stats.json").write_text(json.dumps({"observation.force": {"mean": [0.5]}}))
+    values, before = np.random.default_rng(0).normal(size=(2, 9, 3)).astype("f4"), contents()
+    numbers = np.arange(9)[::-1] + 3
+    columns = {f"touch.{name}": (x, numbers) for name, x in zip(("left", "right"), values, strict=True)}
+    with pytest.raises(UserError, match="no frame of index 12"):
+        lerobot.write_features(root, columns | {"touch.other": (values[0], numbers + 1)})
+    write, calls = pa.parquet.write_table, []
+
+    def full(table, path):
+        calls.append(path)
+        if len(calls) > 1:
+            raise OSError(28, "No space left on device")
+        write(table, path)
+
+    with monkeypatch.context() as changed, pytest.raises(OSError, match="No space left"):
+        changed.setattr(pa.parquet, "write_table", full)
+        lerobot.write_features(root, columns)
+    assert contents() == before
+    lerobot.write_features(root, columns)
+    stats = json.loads((root / "meta" / "stats.json").read_text())
+    assert stats.pop("observation.force") == {"mean": [0.5]} and stats.keys() == columns.keys()
+    tables = [pa.parquet.read_table(path) for path in sorted((root / "data").rglob("*.parquet"))]
+    for name, (x, _) in columns.items():
+        wanted = {
+            "min": x.min(0),
+            "max": x.max(0),
+            "mean": x.mean(0),
+            "std": x.std(0),
+            "q50": np.median(x, 0),
+            "count": 9,
+        }
+        for key, value in wanted.items():
+            np.testing.assert_allclose(stats[name][key], np.atleast_1d(value), atol=1e-6)
+        assert {"q01", "q10", "q90", "q99"} < stats[name].keys()
+        written = np.concatenate([np.stack(table[name].to_pylist()) for table in tables])
+        np.testing.assert_array_equal(written, np.concatenate([np.full((3, 3), np.nan), x[::-1]]))
 
 
 def test_what_is_not_a_data_set_of_this_version_is_one_sentence(root, tmp_path):

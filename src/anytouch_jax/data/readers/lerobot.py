@@ -5,9 +5,11 @@ The layout is that of github.com/huggingface/lerobot (`src/lerobot/datasets/util
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ import pyarrow.parquet
 from anytouch_jax.data.images import ImageError, frames_from_video
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, read_json, save_png
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path, atomic_write
+from anytouch_jax.files import atomic_path
 
 TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)
 
@@ -153,35 +155,62 @@ def _vector_labels(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[s
     return labels
 
 
-def write_features(root: Path, name: str, features: np.ndarray, index: np.ndarray) -> None:
-    """Write features f32 (n, E) of the frames with these numbers (column `index`) as the column `name`.
+def camera_names(cameras: Sequence[str]) -> list[str]:
+    """Return what distinguishes the keys of cameras: left and right of observation.left.gel, observation.right.gel."""
+    parts = [camera.split(".") for camera in cameras]
+    first = _common(parts)
+    last = _common([part[first:][::-1] for part in parts])
+    names = [".".join(part[first : len(part) - last]) for part in parts]
+    return names if all(names) and len(cameras) > 1 else list(cameras)
 
-    Frames without features get NaN. Every Parquet file is replaced as a whole, and meta/info.json last. Raises
-    UserError for a column that is there, and for frames that are not.
+
+def _common(lists: Sequence[Sequence[str]]) -> int:
+    """Return how many items all lists begin with."""
+    return sum(1 for _ in itertools.takewhile(lambda items: len(set(items)) == 1, zip(*lists, strict=False)))
+
+
+def write_features(root: Path, columns: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Write columns by name: features f32 (n, E), and the numbers (n,) of their frames in the column `index`.
+
+    Frames without features get NaN. meta/stats.json has the statistics of the others, for LeRobot's normaliser. All
+    files are written before the first one is replaced, and meta/info.json is replaced last. Raises UserError for a
+    column that is there, and for frames that are not.
     """
-    file = root / "meta" / "info.json"
-    info = read_json(file)
-    if name in info.get("features", {}):
-        raise UserError(f"{root} has a feature {name}; choose another name")
-    place = {int(number): row for row, number in enumerate(index)}
+    file, statistics = root / "meta" / "info.json", root / "meta" / "stats.json"
+    info, stats = read_json(file), read_json(statistics) if statistics.is_file() else {}
     files = sorted((root / "data").glob("*/*.parquet"))
-    tables = [pa.parquet.read_table(path) for path in files]
-    known = {number for table in tables for number in table["index"].to_pylist()}
-    if lost := place.keys() - known:
-        raise UserError(f"{root} has no frame of index {min(lost)}; the features are of another data set")
-    width = features.shape[1]
-    for path, table in zip(files, tables, strict=True):
-        values = np.full((len(table), width), np.nan, np.float32)
-        for at, number in enumerate(table["index"].to_pylist()):
-            if number in place:
-                values[at] = features[place[number]]
-        column = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), width)
-        metadata = {key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"}
-        table = table.append_column(name, column).replace_schema_metadata(metadata or None)
-        with atomic_path(path) as part:
-            pa.parquet.write_table(table, part)
-    info["features"][name] = {"dtype": "float32", "shape": [width], "names": None}
-    atomic_write(file, json.dumps(info, indent=4))
+    known = [np.asarray(pa.parquet.read_table(path, columns=["index"])["index"]) for path in files]
+    for name, (features, index) in columns.items():
+        if name in info.get("features", {}):
+            raise UserError(f"{root} has a feature {name}; choose another name")
+        if len(lost := np.setdiff1d(index, np.concatenate([np.zeros(0, int), *known]))):
+            raise UserError(f"{root} has no frame of index {lost[0]}; the features are of another data set")
+        info["features"][name] = {"dtype": "float32", "shape": [features.shape[1]], "names": None}
+        stats[name] = _statistics(features)
+    with ExitStack() as written:  # what is entered last is replaced first
+        for path, content in ((file, info), (statistics, stats)):
+            written.enter_context(atomic_path(path)).write_text(json.dumps(content, indent=4))
+        for path, numbers in zip(files, known, strict=True):
+            table = pa.parquet.read_table(path)
+            for name, (features, index) in columns.items():
+                values = np.full((len(numbers), features.shape[1]), np.nan, np.float32)
+                order = np.argsort(index)
+                at = order[np.searchsorted(index, numbers, sorter=order).clip(max=len(order) - 1)]
+                values[index[at] == numbers] = features[at[index[at] == numbers]]
+                column = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), features.shape[1])
+                kept = [own for own in table.column_names if own != name]  # left by an interrupted run
+                table = table.select(kept).append_column(name, column)
+            metadata = {key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"}
+            table = table.replace_schema_metadata(metadata or None)
+            pa.parquet.write_table(table, written.enter_context(atomic_path(path)))
+
+
+def _statistics(features: np.ndarray) -> dict[str, list[float]]:
+    """Return statistics of features (n, E) under the names of LeRobot (`src/lerobot/datasets/compute_stats.py`)."""
+    x = features.astype(np.float64)
+    values = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
+    values |= {f"q{percent:02d}": np.percentile(x, percent, axis=0) for percent in (1, 10, 50, 90, 99)}
+    return {name: value.tolist() for name, value in values.items()} | {"count": [len(x)]}
 
 
 READERS = {

@@ -1,0 +1,140 @@
+"""Encoders in other processes and for any number of touches: pickle, fork, and how many programs are compiled."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import time
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from tiny_models import full_model
+
+from anytouch_jax.config import Config
+from anytouch_jax.encoder import base
+from anytouch_jax.encoder.base import Preprocess
+from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
+from anytouch_jax.encoder.export import export, load
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.functional import build
+
+RNG = np.random.default_rng(0)
+FRAMES = RNG.integers(0, 256, (70, 1, 28, 28, 3), np.uint8)
+GOLDEN = Path(__file__).parents[1] / "parity" / "golden_others"
+PICTURE = RNG.integers(0, 256, (40, 30, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def workers(tmp_path_factory):
+    """What users send to workers, by name: the object, and a function of it that computes."""
+    folder, config = tmp_path_factory.mktemp("workers"), Config(full_model())
+    params = build(config.model).init(jax.random.key(0))
+    touch = {"touch": params.pop("touch")}
+    encoder = Encoder(base.touch_only(config), touch, "mine", whole=config.model, others=params)
+    export(encoder, folder / "touch.bin", platforms=("cpu",))
+    export(encoder, folder / "touch.onnx", form="onnx")
+    other = load_encoder(GOLDEN / "timm_vit.safetensors", heads=4)
+    return {
+        "encoder": (encoder, lambda one: one.encode_touch(FRAMES[:3], "digit")),
+        "towers": (encoder, lambda one: one.encode_image([PICTURE, PICTURE])),
+        "match": (encoder, lambda one: one.match(np.ones((3, 12)), np.ones((3, 12)))),
+        "family": (other, lambda one: one.encode_touch(np.stack([one.preprocess(PICTURE)] * 3))),
+        "preprocess": (Preprocess(encoder, PICTURE), lambda one: one(PICTURE)),
+        "preprocess of a family": (Preprocess(other), lambda one: one(PICTURE)),
+        "preprocess of an engine": (Preprocess(load_encoder(folder / "touch.onnx")), lambda one: one(PICTURE)),
+        "exported": (load(folder / "touch.bin"), lambda one: one(FRAMES[:3])),
+        "engine": (load_encoder(folder / "touch.onnx"), lambda one: one.encode_touch(FRAMES[:3])),
+        "the folder": (folder, lambda one: load_encoder(one / "touch.onnx")),
+    }
+
+
+NAMES = ("encoder", "towers", "match", "family", "preprocess", "preprocess of a family", "preprocess of an engine",
+         "exported", "engine")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pickle_holds_the_same_before_and_after_the_first_call(workers, name):
+    one, use = workers[name]
+    fresh = pickle.dumps(pickle.loads(pickle.dumps(one)))
+    wanted = use(one)
+    assert abs(len(pickle.dumps(one)) - len(fresh)) < 100  # compiled programs are not state
+    np.testing.assert_array_equal(use(pickle.loads(pickle.dumps(one))), wanted)
+    if "preprocess" in name:
+        assert len(fresh) < 10_000  # no parameters go to a worker that prepares frames
+
+
+def test_a_forked_process_computes_or_says_why_it_cannot(workers):
+    def answers(pipe) -> None:
+        for one, use in workers.values():
+            begin = time.monotonic()
+            try:
+                answer = str(use(one).shape)
+            except UserError as error:
+                answer = str(error)
+            pipe.send((answer, time.monotonic() - begin))
+
+    for one, use in workers.values():
+        use(one)  # jax runs in this process
+    fork = multiprocessing.get_context("fork")
+    ours, theirs = fork.Pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # jax and Python warn of forks
+        child = fork.Process(target=answers, args=(theirs,))
+        child.start()
+    try:
+        for name in workers:
+            assert ours.poll(30), f"{name} hangs"
+            answer, seconds = ours.recv()
+            if name == "engine" or "preprocess" in name:
+                assert answer.startswith("("), name
+            else:
+                assert "forked" in answer and "spawn" in answer and seconds < 1, name
+    finally:
+        child.kill()
+        child.join()
+
+
+@pytest.mark.parametrize("part", ["touch", "image", "text", "match", "exported"])
+def test_few_numbers_of_rows_are_compiled_and_features_are_equal(workers, part, monkeypatch):
+    encoder, exported = workers["encoder"][0], workers["exported"][0]
+    encoder, shapes = pickle.loads(pickle.dumps(encoder)), set()
+
+    def ids(texts, length):
+        return np.array([[int(one) % 9] * length for one in texts]), np.ones((len(texts), length), bool)
+
+    words = SimpleNamespace(vocab_size=9, encode=ids)
+    encoder.__dict__["tokenizer"] = words
+    pictures, z = RNG.integers(0, 256, (70, 28, 28, 3), np.uint8), RNG.standard_normal((2, 70, 12))
+    run = {
+        "touch": lambda n: encoder.encode_touch(FRAMES[:n], np.arange(n) % 3),
+        "image": lambda n: encoder.encode_image(list(pictures[:n])),
+        "text": lambda n: encoder.encode_text([str(i) for i in range(n)]),
+        "match": lambda n: encoder.match(z[0, :n], z[1, :n]),
+        "exported": lambda n: exported(FRAMES[:n], np.arange(n) % 3),
+    }[part]
+    plain = jax.jit
+
+    def counting(function, *args, **kwargs):
+        def traced(*given):
+            shapes.add(tuple(x.shape[0] for x in jax.tree.leaves(given[1:] if part == "touch" else given[-1:])))
+            return function(*given)
+
+        return plain(traced, *args, **kwargs)
+
+    monkeypatch.setattr(jax, "jit", counting)
+    exported.__dict__.pop("_running", None)
+    whole = run(70)
+    assert len(whole) == 70
+    for count in (*range(1, 23), 33, 65):
+        np.testing.assert_allclose(run(count), whole[:count], atol=1e-5)
+    assert len(shapes) <= 8  # 1, 2, 4, ... 64, 128
+
+
+def test_touches_of_two_numbers_do_not_match(workers):
+    with pytest.raises(UserError, match="one shape"):
+        workers["encoder"][0].match(np.ones((3, 12)), np.ones((4, 12)))
+    assert random_encoder(Config(full_model())).encode_touch(FRAMES[:0]).shape == (0, 12)

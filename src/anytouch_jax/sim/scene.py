@@ -236,10 +236,10 @@ def moved(gesture: Gesture, times: Any, gap: Any, xp: ModuleType) -> tuple[Any, 
         return x**2 * (3 - 2 * x)
 
     depth = gesture.depth * (0.05 + 0.95 * smooth(1)) * (1 - 0.95 * smooth(5))
-    motion = smooth(3)[:, None] * xp.stack([*gesture.slide, gesture.twist])
+    motion = smooth(3)[:, None] * xp.stack([*gesture.slide, gesture.twist])[None]
     lifted = gesture.lift >= 0
     off = (times < ends[0]) | (times > ends[5]) | (lifted & (xp.abs(times - gesture.lift) <= gap))
-    motion = motion + (lifted & (times > gesture.lift))[:, None] * gesture.regrasp
+    motion = motion + (lifted & (times > gesture.lift))[:, None] * gesture.regrasp[None]
     return motion, xp.where(off, -1.0, depth)
 
 

@@ -236,9 +236,9 @@ def draw_drift(frames: int, rng: Rng) -> Any:
     """
     xp = namespace_of(rng)
     often = xp.where(rng.uniform() < 0.1, 4.0, 1.0)
-    since = rng.normal(0, 0.012, (3, 3)) + np.array([1.0, 0.0, 0.0])[:, None] * rng.normal(0, 0.012)
-    steps = rng.normal(0, 0.002, (frames, 3, 3)) + rng.normal(0, 0.0015, (3, 3))
-    return (often * (since + xp.cumsum(steps, 0))).astype(xp.float32)
+    since = rng.normal(0, 0.012, (3, 3)) + np.array([[1.0], [0.0], [0.0]]) * rng.normal(0, 0.012)
+    steps = rng.normal(0, 0.002, (frames, 3, 3)) + rng.normal(0, 0.0015, (1, 3, 3))
+    return (often * (since[None] + xp.cumsum(steps, 0))).astype(xp.float32)
 
 
 def rotated(x: jax.Array, y: jax.Array, angle: Any) -> tuple[jax.Array, jax.Array]:

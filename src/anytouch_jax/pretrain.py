@@ -76,7 +76,7 @@ def pretrain(
     shard = (jax.process_index(), jax.process_count())
     loader: Loader | SimulatedLoader
     if simulates:
-        loader = SimulatedLoader(config, manifest, tokenizer=tokenizer, log=log)
+        loader = SimulatedLoader(config, manifest, tokenizer=tokenizer, devices=mesh.size, log=log)
     else:
         assert manifest is not None
         loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard, log=report)

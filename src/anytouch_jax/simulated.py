@@ -75,6 +75,9 @@ class Texts(NamedTuple):
     mask: Any
 
 
+_sample = jax.jit(endless.sample, static_argnames=("sampling", "count"))  # one program for all loaders of one form
+
+
 class SimulatedLoader:
     """Batches for `config.stage` with the interface of `Loader`. `manifest` has real recordings, or is None.
 
@@ -84,7 +87,7 @@ class SimulatedLoader:
 
     def __init__(
         self, config: Config, manifest: Manifest | None = None, *, tokenizer: Tokenizer | None = None,
-        log: Callable[[str], None] = lambda _: None,
+        devices: int = 1, log: Callable[[str], None] = lambda _: None,
     ) -> None:  # fmt: skip
         simulated, model, size = config.simulated, config.model, config.data.batch_size
         if config.recipe == "release":
@@ -105,8 +108,7 @@ class SimulatedLoader:
         self._pool: tuple[int, int, SimulatedTouches] | None = None
         kinds = sum(1 for part in self._real.windows if part is not None) if self._real else 2
         self._has_clips = kinds > 1 and config.data.clip_share > 0
-        self._sample = jax.jit(endless.sample, static_argnames=("sampling", "count"))
-        self._assemble = jax.jit(partial(_assemble, config=config, rows=self._rows))
+        self._assemble = jax.jit(partial(_assemble, config=config, rows=self._rows, devices=devices))
 
     @property
     def steps_per_epoch(self) -> int:
@@ -151,7 +153,7 @@ class SimulatedLoader:
             )  # fmt: skip
             key = jax.random.fold_in(jax.random.fold_in(self._key, 1), number)
             gallery = jax.random.randint(jax.random.fold_in(key, frames), (), 0, len(simulated.sensors))
-            touches = self._sample(key, self._world, sampling, self._count, gallery)
+            touches = _sample(key, self._world, sampling, self._count, gallery)
             pool = self._pool = (number, frames, touches)
         return pool[2]
 
@@ -296,7 +298,7 @@ class _Touches(NamedTuple):
 
 def _assemble(
     key: Array, touches: SimulatedTouches, real: Real | None, photos: Array | None, texts: Texts | None, *,
-    config: Config, rows: np.ndarray,
+    config: Config, rows: np.ndarray, devices: int,
 ) -> Batch:  # fmt: skip
     """Return the batch of a step from simulated touches and the real frames."""
     count, missing = len(touches.object), config.data.batch_size - len(touches.object)
@@ -308,7 +310,7 @@ def _assemble(
     ]
     fields = None
     if touches.fields is not None:
-        fields = field_batch(keys[2], touches, sensor, config, max(1, int(count * FIELD_SHARE)))
+        fields = field_batch(keys[2], touches, sensor, config, _slots(count * FIELD_SHARE, devices))
     kind = STILL if touches.clip.shape[2] == 1 else CLIP
     if config.stage == 1:
         one = takes[0]
@@ -336,7 +338,7 @@ def _assemble(
     size = len(first.sensor)
     image, image_row = jnp.zeros((0, *first.clip.shape[2:]), jnp.uint8), jnp.zeros(0, jnp.int32)
     if photos is not None:
-        slots = count // 2
+        slots = min(_slots(count / 2, devices), count)
         seen = jnp.argsort(touches.photo < 0, stable=True)[:slots]  # touches with a photograph come first
         image = photos[touches.object[seen], jnp.maximum(touches.photo[seen], 0)]
         image_row = jnp.where(touches.photo[seen] >= 0, seen, size).astype(jnp.int32)
@@ -347,6 +349,11 @@ def _assemble(
     align = AlignBatch(first.clip, first.sensor, image, image_row, text, mask, text_row)
     has_towers = photos is not None or texts is not None
     return Stage2Batch(align if has_towers else None, match, fields)
+
+
+def _slots(count: float, devices: int) -> int:
+    """Return at least `count` rows, in a multiple of the devices."""
+    return devices * max(1, -(-int(count) // devices))
 
 
 def _simulated_captions(texts: Texts | None, real: Real) -> Array:

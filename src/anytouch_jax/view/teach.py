@@ -235,7 +235,7 @@ class Teacher:
         return packed
 
     def _train(self) -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)  # live touch comes first
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)  # live touch comes first
         try:
             self._fault = ""
             self._fit(manifests.read(self._recorder.file))

@@ -104,6 +104,7 @@ test: $(STAMP) ## the quick tests, some minutes on two cores
 
 test-all: $(STAMP) ## every test
 	-$(PY) -m pip install -q playwright "moto[server]" s3fs
+	-npm install --silent --no-save --no-audit --no-fund --prefix $(VENV) axe-core@4
 	$(PYTEST)
 	$(if $(shell $(NEWPYTHON) -c "print(1)" 2>/dev/null),$(MAKE) test-jax)
 

@@ -5,28 +5,35 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http.client
+import io
 import json
 import socket
 import struct
 import threading
 import time
+import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import uvicorn
 from starlette.testclient import TestClient
-from view_world import DEPTHS
+from view_world import DEPTHS, SCRIPT, PressCamera
 
+from anytouch_jax.cli.app import main
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
+from anytouch_jax.view import live as live_module
 from anytouch_jax.view import server
-from anytouch_jax.view.live import Live, LiveRecorder
+from anytouch_jax.view.live import Live
 from anytouch_jax.view.space import FeatureMap
+from anytouch_jax.view.teach import SCORE, LiveRecorder
 
 PAGE = {"X-Anytouch": "1"}
+FRAME = (np.zeros((8, 8, 3), np.uint8), 1.0, np.zeros(4, np.float32))  # picture, contact score and features
 
 
 @pytest.fixture(scope="module")
@@ -47,20 +54,20 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
     live.start()
     runner = asyncio.Runner()
     try:
-        packets = live.packets()
+        packets = live.packets("contact")
 
         def until(wanted) -> dict:
             return next(about for about in (opened(runner.run(anext(packets)))[0] for _ in range(500)) if wanted(about))
 
         first, jpeg = opened(runner.run(anext(packets)))
-        assert first["contact"] is None and first["panels"] == 1 and jpeg[:2] == b"\xff\xd8"
+        assert first["gel"] == "estimated" and first["layer"] == "contact" and jpeg[:2] == b"\xff\xd8"
         assert until(lambda about: about["frame"] > 15)["picture"] == "ok"  # the film begins again
         assert page.post("/api/0/control", json={"do": "background"}).status_code == 403  # another site
         for order in ({"do": "x"}, {}, [], {"do": "orient", "rotate": 45, "flip": "none"}, {"do": ["record"]}):
             assert page.post("/api/0/control", json=order, headers=PAGE).status_code == 400
         assert page.post("/api/0/control", content=b"x" * 20_000, headers=PAGE).status_code == 413
         assert page.post("/api/0/control", json={"do": "background"}, headers=PAGE).json() == {"done": True}
-        assert until(lambda about: about["contact"] is not None)["panels"] == 3
+        assert until(lambda about: about["gel"] == "captured")
         for name in ("cup", "../../cup"):
             order = {"do": "record", "object": name}
             assert page.post("/api/0/control", json=order, headers=PAGE).status_code == 200
@@ -70,7 +77,7 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
             until(lambda about: not about["recording"]["on"])  # packets under way are of the recording before
         orient = {"do": "orient", "rotate": 90, "flip": "across"}
         assert page.post("/api/0/control", json=orient, headers=PAGE).status_code == 200
-        assert until(lambda about: about["contact"] is None)  # another orientation, another background
+        assert until(lambda about: about["gel"] == "estimated")  # another orientation, another background
     finally:
         live.stop()
     table = manifests.read(tmp_path / "recorded" / "manifest.parquet")
@@ -81,14 +88,14 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
     assert sorted(path.name[0] for path in (tmp_path / "recorded").iterdir()) == ["2", "2", "m"]  # nothing hidden
 
 
-def test_a_stopped_camera_does_not_stop_the_page(encoder, film):
-    live, open_streams = Live(str(film), encoder, sensor="digit"), set()
+def test_a_stopped_camera_does_not_stop_the_page(encoder, film, tmp_path):
+    live, open_streams = Live(str(film), encoder, sensor="digit", out=tmp_path), set()
     plain = live.packets
 
-    async def counted():
+    async def counted(layer):
         open_streams.add(me := object())
         try:
-            async for packet in plain():
+            async for packet in plain(layer):
                 yield packet
         finally:
             open_streams.discard(me)
@@ -108,8 +115,8 @@ def test_a_stopped_camera_does_not_stop_the_page(encoder, film):
 
     request = f"GET /api/0/stream HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode()
     try:
-        for packet in (b"", b"the last one"):  # before the first frame, and after the last
-            live._newest = (len(packet), packet)
+        for number in (0, 1):  # before the first frame, and after the last
+            live._newest = live._newest._replace(number=number)
             with contextlib.ExitStack() as pages:
                 for _ in range(60):  # the server has 40 threads
                     pages.enter_context(socket.create_connection(("127.0.0.1", port))).sendall(request)
@@ -136,9 +143,9 @@ def test_frames_before_a_full_disk_are_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", full)
     recorder = LiveRecorder(tmp_path, "digit")
-    recorder.start("cup", "train", None)
+    recorder.start("cup", None)
     for _ in range(60):
-        recorder.add(np.zeros((8, 8, 3), np.uint8))
+        recorder.add(*FRAME)
     recorder.stop()
     assert "No space left" in recorder.state()["done"] and "first 2 frames" in recorder.state()["done"]
     assert len(list(tmp_path.glob("*_cup/*.png"))) == 2 and not list(tmp_path.glob(".*"))
@@ -147,18 +154,118 @@ def test_frames_before_a_full_disk_are_kept(tmp_path, monkeypatch):
 def test_a_recording_that_fails_keeps_what_there_was(tmp_path):
     (tmp_path / "manifest.parquet").write_bytes(b"not a table")
     recorder = LiveRecorder(tmp_path, "digit")
-    recorder.start("cup", "train", None)
-    recorder.add(np.zeros((8, 8, 3), np.uint8))
+    recorder.start("cup", None)
+    recorder.add(*FRAME)
     recorder.stop()
     assert "failed" in recorder.state()["done"] and (tmp_path / "manifest.parquet").read_bytes() == b"not a table"
     assert len(list(tmp_path.glob("*_cup/000000.png"))) == 1  # its frames are not lost
-    with pytest.raises(UserError, match="--sensor"):
-        LiveRecorder(tmp_path, None).start("cup", "train", None)
 
 
 def test_a_source_that_ends_and_touches_of_another_encoder(encoder, features, tmp_path, film):
     with pytest.raises(UserError, match="another encoder"):
-        Live(str(film), encoder, sensor="digit", space=FeatureMap(features, []))
+        Live(str(film), encoder, sensor="digit", space=FeatureMap(features, []), out=tmp_path)
     with pytest.raises(UserError, match="no video"):
-        Live(str(tmp_path / "no.avi"), encoder, sensor="digit").start()
+        Live(str(tmp_path / "no.avi"), encoder, sensor="digit", out=tmp_path).start()
     assert len(DEPTHS) == 3
+
+
+NAMES = {"": 400, "  \u200b ": 400, "None": 400, "n/a": 400, SCRIPT: 200, "../../cup": 200, "x" * 300: 200, "cup": 200}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_hostile_name_is_text(name, encoder, film, tmp_path):
+    live = Live(str(film), encoder, sensor=None, out=tmp_path / "out", log=lambda _: None)
+    page = TestClient(server.app([live]), "http://127.0.0.1", raise_server_exceptions=False)
+
+    def order(**body) -> int:
+        return page.post("/api/0/control", json=body, headers=PAGE).status_code
+
+    for _ in range(2):  # the second recording has an existing name
+        assert order(do="record", object=name) == NAMES[name]
+        live.recorder.add(*FRAME)
+        assert order(do="stop") == 200
+    names = page.get("/api/0/taught").json()["names"]
+    if NAMES[name] == 400:
+        assert names == {} and not (tmp_path / "out").exists()
+        return
+    assert list(names) == [name[:100]] and names[name[:100]]["recordings"] == 2
+    table = manifests.read(tmp_path / "out" / "manifest.parquet")
+    assert set(table.text_column("sensor")) == {"universal"} and sorted(tmp_path.iterdir()) == [tmp_path / "out"]
+    assert page.get("/api/0/recorded/0").status_code == 200
+    assert order(do="leave out", sequence="no") == 400
+    assert order(do="leave out", sequence=names[name[:100]]["last"]) == 200
+    assert page.get("/api/0/taught").json()["names"][name[:100]]["recordings"] == 1
+    assert len(manifests.read(tmp_path / "out" / "manifest.parquet")) == 2  # its frames stay
+
+
+def test_a_classifier_taught_by_touching(encoder, tmp_path, monkeypatch, capsys):
+    camera, out = PressCamera(), tmp_path / "touches"
+    monkeypatch.setattr(live_module, "open_source", lambda *_: (camera, True))
+
+    def opened_live() -> Live:
+        return Live("0", encoder, sensor="gelsight_mini", out=out, log=lambda _: None)
+
+    live = opened_live()
+    page = TestClient(server.app([live]), "http://127.0.0.1", raise_server_exceptions=False)
+    live.start()
+    runner, packets = asyncio.Runner(), live.packets("frame")
+
+    def until(wanted) -> dict:
+        return next(about for about in (opened(runner.run(anext(packets)))[0] for _ in range(900)) if wanted(about))
+
+    def order(**body) -> None:
+        assert page.post("/api/0/control", json=body, headers=PAGE).status_code == 200, body
+
+    try:
+        until(lambda about: about["frame"] > 3)
+        order(do="background")
+        refused = page.post("/api/0/control", json={"do": "train"}, headers=PAGE)
+        assert refused.status_code == 400 and "two names" in refused.json()["error"]
+        for name in ("ball", "bar", "pins", "ball", "bar", "pins"):
+            camera.shape = name
+            until(lambda about: about["contact"])
+            order(do="record", object=name)
+            until(lambda about: about["recording"]["on"] and about["recording"]["written"] > 5)
+            order(do="stop")
+            camera.shape = ""
+            until(lambda about: about["contact"] is False)
+        order(do="train")
+        end = time.monotonic() + 300
+        while (after := page.get("/api/0/taught").json())["training"] or not after["trained"]:
+            assert time.monotonic() < end and not after["fault"], after
+            time.sleep(0.05)
+        for name in ("pins", "ball", "bar"):
+            camera.shape = name
+            seen = until(lambda about, name=name: about["contact"] and about.get("label") == name)
+            assert seen["p"] > 0.5 and seen["set"] and "novelty" in seen
+            assert until(lambda about, name=name: about["recorded"][0]["about"]["object"] == name)
+        assert after["result"]["right"] > 0.7 and 0 <= after["result"]["pixels"] <= 1
+        head, packed = page.get("/api/0/taught/head.npz"), page.get("/api/0/taught/recordings.zip")
+        with zipfile.ZipFile(io.BytesIO(packed.content)) as archive:
+            archive.extractall(tmp_path / "downloaded")
+        (tmp_path / "head.npz").write_bytes(head.content)
+        order(do="record", object="last")
+        until(lambda about: about["recording"]["name"] == "last" and about["recording"]["written"] > 2)
+    finally:
+        live.stop()  # as Ctrl-C does
+        runner.close()
+    table = manifests.read(out / "manifest.parquet")
+    assert set(table.text_column("object")) == {"ball", "bar", "pins", "last"}  # that was not stopped is not lost
+    assert (table.number_column(SCORE)[table.text_column("object") == "pins"] > 6.5).all()
+    again = opened_live().teacher.about()  # a new start continues
+    assert again["trained"] and set(again["names"]) == {"ball", "bar", "pins", "last"}
+    assert again["result"] == after["result"]
+    film = tmp_path / "bar.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 30, (160, 120))
+    camera.shape = "bar"
+    for _ in range(3):
+        writer.write(camera.retrieve()[1])
+    writer.release()
+    gel = table.file(0, "background_path")
+    options = ["--model", encoder.source, "--head", tmp_path / "head.npz", "--sensor", "gelsight_mini", "--out", "-"]
+    capsys.readouterr()
+    assert main(list(map(str, ["stream", "--data", film, "--background", gel, *options]))) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [json.loads(line)["label"] for line in lines if line.startswith("{")] == ["bar"] * 3
+    copy = manifests.read(tmp_path / "downloaded" / "touches" / "manifest.parquet")
+    assert len(copy) and all(copy.file(row).is_file() for row in range(len(copy)))

@@ -17,11 +17,14 @@ import pytest
 from starlette.testclient import TestClient
 from view_world import SCRIPT
 
+from anytouch_jax.data.cameras import Camera
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import Features, save_npz
 from anytouch_jax.errors import UserError
 from anytouch_jax.view import server
 from anytouch_jax.view.tables import Run, Table
+
+KINDS = (".html", ".js", ".css")
 
 
 def client(*paths, **options) -> TestClient:
@@ -74,26 +77,27 @@ def test_rows_in_any_order_make_the_same_touches(touches):
 
 
 def test_a_frame_shows_its_difference_and_contact(page):
-    free, pressed = page.get("/api/0/frame/0"), page.get("/api/0/frame/2")
-    assert picture(pressed).shape == (48, 144, 3) and pressed.headers["x-panels"] == "3"
+    free, pressed = page.get("/api/0/frame/0?layer=difference"), page.get("/api/0/frame/2?layer=contact")
+    assert picture(page.get("/api/0/frame/2")).shape == picture(pressed).shape == (48, 48, 3)
     assert float(free.headers["x-score"]) < 1 < 20 < float(pressed.headers["x-score"])
-    difference = picture(free)[:, 48:96]
-    assert abs(difference.astype(int) - 128).max() < 6  # an untouched gel is grey
-    blue, _, red = picture(pressed)[24, 96 + 24].astype(int)
+    assert abs(picture(free).astype(int) - 128).max() < 6  # an untouched gel is grey
+    blue, _, red = picture(pressed)[24, 24].astype(int)
     assert red > blue + 60  # the middle of the press is marked
     assert picture(page.get("/api/0/photo/0")).shape == (48, 48, 3)
-    for path in ("photo/1", "frame/12", "frame/99999999999999999999"):
+    for path in ("photo/1", "frame/12", "frame/99999999999999999999", "frame/0?layer=x"):
         assert page.get(f"/api/0/{path}").status_code == 400
 
 
-def test_without_a_background_the_untouched_gel_is_estimated(film, tmp_path):
+def test_a_film_by_its_name_with_its_own_untouched_gel(film, tmp_path):
     shutil.copy(film, tmp_path / "film.avi")
     page = client(tmp_path / "film.avi")
-    assert [page.get(f"/api/0/frame/{row}").headers["x-panels"] for row in (0, 11)] == ["3", "3"]
-    grey = {row: picture(page.get(f"/api/0/frame/{row}"))[:, :48].mean() for row in (11, 3, 4, 0, 7)}
+    assert all(page.get(f"/api/0/frame/{row}").headers["x-score"] for row in (0, 11))
+    grey = {row: picture(page.get(f"/api/0/frame/{row}")).mean() for row in (11, 3, 4, 0, 7)}
     for row, value in grey.items():  # frames in any order
         assert abs(value - 20 - 15 * row) < 4
-    assert page.get("/api/0/touch").json()["clips"][0]["rows"] == list(range(12))
+    touch = page.get("/api/0/touch").json()
+    assert touch["clips"][0]["rows"] == list(range(12)) and touch["name"] == "film"
+    assert not {"sensor", "split", "sequence"} & set(touch["clips"][0])  # nothing is known of them
 
 
 def test_a_folder_of_pictures(tmp_path):
@@ -101,8 +105,38 @@ def test_a_folder_of_pictures(tmp_path):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((32, 32, 3), value, np.uint8))
     page = client(tmp_path)
     assert page.get("/api/0/touch").json()["clips"][0]["rows"] == [0, 1]
-    assert abs(picture(page.get("/api/0/frame/0"))[:, :32].mean() - 60) < 2  # 2 before 10
-    assert page.get("/api/0/frame/0").headers["x-panels"] == "3"
+    assert abs(picture(page.get("/api/0/frame/0")).mean() - 60) < 2  # 2 before 10
+    assert page.get("/api/0/frame/0").headers["x-score"] and page.get("/api/sources").json()[0]["name"] == tmp_path.name
+
+
+def test_examples_of_the_package(tmp_path):
+    page = client(Path("examples"))
+    touches = [page.get(f"/api/0/touch?place={place}").json() for place in (0, 1)]
+    assert [(touch["name"], len(touch["clips"])) for touch in touches] == [("dots", 3), ("ring", 3)]
+    for row in range(6):
+        assert float(page.get(f"/api/0/frame/{row}?layer=contact").headers["x-score"]) > 6.5
+
+
+def test_the_first_page_opens_a_camera(monkeypatch):
+    class Fake:
+        kind, name, source = "live", "camera 2", "2"
+
+        def about(self):
+            return {}
+
+        def start(self):
+            started.append(self.source)
+
+    started, sources = [], []
+    cameras = [Camera(2, "GelSight Mini", "28H7", ()), Camera(4, "webcam", "", ())]
+    monkeypatch.setattr(server, "list_cameras", lambda: cameras)
+    sources.append(server.StartPage(lambda camera: Fake()))
+    page = TestClient(server.app(sources), "http://127.0.0.1", raise_server_exceptions=False)
+    assert page.get("/api/sources").json()[0]["about"]["cameras"] == {"2": "GelSight Mini 28H7", "4": "webcam"}
+    answers = [page.post("/api/0/control", json={"camera": one}, headers={"X-Anytouch": "1"}) for one in "2324"]
+    assert [answer.status_code for answer in answers] == [200, 400, 200, 400] and started == ["2"]
+    assert answers[0].json() == answers[2].json() == {"source": 1}
+    assert page.post("/api/0/control", json={"camera": "2"}).status_code == 403
 
 
 def test_nothing_outside_is_served(tmp_path, touches):
@@ -185,10 +219,16 @@ def test_text_of_files_stays_text(page):
     assert answer.json()["clips"][0]["object"] == SCRIPT
     policy = page.get("/").headers["content-security-policy"]
     assert "default-src 'none'" in policy and "script-src 'self';" in policy and "unsafe" not in policy
-    script = (files("anytouch_jax.view") / "page.js").read_text()
+    assets = {
+        file.name: file.read_text()
+        for file in map(Path, map(str, files("anytouch_jax.view").iterdir()))
+        if file.suffix in KINDS
+    }
+    script = "".join(text for name, text in assets.items() if name.endswith(".js"))
     assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc", script)
-    for name in ("page.html", "page.js", "page.css"):  # nothing from the network
-        assert not re.search(r"https?:|//cdn|@import|url\(", (files("anytouch_jax.view") / name).read_text())
+    for name, text in assets.items():  # nothing from the network
+        assert not re.search(r"https?:|//cdn|@import|url\(", text)
+        assert name == "page.html" or page.get(f"/{name}").text == text
 
 
 def test_a_token_and_the_name_of_the_host(touches):

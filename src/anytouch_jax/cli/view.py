@@ -26,18 +26,20 @@ class ViewOptions(CameraOptions):
 
     Example: anytouch view manifest.parquet features.npz runs/stage1
 
-    Name a manifest, a folder of pictures, a film, a features file of `anytouch embed`, a run folder, or a camera: 0, a
-    part of its name, its serial, or an address http:// or rtsp://. Features show their pictures if their manifest is
-    named, too. Press Ctrl-C to stop.
+    Name a manifest, a folder of pictures, a film, a features file of `anytouch embed`, a run folder, the word examples,
+    or a camera: 0, a part of its name, its serial, or an address http:// or rtsp://. Without any, the page shows the
+    cameras that are connected, and the examples. Features show their pictures if their manifest is named, too. Press
+    Ctrl-C to stop.
     """
 
-    paths: Positional[tuple[str, ...]]  # What to show, several at once.
+    paths: Positional[tuple[str, ...]] = ()  # What to show, several at once.
     live: bool = False  # Play films as if they came from a camera.
     model: Path = Path(DEFAULT)
     """Encoder of a camera: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
     sensor: str | None = None  # Sensor of a camera. Without it, the universal tokens are used.
     head: Path | None = None  # Show the class of a camera's touch by this head of `anytouch probe label --save`.
-    out: Path | None = None  # Folder for recordings of a camera, with their manifest.parquet.
+    out: Path = Path("recordings")
+    """Folder for recordings of a camera, with their manifest.parquet, and for the head that they teach."""
     host: str = "127.0.0.1"  # Address to listen on. For any but this machine's own, the page asks for a token.
     port: Annotated[int, Range(1, 65535, "1 to 65535")] = 8765  # Port to listen on.
 
@@ -54,14 +56,16 @@ def run(options: ViewOptions) -> int:
 
     played = [path for path in options.paths if options.live and _is_film(path)]
     cameras = [path for path in options.paths if path in played or camera_of(path) is not None]
-    if not cameras:
+    if not cameras and options.paths:
         refuse_unused(options, ("model", "sensor", "head", "out"), "without a camera, or a film with --live")
-    if len(cameras) == len(played):
+    if len(cameras) == len(played) and options.paths:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "without a camera")
     if len(cameras) > 1:
         raise UserError(f"One camera can be shown at a time, not {len(cameras)}. Start another page for the next.")
     begin = time.perf_counter()
-    sources = server.open_sources([Path(path) for path in options.paths if path not in cameras])
+    sources = server.open_sources([Path(path) for path in options.paths or ("examples",) if path not in cameras])
+    if not options.paths:
+        sources.insert(0, server.StartPage(lambda camera: _open_camera(options, camera, sources)))
     for camera in cameras:
         sources.append(_open_camera(options, camera, sources))
     log(f"opened in {time.perf_counter() - begin:.1f} s")

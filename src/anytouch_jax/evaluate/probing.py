@@ -391,7 +391,7 @@ def probe_label(
             head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
             if source.encoder.subtracts:
                 head = replace(head, gels=gels.pictures(rows.rows[:, 0]))
-            head = _calibrated(
+            head = calibrated(
                 head, x, rows, results[0].penalty or 1.0, log, coverage=coverage, false_alarms=false_alarms
             )
             save_head(save, head)
@@ -403,7 +403,7 @@ def probe_label(
     return results
 
 
-def _calibrated(head: LinearHead, x: Array, rows: TaskRows, penalty: float, log: Log, **shares: float) -> LinearHead:
+def calibrated(head: LinearHead, x: Array, rows: TaskRows, penalty: float, log: Log, **shares: float) -> LinearHead:
     """Return the head with its calibration, and log what it says; without one if the data do not allow it."""
     fit, val = (np.flatnonzero(rows.split == name) for name in ("train", "val"))
     try:

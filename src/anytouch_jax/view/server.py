@@ -11,6 +11,7 @@ import hmac
 import secrets
 import socket
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -19,6 +20,7 @@ import cv2
 import numpy as np
 import uvicorn
 from starlette.applications import Starlette
+from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -28,11 +30,12 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from anytouch_jax.config import parse_json
+from anytouch_jax.data.cameras import list_cameras
 from anytouch_jax.data.images import encode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.tables import Run, Table, open_film, open_folder, scale_down
+from anytouch_jax.view.tables import LAYERS, SIDE, Run, Table, open_examples, open_film, open_folder, scale_down, title
 
 if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
     from anytouch_jax.view.live import Live
@@ -40,7 +43,8 @@ if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest need
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 HEADER = "x-anytouch"  # of every request that changes something: another site would need CORS to send it
-_ASSETS = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
+_SCRIPTS = ("page.js", "space.js", "live.js")
+_ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
 _POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob: data:"
 _SAFE = {
     "Content-Security-Policy": f"{_POLICY}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -50,7 +54,23 @@ _SAFE = {
 _LONGEST = 10_000  # bytes of a request body
 _TABLES = (".csv", ".parquet")
 
-Source: TypeAlias = "Table | FeatureMap | Run | Live"
+Source: TypeAlias = "StartPage | Table | FeatureMap | Run | Live"
+
+
+class StartPage:
+    """The first page without anything to show: the cameras of this machine, each by its number and name.
+
+    `open_camera` opens one of them.
+    """
+
+    kind, name = "start", "start"
+
+    def __init__(self, open_camera: Callable[[str], Live]) -> None:
+        self.open_camera = open_camera
+
+    def about(self) -> dict[str, Any]:
+        """Return the cameras that are connected now."""
+        return {"cameras": {str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()}}
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
@@ -63,9 +83,11 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
     sources: list[Source] = []
     features: list[Path] = []
     for path in paths:
-        if not path.exists():
-            raise UserError(f"There is nothing at {path}. Name a manifest, folder, film, features, run or camera.")
-        if path.suffix.lower() == ".npz":
+        if str(path) == "examples" and not path.exists():
+            tables.append(open_examples())
+        elif not path.exists():
+            raise UserError(f"There is no {path}. Name a manifest, a folder, a film, features, a run or a camera.")
+        elif path.suffix.lower() == ".npz":
             features.append(path)
         elif path.is_dir() and (path / "metrics.jsonl").is_file():
             sources.append(Run(path))
@@ -85,25 +107,26 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
 
 def _open_table(path: Path) -> Table:
     if path.suffix.lower() in _TABLES:
-        return Table(manifests.read(path), path.name)
+        return Table(manifests.read(path), title(path))
     if not path.is_dir():
         return open_film(path)
     inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
     inside.sort(key=lambda file: file.stem != "manifest")
-    return Table(manifests.read(inside[0]), inside[0].name) if inside else open_folder(path)
+    return Table(manifests.read(inside[0]), title(inside[0])) if inside else open_folder(path)
 
 
 def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
     """Return the table that features were made from, if it lies in their folder."""
     file = Path(space.index.about.get("input", ""))
     inside = file.suffix.lower() in _TABLES and file.resolve().is_relative_to(features.resolve().parent)
-    return Table(manifests.read(file), file.name) if inside and file.is_file() else None
+    return Table(manifests.read(file), title(file)) if inside and file.is_file() else None
 
 
-def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
+def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
     """Return the ASGI application of the page.
 
-    With a `token`, every request for data needs it. Requests to other names than `hosts` are refused.
+    With a `token`, every request for data needs it. Requests to other names than `hosts` are refused. A camera that
+    the page opens is added to `sources`.
     """
 
     def source(request: Request, kind: str) -> Any:
@@ -125,9 +148,23 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
         return _json(table.touch(place, filters))
 
     def frame(request: Request, table: Table) -> Response:
-        strip, score = table.panels(request.path_params["row"])
-        count = 1 if np.isnan(score) else 3
-        return _picture(strip, {"X-Panels": str(count), "X-Score": "" if np.isnan(score) else f"{score:.2f}"})
+        view, score = table.layer(request.path_params["row"], _layer(request))
+        return _picture(view, {"X-Score": "" if np.isnan(score) else f"{score:.2f}"})
+
+    def recorded(request: Request, live: Live) -> Response:
+        if live.teacher.table is None:
+            raise UserError("Nothing is recorded yet.")
+        return frame(request, live.teacher.table)
+
+    def taught(request: Request, live: Live) -> Response:
+        file = live.teacher.head_file
+        if request.path_params["file"] == "head.npz" and file.is_file():
+            return Response(file.read_bytes(), media_type="application/octet-stream", headers=_SAFE)
+        if request.path_params["file"] != "recordings.zip":
+            raise UserError("There is no such file yet.")
+        packed = live.teacher.archive()
+        blocks = iter(partial(packed.read, 1 << 20), b"")
+        return StreamingResponse(blocks, headers=_SAFE, background=BackgroundTask(packed.close))
 
     def of(kind: str, path: str, answer: Callable[[Request, Any], Response]) -> Route:
         return Route(f"/api/{{source:int}}/{path}", lambda request: answer(request, source(request, kind)))
@@ -140,7 +177,10 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
             body += part
             if len(body) > _LONGEST:
                 return _json({"error": "The request is too long."}, 413)
-        await run_in_threadpool(_control, source(request, "live"), parse_json(body.decode()))
+        order, number = parse_json(body.decode()), request.path_params["source"]
+        if number < len(sources) and isinstance(start := sources[number], StartPage):
+            return _json({"source": await run_in_threadpool(_open, start, order, sources)})
+        await run_in_threadpool(_control, source(request, "live"), order)
         return _json({"done": True})
 
     def page(request: Request) -> Response:
@@ -163,14 +203,17 @@ def app(sources: Sequence[Source], *, token: str = "", hosts: Sequence[str] = LO
         of("run", "figure/{name:str}",
            lambda request, run: _picture(run.figure(request.path_params["name"]), side=4000)),
         of("live", "stream",
-           lambda _, live: StreamingResponse(live.packets(), media_type="application/octet-stream")),
+           lambda request, live: StreamingResponse(
+               live.packets(_layer(request)), media_type="application/octet-stream", headers=_SAFE)),
+        of("live", "taught", lambda _, live: _json(live.teacher.about())),
+        of("live", "recorded/{row:int}", recorded), of("live", "taught/{file:str}", taught),
         Route("/api/{source:int}/control", control, methods=["POST"]),
     ]  # fmt: skip
     guards = [Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)), Middleware(_Token, token=token)]
     return Starlette(routes=routes, middleware=guards, exception_handlers={UserError: _refuse, ValueError: _refuse})
 
 
-def serve(sources: Sequence[Source], host: str, port: int, show: Callable[[str], None]) -> None:
+def serve(sources: list[Source], host: str, port: int, show: Callable[[str], None]) -> None:
     """Serve the page until Ctrl-C. `show` gets its address. Raises UserError if the port is taken."""
     is_local = host in LOCAL
     token = "" if is_local else secrets.token_urlsafe(18)
@@ -184,15 +227,18 @@ def serve(sources: Sequence[Source], host: str, port: int, show: Callable[[str],
         raise UserError(f"Port {port} of {host} cannot be used: {error.strerror}. Choose another --port.") from None
     shown = f"[{host}]" if ":" in host else host
     show(f"http://{shown}:{listener.getsockname()[1]}/{f'#token={token}' if token else ''}")
-    live: list[Any] = [source for source in sources if source.kind == "live"]
     try:
-        for one in live:
+        for one in _live(sources):
             one.start()
         uvicorn.Server(config).run([listener])
     finally:
-        for one in live:
+        for one in _live(sources):
             one.stop()
         listener.close()
+
+
+def _live(sources: Sequence[Source]) -> list[Any]:
+    return [source for source in sources if source.kind == "live"]
 
 
 class _Token:
@@ -210,10 +256,25 @@ class _Token:
         await self._app(scope, receive, send)
 
 
+def _open(start: StartPage, order: Any, sources: list[Source]) -> int:
+    """Open the camera that the page asks for, unless it is open, and return its place. Raises UserError."""
+    camera = order.get("camera") if isinstance(order, dict) else None
+    if not isinstance(camera, str) or camera not in start.about()["cameras"]:
+        raise UserError("There is no such camera. Plug it in, and look again.")
+    for one in _live(sources):
+        if one.source == camera:
+            return sources.index(one)
+        raise UserError("One camera can be shown at a time. Start another page for the next.")
+    live = start.open_camera(camera)
+    live.start()
+    sources.append(live)
+    return len(sources) - 1
+
+
 def _control(live: Live, order: Any) -> None:
     """Do what the page asks of a live source. Raises UserError for anything else."""
     order = order if isinstance(order, dict) else {}
-    action, recorder = order.get("do"), live.recorder
+    action, name, sequence = (order.get(key) for key in ("do", "object", "sequence"))
     rotate, flip = order.get("rotate"), order.get("flip")
     if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
         live.orient(rotate, flip)
@@ -221,10 +282,15 @@ def _control(live: Live, order: Any) -> None:
         live.capture_background()
     elif action == "no background":
         live.set_background(None)
-    elif action == "record" and recorder is not None and isinstance(order.get("object", ""), str):
-        recorder.start(order.get("object", ""), "train", live.background)
-    elif action == "stop" and recorder is not None:
-        recorder.stop()
+    elif action == "record" and isinstance(name, str):
+        live.recorder.start(name, live.gel)
+    elif action == "stop":
+        live.recorder.stop()
+        live.teacher.reload()
+    elif action == "train":
+        live.teacher.train()
+    elif action == "leave out" and isinstance(sequence, str):
+        live.teacher.leave_out(sequence)
     else:
         raise UserError("The page asked for something that this source cannot do.")
 
@@ -235,6 +301,12 @@ def _refuse(_: Request, error: Exception) -> Response:
 
 def _method(request: Request) -> str:
     return request.query_params.get("method", "pca")
+
+
+def _layer(request: Request) -> str:
+    if (name := request.query_params.get("layer", LAYERS[0])) not in LAYERS:
+        raise UserError(f"A touch has the layers {', '.join(LAYERS)}.")
+    return name
 
 
 def _number(request: Request, name: str) -> int:
@@ -248,7 +320,7 @@ def _json(value: Any, status: int = 200) -> Response:
     return JSONResponse(value, status, _SAFE | {"Cache-Control": "no-store"})
 
 
-def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = 3 * 320) -> Response:
+def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = SIDE) -> Response:
     headers = _SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
     data = encode(scale_down(picture, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
     return Response(data, media_type="image/jpeg", headers=headers)

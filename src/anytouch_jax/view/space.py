@@ -12,7 +12,7 @@ import numpy.typing as npt
 from anytouch_jax.encoder.search import load_index, nearest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.geometry import tsne
-from anytouch_jax.view.tables import Table
+from anytouch_jax.view.tables import Table, title
 
 Array = npt.NDArray[Any]
 METHODS = {"pca": 20_000, "tsne": 2_000}  # and how many points each draws
@@ -29,7 +29,7 @@ class FeatureMap:
     kind = "space"
 
     def __init__(self, path: Path, tables: list[Table]) -> None:
-        self.name, self.index = path.name, load_index(path)
+        self.name, self.index = title(path), load_index(path)
         self._rows = self.index.rows
         self.table = next((number for number, table in enumerate(tables) if self._has_rows_of(table)), None)
         self.map = lru_cache(len(METHODS))(self._map)
@@ -37,6 +37,7 @@ class FeatureMap:
     def about(self) -> dict[str, Any]:
         """Return the number of features, the columns that colour them, and where they come from."""
         about = {"count": len(self._rows), "columns": sorted(self.index.keys), "table": self.table}
+        about["sensors"] = len(np.unique(self.index.keys.get("sensor", np.zeros(1))))
         return about | {"methods": list(METHODS), "from": self.index.about}
 
     def _map(self, method: str) -> dict[str, Any]:

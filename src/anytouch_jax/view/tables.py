@@ -18,6 +18,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from anytouch_jax import encoder
 from anytouch_jax.config import parse_json
 from anytouch_jax.data.gels import FRAMES, UnitGels, recording_gel
 from anytouch_jax.data.images import QUIET, count_frames, decode, list_images, open_video, to_rgb
@@ -29,8 +30,10 @@ from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.errors import UserError
 
 Array = npt.NDArray[Any]
-UNKNOWN = "unknown"  # the sensor of a folder or a film
-SIDE = 320  # pixels of the long side of a picture on the page
+UNKNOWN, UNUSED = "unknown", "unused"  # the sensor and the split of a folder or a film, which the page leaves out
+EXAMPLES = Path(encoder.__file__).with_name("examples")  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg
+LAYERS = ("frame", "difference", "contact")  # of a touch, by which the page shows it
+SIDE = 640  # pixels of the long side of a picture on the page
 _MOST_ROWS, _MOST_CLIPS, _MOST_CHOICES = 5000, 12, 500  # frames of a clip, clips of a touch, values of a filter
 _LINES = 2_000  # points of a loss curve on the page
 _BLOCK = 1 << 22  # bytes of metrics.jsonl that are read at once
@@ -50,7 +53,8 @@ class Table:
 
     def about(self) -> dict[str, Any]:
         """Return the number of rows and touches, and the columns that filter them with their values."""
-        return {"rows": len(self.manifest), "touches": len(self._touches(())), "filters": self._filters}
+        about = {"rows": len(self.manifest), "touches": len(self._touches(()))}
+        return about | {"filters": self._filters, "layers": LAYERS}
 
     def touch(self, place: int, filters: dict[str, str]) -> dict[str, Any]:
         """Return touch `place` among those that pass `filters` {column: value}: its clips, and how many there are.
@@ -66,7 +70,7 @@ class Table:
         place = min(max(place, 0), len(touches) - 1)
         recordings = np.flatnonzero((self._touch_of == touches[place]) & self._chosen(chosen))
         clips = [self._clip(int(one)) for one in recordings[:_MOST_CLIPS]]
-        name = self.manifest.value(clips[0]["rows"][0], "touch") or clips[0]["sequence"]
+        name = self.manifest.value(clips[0]["rows"][0], "touch") or clips[0].get("sequence", self.name)
         more = max(0, len(recordings) - _MOST_CLIPS)
         return {"count": len(touches), "place": place, "name": name, "clips": clips, "more": more}
 
@@ -87,9 +91,9 @@ class Table:
         self._check(row)
         return decode(self.manifest.file(row, "image_path"))
 
-    def panels(self, row: int) -> tuple[Array, float]:
-        """Return the panels of a row (see `touch_panels`) and its contact score, NaN without an untouched gel."""
-        return touch_panels(self.frame(row), self._untouched(row), self.threshold(row))
+    def layer(self, row: int, name: str) -> tuple[Array, float]:
+        """Return a layer of a row (see `touch_layer`) and its contact score, NaN without an untouched gel."""
+        return touch_layer(self.frame(row), self._untouched(row), self.threshold(row), name)
 
     def threshold(self, row: int) -> float:
         """Return the contact score above which a frame of the row's sensor shows contact."""
@@ -168,7 +172,7 @@ class Table:
             column = self.manifest.table[name]
             if name == "object" or not pa.types.is_floating(column.type):
                 distinct = column.unique().drop_null()
-                if 1 < len(distinct) <= _MOST_CHOICES or name == "object":
+                if len(distinct) > 1 and (len(distinct) <= _MOST_CHOICES or name == "object"):
                     values[name] = sorted(distinct.cast(pa.string()).to_pylist())[:_MOST_CHOICES]
         return values
 
@@ -185,7 +189,8 @@ class Table:
                 curves[name] = [None if value != value else value for value in column.to_pylist()]
             values = column.unique().drop_null().to_pylist()
             labels[name] = values[0] if len(values) == 1 else None if not values else f"{len(values)} values"
-        keys = {name: first.get(name) for name in ("sensor", "unit", "sequence", "object", "split", "dataset", "text")}
+        names = ("sensor", "unit", "sequence", "object", "split", "dataset", "text")
+        keys = {name: first[name] for name in names if first.get(name) not in (None, "", UNKNOWN, UNUSED)}
         return keys | {
             "rows": rows.tolist(), "frames": table["frame_index"].to_pylist(), "whole": whole, "labels": labels,
             "curves": {name: values for name, values in curves.items() if len(set(values)) > 1},
@@ -218,12 +223,17 @@ def scale_down(picture: Array, side: int = SIDE) -> Array:
     return picture if max(picture.shape[:2]) <= side else scale_picture(picture, side)
 
 
-def touch_panels(frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold: float) -> tuple[Array, float]:
-    """Return pictures side by side, RGB u8 (h, n w, 3), and the contact score.
+def touch_layer(
+    frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold: float, name: str
+) -> tuple[Array, float]:
+    """Return one of LAYERS as a picture RGB u8 (h, w, 3), and the contact score.
 
     They are the frame, its difference from the untouched gel as an encoder reads it, and its contact. Without a `gel`
-    (scaled down) of the same proportions, only the frame is shown, and the score is NaN.
+    (scaled down) of the same proportions, the frame is returned, and the score is NaN. Raises UserError for another
+    name.
     """
+    if name not in LAYERS:
+        raise UserError(f"A touch has the layers {', '.join(LAYERS)}, not {name[:20]}.")
     view = scale_down(frame)
     height, width = view.shape[:2]
     try:
@@ -232,18 +242,20 @@ def touch_panels(frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold
         change = None
     if gel is None or change is None:
         return view, float("nan")
-    background = gel[0] if gel[0].shape == view.shape else cv2.resize(gel[0], (width, height))
-    (difference,) = subtract_background([view], background)
-    mask = (cv2.resize(change, (width, height)) > threshold).astype(np.uint8)
-    contact = cv2.convertScaleAbs(view, alpha=1 / 3, beta=40)
-    cv2.copyTo(cv2.LUT(view, _TINTED), mask, contact)
-    return cv2.hconcat([view, difference, contact]), contact_score(change)
+    if name == "difference":
+        background = gel[0] if gel[0].shape == view.shape else cv2.resize(gel[0], (width, height))
+        (view,) = subtract_background([view], background)
+    elif name == "contact":
+        mask, tinted = (cv2.resize(change, (width, height)) > threshold).astype(np.uint8), cv2.LUT(view, _TINTED)
+        view = cv2.convertScaleAbs(view, alpha=1 / 3, beta=40)
+        cv2.copyTo(tinted, mask, view)
+    return view, contact_score(change)
 
 
 def open_folder(folder: Path) -> Table:
     """Return the pictures of a folder as one recording. Raises UserError if there are none."""
     frames, named = list_images(folder)
-    return Table(_one_recording(folder, [file.name for file in frames], named.get("background")), folder.name)
+    return Table(_one_recording(folder, [file.name for file in frames], named.get("background")), title(folder))
 
 
 def open_film(film: Path) -> Table:
@@ -251,14 +263,33 @@ def open_film(film: Path) -> Table:
     count = count_frames(film)
     if not count:
         raise UserError(f"{film} is no film that can be read. Name a manifest, a folder of pictures or a film.")
-    return Table(_one_recording(film.parent, [film.name] * count, None), film.name, film)
+    return Table(_one_recording(film.parent, [film.name] * count, None), film.stem, film)
+
+
+def open_examples() -> Table:
+    """Return the example touches of the package: two presses, each by three sensors."""
+    touches = [file.stem.split("-") for file in sorted(EXAMPLES.glob("*.jpg")) if file.stem.count("-") == 1]
+    names = ["-".join(touch) for touch in touches]
+    columns = {
+        "path": [f"{name}.jpg" for name in names], "sensor": [sensor for _, sensor in touches], "sequence": names,
+        "frame_index": [0] * len(names), "split": [UNUSED] * len(names), "touch": [press for press, _ in touches],
+        "background_path": [f"{name}-background.jpg" for name in names],
+    }  # fmt: skip
+    return Table(manifests.from_columns(columns, EXAMPLES / "manifest.parquet"), "examples")
+
+
+def title(path: Path) -> str:
+    """Return the name of a file or folder for people: a manifest or features are called by their folder."""
+    path = path.absolute()
+    plain = path.parent.name if path.stem in ("manifest", "features") else path.stem if path.suffix else path.name
+    return plain or "recordings"
 
 
 def _one_recording(folder: Path, names: list[str], background: Path | None) -> Manifest:
     count = len(names)
     columns: dict[str, Any] = {
-        "path": names, "sensor": [UNKNOWN] * count, "sequence": [folder.name or "/"] * count,
-        "frame_index": list(range(count)), "split": ["unused"] * count,
+        "path": names, "sensor": [UNKNOWN] * count, "sequence": [UNKNOWN] * count,
+        "frame_index": list(range(count)), "split": [UNUSED] * count,
     }  # fmt: skip
     if background is not None:
         columns["background_path"] = [background.name] * count

@@ -1,0 +1,212 @@
+"use strict";
+// Live touch, and a classifier that is taught by touching.
+
+const KEPT_LIVE = 300, HELD = 400; // points of a live curve, ms from which a pressed button was held
+
+const percent = (share) => `${Math.round(100 * share)} %`;
+
+// How good the head is, in words and as bars.
+function verdict(result) {
+  if (result.right === undefined) return [el("p", { className: "soft" }, "Record each name twice or more. Then the page measures how good the head is.")];
+  const range = (name) => (result[`${name}_low`] < result[`${name}_high`] ? ` (${Math.round(100 * result[`${name}_low`])} to ${Math.round(100 * result[`${name}_high`])})` : "");
+  const bar = (name, share, own, note) => {
+    const inner = el("i", { className: own ? "ours" : "" });
+    inner.style.width = `${100 * share}%`;
+    return [el("span", {}, name), el("span", { className: "track" }, inner), el("span", {}, percent(share) + note)];
+  };
+  const better = result.right > result.pixels;
+  return [el("p", {}, `Right on ${percent(result.right)} of frames of recordings that were left out. ${better
+    ? `Raw pixels reach ${percent(result.pixels)}.` : `Raw pixels reach ${percent(result.pixels)}, so the encoder adds nothing here.`}`),
+  el("div", { className: "bars small" }, ...bar("this head", result.right, true, range("right")),
+    ...bar("raw pixels", result.pixels, false, range("pixels")), ...bar("commonest name", result.chance, false, "")),
+  ...(result.once ? [el("p", { className: "soft small" }, `${result.once} names were recorded once only. They do not count here: record them again.`)] : [])];
+}
+
+function showLive(source, about) {
+  const canvas = el("canvas", { role: "img", ariaLabel: "live picture" }), curves = el("section", { className: "time" });
+  const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
+  const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
+  const pictures = about.table === null ? null : framesOf(about.table, "frame", true);
+  const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
+  let stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
+  let recorded = new Pictures(`${source}/recorded`, "frame", true);
+  const fact = (name, value, kind = "") => {
+    boxes[name] ??= facts.appendChild(el("div", { className: "fact" }, name, el("b")));
+    if (boxes[name].lastChild.textContent !== value) boxes[name].lastChild.textContent = value;
+    boxes[name].className = `fact ${kind}`;
+  };
+  // Orders go one after the other: a recording begins before it ends.
+  const send = (body, more) => (orders = orders.then(() => { say(""); return order(source, body, more); }).catch((error) => say(error.message, true)));
+  const turn = () => send({ do: "orient", rotate: Number(view.rotate), flip: view.flip });
+
+  // Teach: hold the button to record, or press it shortly to record until the next press.
+  const known = el("datalist", { id: "known-names" });
+  const object = el("input", { list: known.id, maxLength: 100, autocomplete: "off", placeholder: "cup" });
+  const record = el("button", { className: "main record" }, "Hold to record");
+  const begin = () => {
+    if (recording || pressed) { end(); return; }
+    pressed = performance.now();
+    send({ do: "record", object: object.value });
+  };
+  const end = () => { pressed = 0; send({ do: "stop" }); };
+  const release = () => { if (pressed && performance.now() - pressed > HELD) end(); else pressed = 0; };
+  const hold = (event) => [" ", "Enter"].includes(event.key) && (event.preventDefault(), true);
+  record.addEventListener("pointerdown", (event) => { if (event.button === 0) { record.setPointerCapture(event.pointerId); begin(); } });
+  record.addEventListener("pointerup", release);
+  record.addEventListener("pointercancel", release);
+  record.addEventListener("contextmenu", (event) => event.preventDefault());
+  record.addEventListener("keydown", (event) => { if (hold(event) && !event.repeat) begin(); });
+  record.addEventListener("keyup", (event) => { if (hold(event)) release(); });
+  record.addEventListener("click", (event) => { if (event.detail === 0 && !event.pointerType) begin(); }); // by a screen reader
+  const lifted = (event) => { if (event.key === "r") release(); };
+  const leave = () => { if (pressed) send({ do: "stop" }, { keepalive: true }); };
+  const names = el("ul", { className: "names" }), train = el("button", { onclick: () => send({ do: "train" }) }, "Train");
+  const missing = el("p", { className: "soft", role: "status" }), result = el("div", { className: "column" });
+  const save = (file) => guard(async () => {
+    const address = URL.createObjectURL(await (await api(`${source}/taught/${file}`)).blob());
+    el("a", { href: address, download: file }).click();
+    setTimeout(() => URL.revokeObjectURL(address), 10000);
+  });
+  const downloads = el("div", { className: "bar" }, el("button", { onclick: save("head.npz") }, "Download head"),
+    el("button", { onclick: save("recordings.zip") }, "Download recordings"));
+  const learn = guard(async () => {
+    const found = await json(`${source}/taught`), several = Object.entries(found.names);
+    recorded = new Pictures(`${source}/recorded`, "frame", true);
+    trained = found.trained;
+    known.replaceChildren(...several.map(([name]) => el("option", { value: name })));
+    names.replaceChildren(...several.map(([name, one]) => {
+      const count = `${one.recordings} ${one.recordings === 1 ? "recording" : "recordings"}`;
+      return el("li", {}, recorded.image(one.row, `a touch of ${name}`), el("span", {}, el("b", {}, name), el("span", { className: "soft small" }, count)),
+        el("button", { className: "quiet small", title: "Its frames stay on the disk.", ariaLabel: `Leave out last recording of ${name}`,
+          onclick: () => send({ do: "leave out", sequence: one.last }) }, "Leave out last"));
+    }));
+    train.disabled = found.training || Boolean(found.missing);
+    train.className = several.length > 1 && !found.trained ? "main" : "";
+    train.textContent = found.training ? (found.trained && found.result.right === undefined ? "Measuring …" : "Training …") : found.trained ? "Train again" : "Train";
+    missing.className = found.fault ? "alarm" : "soft";
+    missing.textContent = found.fault || (several.length ? found.missing : "Type a name, hold the button, and touch. Touch it again for a second recording. Then teach another name.");
+    downloads.hidden = !several.length;
+    downloads.firstChild.disabled = !found.trained;
+    const use = `anytouch stream --data ${/^\d+$/.test(about.source) ? about.source : "0"} ${about.sensor ? `--sensor ${about.sensor} ` : ""}--head ${found.file} --out -`;
+    result.replaceChildren(...(found.trained ? [...verdict(found.result), el("p", { className: "soft small" }, "Use it in a robot:"), el("code", {}, use)] : []));
+  });
+
+  const curve = (name, value, level) => {
+    if (!scores[name]) {
+      scores[name] = [];
+      curves.append(el("span", { className: "soft" }, name), el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), el("span"));
+    }
+    scores[name].push(value);
+    if (scores[name].length > KEPT_LIVE) scores[name].shift();
+    return () => {
+      const at = 3 * Object.keys(scores).indexOf(name);
+      chart(curves.children[at + 1], [{ values: scores[name], ...looks(at / 3) }], { level, length: KEPT_LIVE });
+      curves.children[at + 2].textContent = String(value);
+    };
+  };
+  const feel = (one) => {
+    const known = about.head || trained, bar = el("i", { className: "ours" });
+    feels.hidden = !known && one.contact === null;
+    sure.hidden = nearest.hidden = !known || one.contact === false || one.label === undefined;
+    if (!known) { felt.textContent = one.contact === null ? "" : one.contact ? "● Contact" : "○ No contact"; why.textContent = ""; return; }
+    if (one.contact === false) { felt.textContent = "○ No contact"; why.textContent = ""; return; }
+    if (one.label === undefined) return;
+    felt.textContent = one.label;
+    bar.style.width = `${100 * one.p}%`;
+    sure.replaceChildren(el("span", {}, "probability"), el("span", { className: "track" }, bar), el("span", {}, percent(one.p)));
+    const possible = one.set?.length === 1 ? "" : one.set?.length ? `It may be ${one.set.slice(0, 4).join(", ")}. ` : "No name is likely enough. ";
+    why.textContent = one.novelty === undefined ? "" : one.novel ? `Unlike every recording. ${one.set ? "" : possible}` : one.set ? possible : "";
+    fact("novelty", one.novelty === undefined ? "unknown" : `${one.novelty}${one.limit ? ` (limit ${one.limit})` : ""}`, one.novel ? "bad" : "");
+    fact("possible names", one.set ? one.set.slice(0, 4).join(", ") || "none" : "unknown");
+  };
+  const percentile = (values, share) => [...values].sort((a, b) => a - b)[Math.floor(share * (values.length - 1))] ?? 0;
+  const show = async (one, jpeg) => {
+    if (one.error) { say(one.error, true); return; }
+    const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
+    paint(canvas, bitmap);
+    bitmap.close();
+    const age = performance.timeOrigin + performance.now() - one.grabbed;
+    ages.push(age);
+    if (ages.length > 600) ages.shift();
+    const draws = Object.entries(one.curves).map(([name, value]) => curve(name, value, name === "contact" ? one.threshold : null));
+    main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
+    if (one.taught !== taught) { taught = one.taught; learn(); }
+    recording = one.recording.on;
+    if (one.frame % 10 && ages.length > 10) return; // text ten times as slow as pictures can be read
+    main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
+    draws.forEach((draw) => draw());
+    feel(one);
+    hidden.hidden = one.layer === state.layer;
+    record.textContent = recording ? `Recording ${one.recording.name}: ${one.recording.written} frames` : "Hold to record";
+    record.classList.toggle("on", recording);
+    const lost = one.recording.lost ? ` ${one.recording.lost} frames were lost, since the disk is slow.` : "";
+    if (recording) done = one.recording.done;
+    else if (done === null) done = one.recording.done; // what was recorded before this page
+    else if (one.recording.done !== done) { done = one.recording.done; say(done + lost, !/^\d/.test(done)); }
+    fact("untouched gel", one.gel);
+    fact("encoder p50, p99", `${one.encoder.map((value) => value.toFixed(1)).join(", ")} ms`);
+    fact("frame to features", `${one.age.map((value) => value.toFixed(1)).join(", ")} ms`);
+    fact("age on this page", `${percentile(ages, 0.5).toFixed(0)}, ${percentile(ages, 0.99).toFixed(0)} ms`, percentile(ages, 0.99) > 100 ? "bad" : "");
+    if (one.picture !== "ok" || one.missed) say(`The picture is ${one.picture}, ${one.missed} reads were missed.`, one.picture !== "ok");
+    const hits = JSON.stringify([one.near, one.recorded].map((found) => found?.map((hit) => hit.row)));
+    if (hits === shownNear) return;
+    shownNear = hits;
+    near.replaceChildren(...(one.near ?? []).map((hit) => hitCard(hit, pictures, guard(async () => {
+      if (pictures) select(about.table, (await json(`${about.table}/touch?row=${hit.table_row}`)).place);
+    }))));
+    nearest.replaceChildren(...(one.recorded ?? []).slice(0, 2).map((hit) =>
+      el("figure", {}, recorded.image(hit.table_row, `recorded touch of ${hit.about.object}`), el("figcaption", {}, `${hit.about.object}, alike ${hit.cosine.toFixed(2)}`))));
+  };
+  const read = guard(async () => {
+    stopped.abort();
+    stopped = new AbortController();
+    const reader = (await api(`${source}/stream?layer=${state.layer}`, { signal: stopped.signal })).body.getReader();
+    let data = new Uint8Array(0);
+    for (;;) {
+      const { value, done } = await reader.read();
+      if (done) { say("The stream has ended. Start `anytouch view` again.", true); return; }
+      const joined = new Uint8Array(data.length + value.length);
+      joined.set(data);
+      joined.set(value, data.length);
+      data = joined;
+      let newest = null;
+      for (;;) { // only the newest whole packet is drawn
+        const view = new DataView(data.buffer, data.byteOffset, data.length);
+        const text = data.length >= 4 ? view.getUint32(0, true) : 0, end = data.length >= 8 + text ? view.getUint32(4 + text, true) : 0;
+        if (data.length < 8 + text || data.length < 8 + text + end || data.length < 8) break;
+        newest = [JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + text))), data.slice(8 + text, 8 + text + end)];
+        data = data.slice(8 + text + end);
+      }
+      if (newest) await show(...newest);
+    }
+  });
+
+  const layers = layerBar(about.layers, read);
+  const hidden = el("span", { className: "soft", hidden: true }, "The untouched gel is not known yet, so the picture is shown.");
+  const background = el("button", { onclick: () => send({ do: "background" }) }, "Capture the untouched gel");
+  const feels = el("section", { className: "card", hidden: true }, felt, sure, why, nearest);
+  const panel = el("div", { className: "column" }, feels,
+    el("section", { className: "card" }, el("h3", {}, "Teach it a touch"), el("label", { className: "tall" }, "name of what you touch", object), known, record, names,
+      missing, train, result, downloads));
+  const more = el("details", {}, el("summary", {}, "Camera and latency"), el("div", { className: "column" }, el("div", { className: "bar" },
+    option("rotate", [0, 90, 180, 270].map((angle) => [angle, `${angle}°`]), 0, (value) => { view.rotate = value; turn(); }),
+    option("flip", [["none", "none"], ["across", "left-right"], ["down", "top-bottom"]], "none", (value) => { view.flip = value; turn(); }),
+    background, el("button", { onclick: () => send({ do: "no background" }) }, "Estimate it again")), facts));
+  main.replaceChildren(el("div", { className: "split live" },
+    el("div", { className: "column" }, el("div", { className: "bar" }, el("h2", {}, state.sources[source].name), el("div", { className: "push" }, layers.node)),
+      el("div", { className: "stage" }, canvas), hidden, curves, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
+    panel), more);
+  keys([["r", "hold to record", () => { if (!state.repeated) begin(); }], ["l", "next layer", layers.next], ["b", "capture the untouched gel", () => background.click()]]);
+  document.addEventListener("keyup", lifted);
+  window.addEventListener("pagehide", leave);
+  window.addEventListener("blur", release);
+  fact("encoder", `${about.encoder}, ${about.sensor ?? "universal tokens"}`);
+  state.stop = () => {
+    leave();
+    stopped.abort();
+    document.removeEventListener("keyup", lifted);
+    window.removeEventListener("pagehide", leave);
+    window.removeEventListener("blur", release);
+  };
+  read();
+}

@@ -220,12 +220,9 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     assert len(frames) == 3 and {name: file.name for name, file in other.items()} == {
         "background": "background.jpg", "photo": "Photo.png"
     }  # fmt: skip
-    order = sorted(["1690.5.png", "1690.4666.png", "1689.9.png"], key=images.frame_sort_key)
-    assert order == ["1689.9.png", "1690.4666.png", "1690.5.png"]
     stamps = ["0.8.bmp", "0.9.bmp", "1.bmp", "1.1.bmp", "2.bmp", "1690000000000000001.bmp", "1690000000000000002.bmp"]
-    turned = stamps[::-1]
-    assert sorted(turned, key=images.frame_sort_key) == stamps  # whole seconds are written without a point
-    assert sorted(["b.png", "img10.png", "img9.png", "3.png"], key=images.frame_sort_key)[:2] == ["3.png", "b.png"]
+    assert images.frame_order(stamps[::-1]) == (stamps, True)  # whole seconds are written without a point
+    assert images.frame_order(["b.png", "img10.png", "3.png"]) == (["b.png", "img10.png", "3.png"], False)
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
         with pytest.raises(images.ImageError, match=words):
@@ -356,6 +353,27 @@ def test_frames_are_numbered_by_what_counts_them():
         assert images.frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
     stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
     assert images.frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
+
+
+_TIMES = [1731000000.0 + i / 30 for i in range(20)]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        *([form.format(time) for time in _TIMES] for form in ("{}.png", "gel_{}.png", "D20012_{}_raw.png", "a.{}.png")),
+        [f"2024-01-05_gel_{time - _TIMES[0]}.png" for time in _TIMES],  # 0.0, 0.0333..., 0.1
+        [f"{time / 1e5 - 17310}.png" for time in _TIMES],  # 3.3e-07
+        [f"{('free', 'contact')[i % 3 == 0]}_{time}.png" for i, time in enumerate(_TIMES)],
+        [f"{('free', 'contact')[i % 3 == 0]}_{i}.png" for i in range(12)],
+        [f"{i * 7919 % 1013}_{i}.png" for i in range(12)],  # a value, then a counter
+        [f"{i * 7919 % 4096:x}x_{i:03d}.png" for i in range(12)],  # a hash, then a counter
+        [f"1.{i}.png" for i in range(1, 13)],  # frame 10 of touch 1
+        [f"2024.5.{i}.png" for i in range(1, 13)], [f"take{i // 3}_frame{i % 3}.png" for i in range(12)],
+    ],
+)  # fmt: skip
+def test_frames_come_in_the_order_of_the_numbers_in_their_names(names):
+    assert images.frame_order(sorted(names, key=lambda name: name[::-1])) == (names, True)
 
 
 @pytest.mark.parametrize(

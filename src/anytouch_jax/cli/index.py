@@ -36,8 +36,12 @@ class DatasetOptions:
     export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
     sensor: str | None = None
     """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new name."""
-    split_by: Literal["object", "recording"] = "object"
-    """recordings: hold out whole objects, or recordings of each object."""
+    split_by: str | None = None
+    """recordings: what is held out: object, recording (a single picture is one), a column of the labels, or the part of
+    the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default: object. For single pictures: recording."""
+    singles: bool = False  # recordings: every picture is a touch alone. By default names decide, and a few pictures.
+    films: bool = False  # recordings: every folder of pictures is a film.
+    order: Literal["names", "times"] = "names"  # recordings: order frames by their names, or by the times of the files.
     labels: Path | None = None
     """recordings: CSV table with a column object, sequence or both. Each other column becomes label.NAME, but unit,
     touch and text keep their names."""

@@ -143,8 +143,7 @@ def index(
     manifest = manifests.from_columns(columns, target)
     manifest.clips(2)  # raises for a repeated frame
     _check_links(manifest, base)
-    groups = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
-    manifest = _carry_over(manifest, target, rows.notes, keep=keep, groups=groups)
+    manifest = _carry_over(manifest, target, rows.notes, keep=keep, groups=rows.keep_together)
     try:
         marked = manifest.table.replace_schema_metadata({_INDEX_KEY: manifest.content_hash.encode()})
         manifests.write(replace(manifest, table=marked), target)

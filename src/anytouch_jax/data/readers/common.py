@@ -53,6 +53,7 @@ class IndexOptions:
     `lists`: a folder with list files, searched before ROOT. `task`: the lists of Touch and Go that decide the split.
     `fold`: the `split_<k>.npy` of Feel. `export`: write pictures into ROOT for datasets of arrays or videos. `sensor`,
     `split_by`, `labels`: for recordings, their sensor, what is held out, and a table of labels by object or sequence.
+    `singles`, `films`: whether pictures are single touches or films (default: by their names). `order`: of frames.
     `url`: the address of shards that are not in ROOT. `keys`: tactile cameras, or topics of images. `values`: what else
     becomes a label, as NAME=PLACE.
     """
@@ -64,7 +65,10 @@ class IndexOptions:
     fold: int = 0
     export: bool = False
     sensor: str | None = None
-    split_by: Literal["object", "recording"] = "object"
+    split_by: str | None = None
+    singles: bool = False
+    films: bool = False
+    order: Literal["names", "times"] = "names"
     labels: Path | None = None
     url: str | None = None
     keys: tuple[str, ...] = ()
@@ -110,6 +114,7 @@ class DatasetIndex:
         self.name, self.root, self.options = name, root, options or IndexOptions()
         self.skipped: dict[str, tuple[int, str]] = {}
         self.notes: list[str] = []
+        self.keep_together = ("sequence", "object")  # columns whose values stay in one split
         self.contact: dict[str, list[str]] | None = None  # the authors' list of contact frames: path -> its cells
         self._contact_rows = 0
         self.table: Columns = {name: [] for name in REQUIRED}

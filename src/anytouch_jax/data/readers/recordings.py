@@ -15,25 +15,30 @@ objects, or recordings without objects, are held out. With `--split-by recording
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.data import images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
-from anytouch_jax.data.manifest.schema import EMPTY, typed_label
+from anytouch_jax.data.manifest.schema import EMPTY, REQUIRED, typed_label
+from anytouch_jax.data.readers import trees
 from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
     DatasetReader,
-    Frames,
     IndexOptions,
     export_video,
     read_lines,
 )
+from anytouch_jax.data.readers.trees import Place
+from anytouch_jax.errors import UserError
 
 CAPTION = "caption.txt"
 MANIFESTS = (".csv", ".parquet")  # of an earlier index
@@ -42,13 +47,24 @@ LABEL_KEYS = ("object", "sequence")
 PLAIN_COLUMNS = ("unit", "touch", "text")  # columns of a label table that do not become label.<name>
 
 
+class _Recording(NamedTuple):
+    """A folder's frames of one finger, in order. `place` is how its folder was understood."""
+
+    folder: str
+    unit: str
+    names: list[str]
+    place: Place
+
+
 def read(index: DatasetIndex) -> None:
-    """Add every folder of pictures. Raises UserError without a sensor."""
+    """Add every folder of pictures. Raises UserError without a sensor, and for options that exclude each other."""
     root, options = index.root, index.options
     sensor = index.need_sensor()
+    if options.singles and options.films:
+        raise UserError("--singles and --films exclude each other; give one of them, or none")
     if options.export:
         _export_videos(index)
-    recordings: dict[str, dict[str, Frames]] = {}  # folder -> finger -> frames
+    found: dict[str, dict[str, list[str]]] = {}  # folder -> finger -> names
     shared: dict[str, dict[str, Any]] = {}  # folder -> cells from the files in it and in the folders above
     for folder, folders, files in index.walk():
         shared[folder] = shared.get(folder.rpartition("/")[0], {}) | _shared_cells(root, folder, files)
@@ -58,19 +74,70 @@ def read(index: DatasetIndex) -> None:
         # A video with a folder of its name has been exported.
         files = [name for name in files if not (_is_video(name) and Path(name).stem in folders)]
         if fingers := _fingers(index, files, folder):
-            recordings[folder] = fingers
-    splits = _splits(index, list(recordings))
-    for folder, fingers in recordings.items():
-        for unit, frames in fingers.items():
-            sequence = f"{folder}/{unit}".strip("/") or "."
-            index.add_recording(frames, folder, split=splits[folder], sensor=sensor, sequence=sequence,
-                                unit=unit or None, object=folder.split("/")[0] or None, dataset=root.name,
-                                **shared[folder])  # fmt: skip
-    if options.labels is not None and recordings:
-        _join_labels(index, options.labels.expanduser())
-    for split in ("val", "test"):
-        if recordings and split not in splits.values() and getattr(options, split):
-            index.notes.append(f"there are too few objects or recordings for split {split}")
+            found[folder] = fingers
+    places = trees.understand(found)
+    recordings = [
+        _Recording(folder, unit, names, places[folder])
+        for folder, fingers in found.items()
+        for unit, names in fingers.items()
+    ]
+    films = _films(index, recordings)
+    sequences = trees.sequences([(one.place, one.unit, one.names) for one in recordings], films)
+    parts: list[str] = []  # of every row: the recording that is never split, a folder or a single picture
+    given: list[str | None] = []  # of every row: the split that a folder decides
+    for one, is_film, sequence in zip(recordings, films, sequences, strict=True):
+        paths = [f"{one.folder}/{name}".lstrip("/") for name in one.names]
+        index.add(
+            paths, sensor=sensor, unit=one.unit or None, object=one.place.object, dataset=root.name, sequence=sequence,
+            frame_index=_frame_numbers(index, one.names) if is_film else 0, **shared[one.folder],
+        )  # fmt: skip
+        parts += [one.folder] * len(paths) if is_film else paths
+        given += [one.place.split] * len(paths)
+    if recordings:
+        index.notes.insert(0, trees.sentence([one.place for one in recordings], films))
+        if options.labels is not None:
+            _join_labels(index, options.labels.expanduser(), parts)
+        _assign_splits(index, parts, given, "recording" if 2 * sum(films) < len(films) else "object")
+
+
+def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
+    """Return whether the pictures of each recording are a film, and put them in order; else each is a touch alone.
+
+    A film counts its frames or gives steady times in their names. Where each object has one folder, a few pictures of
+    it must look so too: they may be numbered single touches.
+    """
+    options, unclear = index.options, list[str]()
+    films = [options.films or options.order == "times"] * len(recordings)
+    for at, one in enumerate(recordings):
+        one.names[:], is_clear = images.frame_order(one.names)
+        if options.order == "times":
+            times = {name: os.stat(index.root / one.folder / name).st_mtime_ns for name in one.names}
+            one.names.sort(key=times.__getitem__)
+            is_clear = len(set(times.values())) == len(times)
+        films[at] = not options.singles and (films[at] or images.looks_like_film(one.names) or len(one.names) == 1)
+        if films[at] and not is_clear:
+            unclear.append(one.folder or ".")
+    if unclear:
+        what = "times of the files" if options.order == "times" else "names"
+        advice = "" if options.order == "times" else "; --order times takes the times of the files"
+        index.notes.append(f"the {what} do not order {len(unclear)} recordings clearly (first: {unclear[0]}){advice}")
+    if options.singles or options.films or options.order == "times":
+        return films
+    several = [at for at, one in enumerate(recordings) if films[at] and len(one.names) > 1]
+    objects = [(recordings[at].place.split, recordings[at].place.object, recordings[at].unit) for at in several]
+    if len(set(objects)) == len(objects):
+        spread = np.unique(np.linspace(0, len(several) - 1, min(8, len(several))).astype(int))
+        chosen = [recordings[several[at]] for at in spread]
+        if not trees.moves_like_film([[index.root / one.folder / name for name in one.names] for one in chosen]):
+            films = [is_film and at not in several for at, is_film in enumerate(films)]
+        elif len({one for _, one, _ in objects}) > 1:
+            index.notes.append("each object has one recording; if its pictures are single touches, give --singles")
+    if alone := [one.folder for one, is_film in zip(recordings, films, strict=True) if not is_film]:
+        index.notes.append(
+            f"the pictures of {len(alone)} folders (first: {alone[0] or '.'}) do not look like a film: each is a single "
+            "touch; --films makes a recording of each folder"
+        )
+    return films
 
 
 def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]:
@@ -89,18 +156,54 @@ def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]
     return dict(zip(order, parts, strict=True))
 
 
-def _splits(index: DatasetIndex, folders: list[str]) -> dict[str, str]:
-    """Return the split of every recording: that of its object, or a part of each object's recordings."""
-    options = index.options
-    objects: dict[str, list[str]] = {}
-    for folder in folders:
-        objects.setdefault(folder.split("/")[0], []).append(folder)
-    if options.split_by == "recording":
-        return {name: split for one in objects.values() for name, split in ranked_split(one, options).items()}
-    if len(objects) > 1 and options.val + options.test > 0:
+def _frame_numbers(index: DatasetIndex, names: list[str]) -> list[int]:
+    return images.frame_numbers(names) if index.options.order == "names" else list(range(len(names)))
+
+
+def _assign_splits(index: DatasetIndex, parts: list[str], given: list[str | None], default: str) -> None:
+    """Fill column split: what a folder decides, else by rank of the groups that `--split-by` names.
+
+    Groups are ranked inside each object, unless they are the objects or span several. `parts` (rows,) are never split.
+    """
+    options, table = index.options, index.table
+    by = options.split_by or default
+    index.keep_together = ("sequence", "object") if by == "object" else ("sequence",)
+    values = parts if by == "recording" else _group_values(table, by)
+    groups: dict[str, str] = {}  # of each part
+    objects: dict[str, set[str | None]] = {}
+    for part, value, obj, split in zip(parts, values, table["object"], given, strict=True):
+        if split is None:
+            objects.setdefault(groups.setdefault(part, part if value is None else str(value)), set()).add(obj)
+    pools: dict[Any, set[str]] = {}
+    is_whole = by == "object" or any(len(one) > 1 for one in objects.values())
+    for group, of in objects.items():
+        pools.setdefault(None if is_whole else min(map(str, of)), set()).add(group)
+    ranked = {group: split for pool in pools.values() for group, split in ranked_split(pool, options).items()}
+    table["split"] = [split or ranked[groups[part]] for part, split in zip(parts, given, strict=True)]
+    if by == "object" and len(objects) > 1 and options.val + options.test > 0:
         index.notes.append("whole objects are held out; for a classifier of objects: --split-by recording")
-    split = ranked_split(objects, options)
-    return {folder: split[folder.split("/")[0]] for folder in folders}
+    for split in ("val", "test"):
+        if split not in table["split"] and getattr(options, split):
+            reason = "there are too few objects or recordings for" if objects else "no folder is of"
+            index.notes.append(f"{reason} split {split}")
+
+
+def _group_values(table: dict[str, list[Any]], by: str) -> list[Any]:
+    """Return the group of every row: a column, or the first part in parentheses of a pattern in its path."""
+    if "(" in by:
+        try:
+            find = re.compile(by).search
+        except re.error as error:
+            raise UserError(f"--split-by {by!r} is no pattern: {error}; write a part of the path as '(p[0-9]+)_'") from None
+        matches = [find(path) for path in table["path"]]
+        if not any(matches):
+            raise UserError(f"--split-by {by!r} is in no path, such as {table['path'][0]}; correct the pattern")
+        return [match and match[1] for match in matches]
+    column = table.get(by, table.get(f"label.{by}"))
+    if column is None:
+        known = ", ".join(name for name in table if name not in REQUIRED)
+        raise UserError(f"--split-by {by!r} is no column; give object, recording, a pattern, or one of {known}")
+    return column
 
 
 def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
@@ -119,10 +222,10 @@ def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
     return cells
 
 
-def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Frames]:
-    """Return the pictures of a folder in order with their numbers, by finger; arrays only if there is nothing else."""
+def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, list[str]]:
+    """Return the pictures of a folder by finger; arrays only if there is nothing else."""
     names = []
-    for name in sorted(files, key=images.frame_sort_key):
+    for name in sorted(files, key=images.natural):
         path, stem, suffix = f"{folder}/{name}".lstrip("/"), Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
@@ -134,10 +237,7 @@ def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Fr
     if arrays and len(arrays) < len(names):
         index.skip("array next to pictures", f"{folder}/{arrays[0]}", len(arrays))
         names = [name for name in names if name not in arrays]
-    if not names:
-        return {}
-    series = images.split_series(names)
-    return {unit: dict(zip(images.frame_numbers(one), one, strict=True)) for unit, one in series.items()}
+    return images.split_series(names) if names else {}
 
 
 def _is_video(name: str) -> bool:
@@ -163,10 +263,10 @@ def _export_videos(index: DatasetIndex) -> None:
                     index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
 
 
-def _join_labels(index: DatasetIndex, path: Path) -> None:
+def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
     """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes first.
 
-    Names match in any Unicode form. Lines without a recording, and recordings without a line, are skipped. Raises
+    A sequence may be named by its folder or picture in `parts` too. Names match in any Unicode form. Lines without a recording, and recordings without a line, are skipped. Raises
     DatasetError for a table that is missing, has no key, or has a column or a key twice.
     """
     names, lines = _read_labels(path)
@@ -174,8 +274,9 @@ def _join_labels(index: DatasetIndex, path: Path) -> None:
     labels: dict[str, list[Any]] = {name: [None] * size for name in names if name not in LABEL_KEYS}
     used: set[tuple[str | None, str | None]] = set()
     unlabelled: dict[str, None] = {}
-    for row, (obj, sequence) in enumerate(zip(table["object"], table["sequence"], strict=True)):
-        names_of = _plain(obj), _plain(sequence)
+    for row, (obj, sequence, part) in enumerate(zip(table["object"], table["sequence"], parts, strict=True)):
+        by_part = any(key in lines for key in ((None, _plain(part)), (_plain(obj), _plain(part))))
+        names_of = _plain(obj), _plain(part if by_part else sequence)
         keys = [key for key in ((names_of[0], None), (None, names_of[1]), names_of) if any(key) and key in lines]
         used.update(keys)
         for name, cell in (item for key in keys for item in lines[key].items()):
@@ -234,6 +335,6 @@ READERS = {
         "<object>/<recording>/0.png",
         "nothing, unless their owner asks for it",
         "as their owner says",
-        uses=("val", "test", "split_by", "sensor", "labels", "export"),
+        uses=("val", "test", "split_by", "sensor", "labels", "export", "singles", "films", "order"),
     )
 }

@@ -242,7 +242,9 @@ def test_split_words_decide_splits_and_name_nothing(tmp_path, read, form, splits
         assert row["split"] == next(part for split, part in of.items() if f"{split}/" in f"{path}/")
         assert not {*splits, *parts} & {*row["sequence"].split("/")}
     assert len(set(table["sequence"])) == 6
-    assert "<split>" in table.report.notes[0] and f"{splits[1]} is split val" in table.report.notes[0] or "val" in splits
+    assert (
+        "<split>" in table.report.notes[0] and f"{splits[1]} is split val" in table.report.notes[0] or "val" in splits
+    )
 
 
 def test_a_path_in_two_splits_is_refused_and_folders_outside_are_ranked(tmp_path, read):

@@ -194,7 +194,9 @@ def _group_values(table: dict[str, list[Any]], by: str) -> list[Any]:
         try:
             find = re.compile(by).search
         except re.error as error:
-            raise UserError(f"--split-by {by!r} is no pattern: {error}; write a part of the path as '(p[0-9]+)_'") from None
+            raise UserError(
+                f"--split-by {by!r} is no pattern: {error}; write a part of the path as '(p[0-9]+)_'"
+            ) from None
         matches = [find(path) for path in table["path"]]
         if not any(matches):
             raise UserError(f"--split-by {by!r} is in no path, such as {table['path'][0]}; correct the pattern")

@@ -46,7 +46,8 @@ class DatasetOptions:
     """recordings: CSV table with a column object, sequence or both. Each other column becomes label.NAME, but unit,
     touch and text keep their names."""
     url: str | None = None  # gelsight_mini_pretrain, fota, webdataset: address of the shards, as s3://BUCKET/FOLDER.
-    keys: tuple[str, ...] = ()  # lerobot, freetacman: tactile cameras. bags: topics of tactile images.
+    keys: tuple[str, ...] = ()
+    """lerobot, freetacman: tactile cameras. bags: topics of tactile images. webdataset: fields, as left.jpg."""
     values: tuple[str, ...] = ()
     """lerobot: features that become labels. bags: labels from other topics, as force_z=/ft:wrench.force.z."""
 

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from PIL import BmpImagePlugin, ImageFile, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 
+from anytouch_jax.data.films import PyAvFilm
 from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
@@ -362,11 +363,32 @@ def count_frames(path: str | Path) -> int:
 
 
 def open_video(path: str | Path) -> cv2.VideoCapture:
-    """Open a video. Raises ImageError for a web page or a Git LFS pointer in its place."""
+    """Open a video, by PyAV if OpenCV cannot decode it.
+
+    Raises ImageError for a web page or a Git LFS pointer in its place, and for a codec that cannot be decoded.
+    """
     if Path(path).is_file() and (kind := placeholder(path)):
         raise ImageError(f"{path} is {kind}")
-    with QUIET:  # FFmpeg takes the part of a relative name before a colon for a protocol
-        return cv2.VideoCapture(os.path.abspath(path))
+    place = os.path.abspath(path)  # FFmpeg takes the part of a relative name before a colon for a protocol
+    with QUIET:
+        video = cv2.VideoCapture(place)
+        if not video.isOpened():
+            return video
+        codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace").strip("\0 ")
+        if video.grab():
+            return cv2.VideoCapture(place)  # some formats cannot go back
+    try:
+        film = PyAvFilm(place)
+        if film.grab() and film.open(place):
+            return film
+    except ImportError:
+        raise ImageError(
+            f"OpenCV cannot decode {path}, a video of the codec {codec}: pip install 'anytouch_jax[lerobot]' to read it, "
+            "or convert it with ffmpeg -i IN -c:v libx264 OUT.mp4"
+        ) from None
+    except OSError:
+        pass
+    return video
 
 
 def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:

@@ -19,12 +19,10 @@ from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
     DatasetReader,
-    export_video,
     read_json,
     read_pickle,
-    save_png,
 )
-from anytouch_jax.files import atomic_write
+from anytouch_jax.data.readers.exports import Export, export_video, exported
 
 _SPARSH = "Higuera et al., Sparsh: Self-supervised touch representations for vision-based tactile sensing, CoRL 2024"
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
@@ -48,8 +46,11 @@ def _force(index: DatasetIndex) -> None:
         slides = content.get("trajectories", content) if isinstance(content, dict) else None
         if not isinstance(slides, dict) or not files:
             raise DatasetError(f"{index.root / folder} has no slides or no frames; download it again")
-        written = index.tracked(frames, "frames written")
-        names = [_picture(index, frame, f"{folder}/frames/{i:06d}") for i, frame in enumerate(written)]
+        sources = [index.root / folder / name for name in files]
+        with exported(index, f"{folder}/frames", "frames", sources) as pictures:
+            written = enumerate(index.tracked(frames, "frames written"))
+            names = [_picture(pictures, frame, f"{i:06d}", sources[0]) for i, frame in written]
+        names = [f"{pictures.folder}/{name}" for name in names]
         contact = np.ravel(content.get("in_contact", np.ones(len(names))))
         free = np.flatnonzero(contact == 0)
         gel = names[int(free[0])] if len(free) and free[0] < len(names) else None
@@ -101,7 +102,10 @@ def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise DatasetError(f"{path}: {error} is missing or of an odd shape; download it again") from None
         name = f"{part}/{folder}/{bag.removesuffix('.pkl')}/{finger}"
-        names = [_picture(index, frames[i], f"{name}/{i:06d}") for i in index.tracked(range(count), "frames written")]
+        with exported(index, name, finger, [path]) as pictures:
+            written = index.tracked(range(count), "frames written")
+            names = [_picture(pictures, frames[i], f"{i:06d}", path) for i in written]
+        names = [f"{pictures.folder}/{one}" for one in names]
         gel = f"bgs/digit_{finger}.png"
         yaw = np.degrees(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]))  # the last of Euler's angles "xyz"
         index.add(
@@ -118,17 +122,16 @@ def _list(path: Path) -> list[Any]:
     return frames
 
 
-def _picture(index: DatasetIndex, frame: Any, name: str) -> str:
-    """Write a frame of a pickle, an encoded picture or an array, and return its path below ROOT."""
+def _picture(pictures: Export, frame: Any, name: str, path: Path) -> str:
+    """Write a frame of a pickle, an encoded picture or an array, and return the name of its file."""
     if isinstance(frame, bytes):
-        suffix = next((end for magic, end in _MAGIC.items() if frame.startswith(magic)), ".png")
-        if not (file := index.root / f"{name}{suffix}").is_file():
-            atomic_write(file, frame, sync=False)
-        return f"{name}{suffix}"
+        name += next((end for magic, end in _MAGIC.items() if frame.startswith(magic)), ".png")
+        pictures.save(name, frame)
+        return name
     picture = np.asarray(frame)
     if picture.dtype != np.uint8 or picture.ndim != 3:
-        raise DatasetError(f"a frame for {index.root / name} is no picture; download the data again")
-    save_png(index.root / f"{name}.png", picture)
+        raise DatasetError(f"frame {name} of {path} is no picture; download the data again")
+    pictures.save(f"{name}.png", picture)
     return f"{name}.png"
 
 
@@ -173,19 +176,17 @@ def _freetacman(index: DatasetIndex) -> None:
     columns of <task>_<n>_traj.csv, such as `gripper_distance`, become labels if it has a row a frame.
     """
     wanted = index.options.keys or ("tactile",)
-    for folder, folders, files in index.tracked(list(index.walk())):
+    for folder, _, files in index.tracked(list(index.walk())):
         for name in (name for name in files if name.endswith(".mp4")):
             stem = Path(name).stem
             if not any(key in stem for key in wanted):
                 index.skip("film of another camera", f"{folder}/{name}")
                 continue
             index.need_export(f"{name} and other films")
-            place = f"{folder}/{stem}".lstrip("/")
             try:
-                if stem not in folders:
-                    export_video(index.root / folder / name)
-            except ImageError:
-                index.skip("film that cannot be read", place)
+                place = export_video(index, f"{folder}/{name}".lstrip("/"))
+            except ImageError as error:
+                index.skip("film that cannot be read", str(error))
                 continue
             frames = index.frames(place)
             times: Any = _times(index.root / folder / f"{stem}_timestamps.txt", len(frames))

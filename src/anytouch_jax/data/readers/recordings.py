@@ -34,9 +34,9 @@ from anytouch_jax.data.readers.common import (
     DatasetIndex,
     DatasetReader,
     IndexOptions,
-    export_video,
     read_lines,
 )
+from anytouch_jax.data.readers.exports import export_video, find_export, is_current
 from anytouch_jax.data.readers.trees import Place
 from anytouch_jax.errors import UserError
 
@@ -71,8 +71,8 @@ def read(index: DatasetIndex) -> None:
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
             index.skip(f"folder called {BACKGROUND} or {PHOTO}, where one picture is expected", folder)
             continue
-        # A video with a folder of its name has been exported.
-        files = [name for name in files if not (_is_video(name) and Path(name).stem in folders)]
+        if not options.export:
+            _skip_videos(index, folder, folders, files)
         if fingers := _fingers(index, files, folder):
             found[folder] = fingers
     places = trees.understand(found)
@@ -133,9 +133,10 @@ def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
         elif len({one for _, one, _ in objects}) > 1:
             index.notes.append("each object has one recording; if its pictures are single touches, give --singles")
     if alone := [one.folder for one, is_film in zip(recordings, films, strict=True) if not is_film]:
+        where = f"{len(alone)} folders (first: {alone[0] or '.'})"
         index.notes.append(
-            f"the pictures of {len(alone)} folders (first: {alone[0] or '.'}) do not look like a film: each is a single "
-            "touch; --films makes a recording of each folder"
+            f"the pictures of {where} do not look like a film: each is a single touch; --films makes a recording of "
+            "each folder"
         )
     return films
 
@@ -167,7 +168,7 @@ def _assign_splits(index: DatasetIndex, parts: list[str], given: list[str | None
     """
     options, table = index.options, index.table
     by = options.split_by or default
-    index.keep_together = ("sequence", "object") if by == "object" else ("sequence",)
+    index.keep_together = ["sequence", "object"] if by == "object" else ["sequence"]
     values = parts if by == "recording" else _group_values(table, by)
     groups: dict[str, str] = {}  # of each part
     objects: dict[str, set[str | None]] = {}
@@ -231,9 +232,7 @@ def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, li
         path, stem, suffix = f"{folder}/{name}".lstrip("/"), Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
-        elif _is_video(name):
-            index.skip("video (--export writes its frames as pictures)", path)
-        elif suffix not in (*SUFFIXES, *MANIFESTS) and name.lower() != CAPTION:
+        elif suffix not in (*SUFFIXES, *MANIFESTS, *VIDEOS) and name.lower() != CAPTION:
             index.skip("file that is no picture", path)
     arrays = [name for name in names if Path(name).suffix.lower() == ".npy"]
     if arrays and len(arrays) < len(names):
@@ -247,29 +246,32 @@ def _is_video(name: str) -> bool:
 
 
 def _export_videos(index: DatasetIndex) -> None:
-    """Write the frames of every video as 000000.png, ... into a folder of its name, unless that exists.
-
-    A video that cannot be read is skipped. Raises UserError if nothing can be written.
-    """
-    for folder, folders, files in index.tracked(list(index.walk(count=False))):  # before any is made
-        for video in (index.root / folder / name for name in files if _is_video(name)):
-            if video.stem in folders:
-                continue
-            folders.append(video.stem)
+    """Write the frames of every video into a folder of its name. A video that cannot be read is skipped."""
+    for folder, _, files in index.tracked(list(index.walk(count=False))):  # before any is made
+        for video in (f"{folder}/{name}".lstrip("/") for name in files if _is_video(name)):
             try:
-                count = export_video(video)
-            except images.ImageError:
-                index.skip("video that cannot be read", str(video))
-            else:
-                if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
-                    index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
+                export_video(index, video)
+            except images.ImageError as error:
+                index.skip("video that cannot be read", str(error))
+
+
+def _skip_videos(index: DatasetIndex, folder: str, folders: list[str], files: list[str]) -> None:
+    """Report the videos of a folder without pictures, or with those of an earlier video."""
+    for name in filter(_is_video, files):
+        path = f"{folder}/{name}".lstrip("/")
+        place, record = find_export(index.root, path.removesuffix(Path(name).suffix), name)
+        if record is not None and not is_current(record, [index.root / path]):
+            index.skip(f"video that was changed after its pictures in {place} (--export writes them again)", path)
+        elif record is None and Path(name).stem not in folders:
+            index.skip("video (--export writes its frames as pictures)", path)
 
 
 def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
     """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes first.
 
-    A sequence may be named by its folder or picture in `parts` too. Names match in any Unicode form. Lines without a recording, and recordings without a line, are skipped. Raises
-    DatasetError for a table that is missing, has no key, or has a column or a key twice.
+    A sequence may be named by its folder or picture in `parts` too. Names match in any Unicode form. Lines without a
+    recording, and recordings without a line, are skipped. Raises DatasetError for a table that is missing, has no key,
+    or has a column or a key twice.
     """
     names, lines = _read_labels(path)
     table, size = index.table, len(index.table["path"])

@@ -38,7 +38,7 @@ class Place(NamedTuple):
 
 
 def split_word(name: str) -> str | None:
-    """Return the split that a folder's name says, in any case: train, Training, valid, test_set, ... None for others."""
+    """Return the split that a folder's name says, in any case: Training, valid, test_set; None for others."""
     match = _SPLIT.fullmatch(name)
     return match and _WORDS[match[1].lower()]
 
@@ -58,8 +58,8 @@ def understand(folders: Iterable[str]) -> dict[str, Place]:
         if any(words):
             above.append(names[: next(at for at, word in enumerate(words) if word)])
             rest.append(words.count(None))
-    shared = len(os.path.commonprefix(above)) if above else 0  # type: ignore[type-var]
-    shared = max(0, min([shared, *(count - 1 for count in rest if count)]))
+    wrapping = [len(set(level)) == 1 for level in zip(*above, strict=False)]
+    shared = max(0, min([(*wrapping, False).index(False), *(count - 1 for count in rest if count)]))
     return {folder: _place(names, shared) for folder, names in parts.items()}
 
 

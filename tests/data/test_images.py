@@ -1,5 +1,6 @@
 import io
 import struct
+import sys
 import zlib
 
 import cv2
@@ -508,3 +509,32 @@ def test_an_array_cannot_declare_more_than_it_has(shape, kind, words):
     np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
     with pytest.raises(ImageError, match=words):
         decode_bytes(stream.getvalue() + bytes(48), "x.npy")
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv"])
+def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(tmp_path, monkeypatch, ending):
+    av = pytest.importorskip("av")
+    codec = next((name for name in ("libsvtav1", "libaom-av1") if name in av.codecs_available), None)
+    if codec is None:
+        pytest.skip("this build of PyAV writes no AV1")
+    film, greys = tmp_path / f"film.{ending}", [60 + 20 * i for i in range(6)]
+    with av.open(str(film), "w") as out:
+        stream = out.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for grey in greys:
+            picture = av.VideoFrame.from_ndarray(np.full((64, 64, 3), grey, np.uint8), format="rgb24")
+            out.mux(stream.encode(picture))
+        out.mux(stream.encode())
+    frames = list(images.timed_frames(film))
+    assert [round(time, 2) for time, _ in frames] == pytest.approx([i / 10 for i in range(6)], abs=0.01)
+    np.testing.assert_allclose([frame.mean() for _, frame in frames], greys, atol=3)
+    video = images.open_video(film)
+    assert (
+        video.isOpened()
+        and video.set(cv2.CAP_PROP_POS_FRAMES, 4)
+        and video.read()[1].mean() == pytest.approx(140, abs=3)
+    )
+    assert video.set(cv2.CAP_PROP_POS_FRAMES, 1) and video.read()[1].mean() == pytest.approx(80, abs=3)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(images.ImageError, match=r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'"):
+        images.open_video(film)

@@ -54,10 +54,13 @@ class DatasetOptions:
 
 def run(options: DatasetOptions) -> int:
     """Read the dataset, write its manifest, and print the counts with the paper's."""
+    from anytouch_jax.cli.output import log
     from anytouch_jax.data import readers
 
     place = ("name", "root", "out", "keep")
     settings = readers.IndexOptions(**{name: value for name, value in vars(options).items() if name not in place})
     report = readers.index(options.name, options.root, options.out, options=settings, keep=options.keep)
+    if report.written:
+        log(f"{report.written:,} pictures were written into {options.root}")
     print("\n".join(report.lines()))
     return 0

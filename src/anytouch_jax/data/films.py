@@ -32,7 +32,7 @@ class PyAvFilm:
         self._frame, self._number = None, 0
         return True
 
-    def isOpened(self) -> bool:  # noqa: N802
+    def isOpened(self) -> bool:
         """Return whether frames can be read."""
         return self._container is not None
 

@@ -362,7 +362,7 @@ def count_frames(path: str | Path) -> int:
         video.release()
 
 
-def open_video(path: str | Path) -> cv2.VideoCapture:
+def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
     """Open a video, by PyAV if OpenCV cannot decode it.
 
     Raises ImageError for a web page or a Git LFS pointer in its place, and for a codec that cannot be decoded.
@@ -374,17 +374,17 @@ def open_video(path: str | Path) -> cv2.VideoCapture:
         video = cv2.VideoCapture(place)
         if not video.isOpened():
             return video
-        codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace").strip("\0 ")
         if video.grab():
             return cv2.VideoCapture(place)  # some formats cannot go back
+    codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace").strip("\0 ")
     try:
         film = PyAvFilm(place)
         if film.grab() and film.open(place):
             return film
     except ImportError:
         raise ImageError(
-            f"OpenCV cannot decode {path}, a video of the codec {codec}: pip install 'anytouch_jax[lerobot]' to read it, "
-            "or convert it with ffmpeg -i IN -c:v libx264 OUT.mp4"
+            f"OpenCV cannot decode {path}, a video of the codec {codec}: pip install 'anytouch_jax[lerobot]' to read "
+            "it, or convert it with ffmpeg -i IN -c:v libx264 OUT.mp4"
         ) from None
     except OSError:
         pass

@@ -296,10 +296,13 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
 def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
     """Yield label values, objects and units that differ by spaces, letter case or Unicode form only.
 
-    Yield labels too of which most are numbers and some are words.
+    Yield labels too of which most are numbers and some are words, and those that are lists.
     """
     for name in manifest.table.column_names:
         column = manifest.table[name]
+        if name.startswith("label.") and pa.types.is_nested(column.type):
+            words = f"values of {name} are lists, which no probe reads; write a column for each number"
+            yield from finding(manifest, "list_label", "warning", np.flatnonzero(manifest.present(name)), words, name)
         if not pa.types.is_string(column.type) or not (name in ("object", "unit") or name.startswith("label.")):
             continue
         for group in spellings(column.unique().drop_null().to_pylist()):

@@ -54,6 +54,7 @@ class IndexReport:
     skipped: dict[str, tuple[int, str]]
     notes: list[str]
     left_out: int = 0  # frames without a row
+    written: int = 0  # pictures that were written into ROOT
 
     @property
     def splits(self) -> dict[str, int]:
@@ -155,7 +156,9 @@ def index(
     except OSError as error:
         raise UserError(f"the manifest {target} cannot be written: {error.strerror}; {_OTHER_OUT}") from None
     rows.notes += [sentence for _, sentence, _ in manifests.misspelt_sensors(manifest)]
-    return IndexReport(reader, target, manifest, dict(sorted(rows.skipped.items())), rows.notes, rows.left_out)
+    return IndexReport(
+        reader, target, manifest, dict(sorted(rows.skipped.items())), rows.notes, rows.left_out, rows.written
+    )
 
 
 def _target(base: Path, name: str, out: str | Path | None) -> Path:

@@ -18,8 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-import numpy as np
-
 from anytouch_jax.bars import Item, tracked
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling, parse_json
 from anytouch_jax.data.images import natural
@@ -122,6 +120,7 @@ class DatasetIndex:
         self._contact_rows = 0
         self.wanted: list[str] = []  # columns that the user asked for
         self.left_out = 0  # frames without a row
+        self.written = 0  # pictures that were written into ROOT
         self.table: Columns = {name: [] for name in REQUIRED}
 
     @staticmethod

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import shutil
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,7 +57,7 @@ def exported(
     """
     place, record = find_export(index.root, folder, stream)
     is_new = record is None or not _is_same(record, sources, part)
-    written = part_path(index.root / folder)
+    written = part_path(index.root / f"{folder}.{zlib.crc32(stream.encode()):08x}")  # two may be open at once
     export = Export(place or folder, is_new, written if is_new else index.root / str(place))
     try:
         yield export
@@ -64,6 +65,7 @@ def exported(
             state = {"stream": stream, "part": part, "sources": _state(sources), "pictures": export.names}
             written.joinpath(EXPORT_RECORD).write_text(json.dumps(state), encoding="utf-8")
             export.folder = _move(index, written, folder, place, record, export.names)
+            index.written += len(export.names)
     except OSError as error:
         raise UserError(
             f"the pictures of {sources[0]} cannot be written to {index.root / folder}: {error.strerror or error}; make "

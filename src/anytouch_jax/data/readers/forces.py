@@ -66,6 +66,7 @@ def _force(index: DatasetIndex) -> None:
             except (KeyError, TypeError, ValueError, IndexError) as error:
                 raise DatasetError(f"{index.root / folder}, slide {name}: {error} does not fit; download it") from None
             slips = [int(slip[i]) if i < len(slip) else None for i in range(len(where))]
+            index.skip("frame of a slide without slip", f"{folder}, slide {name}", slips.count(None))
             used.update(where.tolist())
             index.add(
                 [names[i] for i in where], sequence=f"{folder}/{name}", frame_index=where.tolist(), split=part, **cells,
@@ -101,6 +102,7 @@ def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
             turns, shifts = poses[:count, :3, :3], poses[:count, :3, 3]
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise DatasetError(f"{path}: {error} is missing or of an odd shape; download it again") from None
+        index.leave_out("frame or pose without the other", f"{path}, {finger}", abs(len(frames) - len(poses)))
         name = f"{part}/{folder}/{bag.removesuffix('.pkl')}/{finger}"
         with exported(index, name, finger, [path]) as pictures:
             written = index.tracked(range(count), "frames written")
@@ -189,30 +191,43 @@ def _freetacman(index: DatasetIndex) -> None:
                 index.skip("film that cannot be read", str(error))
                 continue
             frames = index.frames(place)
-            times: Any = _times(index.root / folder / f"{stem}_timestamps.txt", len(frames))
+            times: Any = _times(index, index.root / folder / f"{stem}_timestamps.txt", len(frames))
             task, camera = folder.split("/")[-1] or stem.split("_")[0], next(key for key in wanted if key in stem)
             demonstration = stem.partition(f"_{camera}")[0]
-            poses: Any = _poses(index.root / folder / f"{demonstration}_traj.csv", len(frames))
+            poses: Any = _poses(index, index.root / folder / f"{demonstration}_traj.csv", len(frames))
             index.add_recording(
                 frames, place, split=index.split_of(demonstration), sensor="freetacman", object=task, sequence=place,
                 unit=stem[stem.index(camera) :], time=times, **poses,
             )  # fmt: skip
 
 
-def _poses(path: Path, count: int) -> dict[str, list[Any]]:
+def _poses(index: DatasetIndex, path: Path, count: int) -> dict[str, list[Any]]:
     """Return the number columns of a trajectory as labels, {} if there are not `count` rows. Raises ManifestError."""
-    if not path.is_file() or (table := read_text_csv(path)).num_rows != count:
+    if not path.is_file():
+        index.skip("recording without a trajectory (no labels)", str(path))
+        return {}
+    if (table := read_text_csv(path)).num_rows != count:
+        index.skip(
+            f"trajectory that has not a line for each frame (no labels): {table.num_rows}, not {count}", str(path)
+        )
         return {}
     columns = {name: typed_label(table[name]) for name in table.column_names}
-    return {f"label.{name}": column.to_pylist() for name, column in columns.items() if not is_text(column.type)}
+    texts = [name for name, column in columns.items() if is_text(column.type)]
+    index.skip("column of a trajectory that is no number (no label)", f"{path}, {''.join(texts[:1])}", len(texts))
+    return {f"label.{name}": column.to_pylist() for name, column in columns.items() if name not in texts}
 
 
-def _times(path: Path, count: int) -> list[float] | None:
+def _times(index: DatasetIndex, path: Path, count: int) -> list[float] | None:
     """Return the time stamps of a film, one a line, None if there are not `count` of them."""
     try:
         times = [float(line.split()[-1]) for line in path.read_text().splitlines() if line.strip()]
-    except (OSError, ValueError):
+    except (OSError, ValueError, IndexError):
+        index.skip("film without readable time stamps (no column time)", str(path))
         return None
+    if len(times) != count:
+        index.skip(
+            f"time stamps that have not a line for each frame (no column time): {len(times)}, not {count}", str(path)
+        )
     return times if len(times) == count else None
 
 

@@ -23,7 +23,6 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, atomic_write
 
 
-
 def _lerobot(index: DatasetIndex) -> None:
     """A LeRobotDataset v3: meta/info.json, meta/episodes/, data/*.parquet, videos/KEY/*.mp4.
 
@@ -64,6 +63,9 @@ def _lerobot(index: DatasetIndex) -> None:
         for name in index.options.values
     }
     index.wanted += [f"label.{label}" for names in cells.values() for label in names]
+    others = [name for name in features if name not in (*cameras, *wanted)]
+    if others:
+        index.notes.append(f"features that are not read: {', '.join(others)}; --values makes labels of those it names")
     first = 0
     for path, rows in rows_of.items():
         labels = {f"label.{label}": values[first : first + len(rows)]
@@ -99,8 +101,8 @@ def _stated_splits(index: DatasetIndex, info: dict[str, Any], episodes: Iterable
     if len(splits) < 2:
         if splits and index.options.val + index.options.test:
             index.notes.append(
-                f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by hash; --val 0 --test "
-                "0 keeps all in train"
+                f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by hash; --val 0 "
+                "--test 0 keeps all in train"
             )
         return {number: index.split_of(f"episode-{number:06d}") for number in episodes}
     for name, ranges in splits.items():

@@ -276,6 +276,7 @@ def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
     names, lines = _read_labels(path)
     table, size = index.table, len(index.table["path"])
     labels: dict[str, list[Any]] = {name: [None] * size for name in names if name not in LABEL_KEYS}
+    index.wanted += [name if name in PLAIN_COLUMNS else f"label.{name.removeprefix('label.')}" for name in labels]
     used: set[tuple[str | None, str | None]] = set()
     unlabelled: dict[str, None] = {}
     for row, (obj, sequence, part) in enumerate(zip(table["object"], table["sequence"], parts, strict=True)):

@@ -38,6 +38,7 @@ from anytouch_jax.data.prepare.scan import (
     finding,
     scan,
 )
+from anytouch_jax.data.transforms import FORM
 from anytouch_jax.shown import shown_short
 
 _SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
@@ -233,6 +234,21 @@ def repeated_rows(manifest: Manifest, same: np.ndarray) -> np.ndarray:
 def _codes(column: pa.ChunkedArray) -> pa.Array:
     binary = pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type)
     return (column if binary else column.cast(pa.string())).combine_chunks().dictionary_encode().indices
+
+
+def _background_forms(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
+    """Yield rows whose background has other proportions than the frame: encoders refuse them."""
+    frame, background = scanned.files.code["path"], scanned.files.code.get("background_path")
+    if background is None:
+        return
+    rows = np.flatnonzero((frame >= 0) & (background >= 0))
+    rows = rows[scanned.decoded[frame[rows]] & scanned.decoded[background[rows]]]
+    sizes = scanned.size[frame[rows]].astype(float), scanned.size[background[rows]].astype(float)
+    scale = sizes[1].max(1) / sizes[0].max(1)
+    odd = rows[np.abs(sizes[0] * scale[:, None] - sizes[1]).max(1) > sizes[1].max(1) / FORM]
+    words = "rows whose background_path has other proportions than the frame: it is turned or cropped"
+    columns = "path", "background_path"
+    yield from finding(manifest, "background_form", "error", odd, words, *columns, column="background_path")
 
 
 def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
@@ -515,4 +531,4 @@ def _variants(colours: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
             yield "turned", np.rot90(fields[:, ::-1] if mirror else fields, turns).ravel()
 
 
-_FILE_CHECKS = (_bad_files, _wrong_sizes, _duplicates, _swapped, picture_faults)
+_FILE_CHECKS = (_bad_files, _wrong_sizes, _background_forms, _duplicates, _swapped, picture_faults)

@@ -29,6 +29,11 @@ from anytouch_jax.files import csv_lines
 Columns = dict[str, list[Any]]
 Frames = dict[int, str]  # frame number -> file name, by number
 Folder = tuple[str, list[str], list[str]]  # its path below a base, its folders, its files
+_WORDS = {"train": "train", "training": "train", "trn": "train", "val": "val", "valid": "val", "validation": "val",
+          "dev": "val", "test": "test", "testing": "test", "tst": "test", "eval": "test", "evaluation": "test",
+          "holdout": "test"}  # fmt: skip
+_MORE = r"(?:set|sets|split|data|dataset|images?|imgs?|frames|pictures|samples)"  # around a word, as in train_set
+_SPLIT = re.compile(rf"[\W_]*(?:{_MORE}[\W_]+)?({'|'.join(_WORDS)})(?:[\W_]*{_MORE})?[\W_]*", re.IGNORECASE)
 MOST_LABELS = 1000  # of one value
 TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)  # in names of cameras and fields
 PARTS = ("train", "val", "test")  # published splits
@@ -320,6 +325,12 @@ class DatasetIndex:
         lost = [name for name in dict.fromkeys(self.wanted) if not has_value.get(name)]
         self.notes += [f"no row has a value of {name}, so the manifest has no such column" for name in lost]
         return {name: column for name, column in self.table.items() if name in REQUIRED or has_value[name]}
+
+
+def split_word(name: str) -> str | None:
+    """Return the split that a folder's name says, in any case: Training, valid, test_set; None for others."""
+    match = _SPLIT.fullmatch(name)
+    return match and _WORDS[match[1].lower()]
 
 
 def label_cells(name: str, values: list[Any]) -> dict[str, list[Any]]:

@@ -19,8 +19,7 @@ import pyarrow.parquet
 from anytouch_jax.config import parse_json
 from anytouch_jax.data.manifest.files import ShardError, tar_members
 from anytouch_jax.data.manifest.schema import typed_label
-from anytouch_jax.data.readers.common import TACTILE, DatasetError, DatasetIndex, DatasetReader, label_cells
-from anytouch_jax.data.readers.trees import split_word
+from anytouch_jax.data.readers.common import TACTILE, DatasetError, DatasetIndex, DatasetReader, label_cells, split_word
 from anytouch_jax.errors import UserError
 
 _CC_BY, _TACTILE_MNIST = "CC-BY-4.0", "CC-BY-2.0"

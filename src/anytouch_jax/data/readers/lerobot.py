@@ -16,9 +16,16 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from anytouch_jax.data.images import ImageError, frames_from_video
-from anytouch_jax.data.readers.common import TACTILE, DatasetError, DatasetIndex, DatasetReader, label_cells, read_json
+from anytouch_jax.data.readers.common import (
+    TACTILE,
+    DatasetError,
+    DatasetIndex,
+    DatasetReader,
+    label_cells,
+    read_json,
+    split_word,
+)
 from anytouch_jax.data.readers.exports import Export, exported
-from anytouch_jax.data.readers.trees import split_word
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, atomic_write
 

@@ -10,6 +10,7 @@ from places import SHARED
 
 from anytouch_jax.data import images
 from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes, encode
+from anytouch_jax.data.names import frame_numbers, frame_order, split_series
 from anytouch_jax.errors import UserError
 
 RNG = np.random.default_rng(0)
@@ -222,8 +223,8 @@ def test_a_folder_comes_in_natural_order(tmp_path):
         "background": "background.jpg", "photo": "Photo.png"
     }  # fmt: skip
     stamps = ["0.8.bmp", "0.9.bmp", "1.bmp", "1.1.bmp", "2.bmp", "1690000000000000001.bmp", "1690000000000000002.bmp"]
-    assert images.frame_order(stamps[::-1]) == (stamps, True)  # whole seconds are written without a point
-    assert images.frame_order(["b.png", "img10.png", "3.png"]) == (["b.png", "img10.png", "3.png"], False)
+    assert frame_order(stamps[::-1]) == (stamps, True)  # whole seconds are written without a point
+    assert frame_order(["b.png", "img10.png", "3.png"]) == (["b.png", "img10.png", "3.png"], False)
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
         with pytest.raises(images.ImageError, match=words):
@@ -340,10 +341,10 @@ def test_a_tiff_that_opencv_would_read_wrong_is_refused(tmp_path):
 
 
 def test_frames_are_numbered_by_what_counts_them():
-    assert images.frame_numbers(["a3.png", "a4.png", "a9.png"]) == [3, 4, 9]
-    assert images.frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
-    assert images.frame_numbers(["a.png", "b2.png"]) == [0, 1] and images.frame_numbers([]) == []
-    assert images.frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
+    assert frame_numbers(["a3.png", "a4.png", "a9.png"]) == [3, 4, 9]
+    assert frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
+    assert frame_numbers(["a.png", "b2.png"]) == [0, 1] and frame_numbers([]) == []
+    assert frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
     for form in (
         "{}_left.png",
         "{:05d}_D20012.png",
@@ -351,9 +352,9 @@ def test_frames_are_numbered_by_what_counts_them():
         "frame{:04d}_cam0.png",
         "{}_320x240.png",
     ):
-        assert images.frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
+        assert frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
     stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
-    assert images.frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
+    assert frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
 
 
 _TIMES = [1731000000.0 + i / 30 for i in range(20)]
@@ -374,7 +375,7 @@ _TIMES = [1731000000.0 + i / 30 for i in range(20)]
     ],
 )  # fmt: skip
 def test_frames_come_in_the_order_of_the_numbers_in_their_names(names):
-    assert images.frame_order(sorted(names, key=lambda name: name[::-1])) == (names, True)
+    assert frame_order(sorted(names, key=lambda name: name[::-1])) == (names, True)
 
 
 @pytest.mark.parametrize(
@@ -413,7 +414,7 @@ def test_series_that_share_numbers_are_apart(names, series):
     if isinstance(series, tuple):  # the series of each name, in turn
         keys = [series[i % len(series)] for i in range(len(names))]
         series = {key: [name for name, of in zip(names, keys, strict=True) if of == key] for key in series}
-    assert images.split_series(names) == (series or {"": names})
+    assert split_series(names) == (series or {"": names})
 
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)

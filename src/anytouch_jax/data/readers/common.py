@@ -20,9 +20,9 @@ from typing import Any, BinaryIO, Literal
 
 from anytouch_jax.bars import Item, tracked
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling, parse_json
-from anytouch_jax.data.images import natural
 from anytouch_jax.data.manifest.remote import open_store
 from anytouch_jax.data.manifest.schema import REQUIRED
+from anytouch_jax.data.names import natural
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import csv_lines
 

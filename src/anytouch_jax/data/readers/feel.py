@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.bars import tracked
-from anytouch_jax.data.images import encode, natural
+from anytouch_jax.data.images import encode
+from anytouch_jax.data.names import natural
 from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,

@@ -31,6 +31,7 @@ import pyarrow as pa
 from anytouch_jax.data import images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
 from anytouch_jax.data.manifest.schema import EMPTY, REQUIRED, typed_label
+from anytouch_jax.data.names import frame_numbers, frame_order, looks_like_film, natural, split_series
 from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
@@ -127,12 +128,12 @@ def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
     options, unclear = index.options, list[str]()
     films = [options.films or options.order == "times"] * len(recordings)
     for at, one in enumerate(recordings):
-        one.names[:], is_clear = images.frame_order(one.names)
+        one.names[:], is_clear = frame_order(one.names)
         if options.order == "times":
             times = {name: os.stat(index.root / one.folder / name).st_mtime_ns for name in one.names}
             one.names.sort(key=times.__getitem__)
             is_clear = len(set(times.values())) == len(times)
-        films[at] = not options.singles and (films[at] or images.looks_like_film(one.names) or len(one.names) == 1)
+        films[at] = not options.singles and (films[at] or looks_like_film(one.names) or len(one.names) == 1)
         if films[at] and not is_clear:
             unclear.append(one.folder or ".")
     if unclear:
@@ -176,7 +177,7 @@ def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]
 
 
 def _frame_numbers(index: DatasetIndex, names: list[str]) -> list[int]:
-    return images.frame_numbers(names) if index.options.order == "names" else list(range(len(names)))
+    return frame_numbers(names) if index.options.order == "names" else list(range(len(names)))
 
 
 def _assign_splits(index: DatasetIndex, parts: list[str], given: list[str | None], default: str) -> None:
@@ -340,7 +341,7 @@ def _tiny(path: Path) -> np.ndarray:
 def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, list[str]]:
     """Return the pictures of a folder by finger; arrays only if there is nothing else."""
     names = []
-    for name in sorted(files, key=images.natural):
+    for name in sorted(files, key=natural):
         path, stem, suffix = f"{folder}/{name}".lstrip("/"), Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
@@ -350,7 +351,7 @@ def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, li
     if arrays and len(arrays) < len(names):
         index.skip("array next to pictures", f"{folder}/{arrays[0]}", len(arrays))
         names = [name for name in names if name not in arrays]
-    return images.split_series(names) if names else {}
+    return split_series(names) if names else {}
 
 
 def _is_video(name: str) -> bool:

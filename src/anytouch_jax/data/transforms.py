@@ -105,8 +105,8 @@ def check_proportions(frame: Sequence[int], background: Sequence[int]) -> None:
     scale = max(high, wide) / max(height, width)
     if max(abs(height * scale - high), abs(width * scale - wide)) > max(high, wide) / FORM:
         raise ImageError(
-            f"the background has {wide} x {high} pixels and the frame {width} x {height}, which are other proportions: "
-            "one of them was turned or cropped; give a picture that was taken as the frames are"
+            f"the background has {wide} x {high} pixels and the frame {width} x {height}: one of them was turned or "
+            "cropped; give a picture taken as the frames are"
         )
 
 

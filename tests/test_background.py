@@ -17,6 +17,7 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError, SampleReader, evaluation
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.embed import embed_rows
@@ -317,3 +318,31 @@ def test_a_stream_is_marked_until_its_untouched_gel_is_settled_or_captured(encod
         assert [one.estimated for one in arrived] == [True] * marked + [False] * (len(frames) - marked)
         np.testing.assert_array_equal(preprocess.background, GEL)
         assert not any(one.contact for one in arrived[4:])
+
+
+@pytest.mark.parametrize(
+    ("size", "fits"),
+    [((24, 48), True), ((48, 96), True), ((96, 48), False), ((24, 44), False), ((48, 48), False), ((100, 196), False)],
+)  # as the frames, larger, turned, cropped at a side, cropped to a square, cropped by little
+def test_a_background_of_other_proportions_is_refused_everywhere(tmp_path, encoder, size, fits):
+    for name, shape in (("frame", (24, 48)), ("gel", size)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), RNG.integers(0, 255, (*shape, 3), np.uint8))
+    columns = {"path": ["frame.png"], "sensor": ["digit"], "sequence": ["a"], "frame_index": [0], "split": ["train"]}
+    table = manifests.from_columns(columns | {"background_path": ["gel.png"]}, tmp_path / "m.csv")
+    manifests.write(table, tmp_path / "m.csv")
+    frame, gel = decode(tmp_path / "frame.png"), decode(tmp_path / "gel.png")
+    tries = {
+        "training": lambda: SampleReader(table, settings(tmp_path / "m.csv", flip=0.5)).touch(np.array([0]), 0),
+        "training, plain": lambda: SampleReader(table, settings(tmp_path / "m.csv")).touch(np.array([0]), 0),
+        "evaluation": lambda: embed_rows(encoder, table, np.array([0])),
+        "Python": lambda: encoder.preprocess(frame, gel),
+        "a camera": lambda: Preprocess(encoder, gel)(frame),
+    }
+    for name, call in tries.items():
+        if fits:
+            call()
+            continue
+        with pytest.raises(UserError, match="was turned or cropped") as raised:
+            call()
+        assert ("m.csv" in str(raised.value)) == (name not in ("Python", "a camera"))
+    assert ("background_form" in {one.kind for one in verify(table).findings}) == (not fits)

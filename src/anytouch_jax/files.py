@@ -28,7 +28,7 @@ def atomic_path(path: str | Path, *, sync: bool = True, part: Path | None = None
     a single process: a leftover of a killed one is overwritten. Raises OSError with the file's name.
     """
     path = Path(path)
-    part = part or _part(path)
+    part = part or part_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
@@ -54,7 +54,7 @@ def atomic_write(path: str | Path, data: bytes | str, *, sync: bool = True, part
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Give a folder to fill, and move it to `path` (missing or empty) when the block ends; remove it on an error."""
-    part = _part(path)
+    part = part_path(path)
     try:
         part.mkdir(parents=True)
         yield part
@@ -167,7 +167,8 @@ def check_array(name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str
         raise ValueError(f"its {name} has values that are not finite")
 
 
-def _part(path: Path) -> Path:
+def part_path(path: Path) -> Path:
+    """Return a hidden name next to `path` for what is not whole yet, of this process and thread."""
     return path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
 
 

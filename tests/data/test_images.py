@@ -1,5 +1,6 @@
 import io
 import struct
+import sys
 import zlib
 
 import cv2
@@ -9,6 +10,7 @@ from places import SHARED
 
 from anytouch_jax.data import images
 from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes, encode
+from anytouch_jax.data.names import frame_numbers, frame_order, split_series
 from anytouch_jax.errors import UserError
 
 RNG = np.random.default_rng(0)
@@ -220,12 +222,9 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     assert len(frames) == 3 and {name: file.name for name, file in other.items()} == {
         "background": "background.jpg", "photo": "Photo.png"
     }  # fmt: skip
-    order = sorted(["1690.5.png", "1690.4666.png", "1689.9.png"], key=images.frame_sort_key)
-    assert order == ["1689.9.png", "1690.4666.png", "1690.5.png"]
     stamps = ["0.8.bmp", "0.9.bmp", "1.bmp", "1.1.bmp", "2.bmp", "1690000000000000001.bmp", "1690000000000000002.bmp"]
-    turned = stamps[::-1]
-    assert sorted(turned, key=images.frame_sort_key) == stamps  # whole seconds are written without a point
-    assert sorted(["b.png", "img10.png", "img9.png", "3.png"], key=images.frame_sort_key)[:2] == ["3.png", "b.png"]
+    assert frame_order(stamps[::-1]) == (stamps, True)  # whole seconds are written without a point
+    assert frame_order(["b.png", "img10.png", "3.png"]) == (["b.png", "img10.png", "3.png"], False)
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
         with pytest.raises(images.ImageError, match=words):
@@ -342,10 +341,10 @@ def test_a_tiff_that_opencv_would_read_wrong_is_refused(tmp_path):
 
 
 def test_frames_are_numbered_by_what_counts_them():
-    assert images.frame_numbers(["a3.png", "a4.png", "a9.png"]) == [3, 4, 9]
-    assert images.frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
-    assert images.frame_numbers(["a.png", "b2.png"]) == [0, 1] and images.frame_numbers([]) == []
-    assert images.frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
+    assert frame_numbers(["a3.png", "a4.png", "a9.png"]) == [3, 4, 9]
+    assert frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
+    assert frame_numbers(["a.png", "b2.png"]) == [0, 1] and frame_numbers([]) == []
+    assert frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
     for form in (
         "{}_left.png",
         "{:05d}_D20012.png",
@@ -353,9 +352,30 @@ def test_frames_are_numbered_by_what_counts_them():
         "frame{:04d}_cam0.png",
         "{}_320x240.png",
     ):
-        assert images.frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
+        assert frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
     stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
-    assert images.frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
+    assert frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
+
+
+_TIMES = [1731000000.0 + i / 30 for i in range(20)]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        *([form.format(time) for time in _TIMES] for form in ("{}.png", "gel_{}.png", "D20012_{}_raw.png", "a.{}.png")),
+        [f"2024-01-05_gel_{time - _TIMES[0]}.png" for time in _TIMES],  # 0.0, 0.0333..., 0.1
+        [f"{time / 1e5 - 17310}.png" for time in _TIMES],  # 3.3e-07
+        [f"{('free', 'contact')[i % 3 == 0]}_{time}.png" for i, time in enumerate(_TIMES)],
+        [f"{('free', 'contact')[i % 3 == 0]}_{i}.png" for i in range(12)],
+        [f"{i * 7919 % 1013}_{i}.png" for i in range(12)],  # a value, then a counter
+        [f"{i * 7919 % 4096:x}x_{i:03d}.png" for i in range(12)],  # a hash, then a counter
+        [f"1.{i}.png" for i in range(1, 13)],  # frame 10 of touch 1
+        [f"2024.5.{i}.png" for i in range(1, 13)], [f"take{i // 3}_frame{i % 3}.png" for i in range(12)],
+    ],
+)  # fmt: skip
+def test_frames_come_in_the_order_of_the_numbers_in_their_names(names):
+    assert frame_order(sorted(names, key=lambda name: name[::-1])) == (names, True)
 
 
 @pytest.mark.parametrize(
@@ -394,7 +414,7 @@ def test_series_that_share_numbers_are_apart(names, series):
     if isinstance(series, tuple):  # the series of each name, in turn
         keys = [series[i % len(series)] for i in range(len(names))]
         series = {key: [name for name, of in zip(names, keys, strict=True) if of == key] for key in series}
-    assert images.split_series(names) == (series or {"": names})
+    assert split_series(names) == (series or {"": names})
 
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
@@ -490,3 +510,32 @@ def test_an_array_cannot_declare_more_than_it_has(shape, kind, words):
     np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
     with pytest.raises(ImageError, match=words):
         decode_bytes(stream.getvalue() + bytes(48), "x.npy")
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv"])
+def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(tmp_path, monkeypatch, ending):
+    av = pytest.importorskip("av")
+    codec = next((name for name in ("libsvtav1", "libaom-av1") if name in av.codecs_available), None)
+    if codec is None:
+        pytest.skip("this build of PyAV writes no AV1")
+    film, greys = tmp_path / f"film.{ending}", [60 + 20 * i for i in range(6)]
+    with av.open(str(film), "w") as out:
+        stream = out.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for grey in greys:
+            picture = av.VideoFrame.from_ndarray(np.full((64, 64, 3), grey, np.uint8), format="rgb24")
+            out.mux(stream.encode(picture))
+        out.mux(stream.encode())
+    frames = list(images.timed_frames(film))
+    assert [round(time, 2) for time, _ in frames] == pytest.approx([i / 10 for i in range(6)], abs=0.01)
+    np.testing.assert_allclose([frame.mean() for _, frame in frames], greys, atol=3)
+    video = images.open_video(film)
+    assert (
+        video.isOpened()
+        and video.set(cv2.CAP_PROP_POS_FRAMES, 4)
+        and video.read()[1].mean() == pytest.approx(140, abs=3)
+    )
+    assert video.set(cv2.CAP_PROP_POS_FRAMES, 1) and video.read()[1].mean() == pytest.approx(80, abs=3)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(images.ImageError, match=r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'"):
+        images.open_video(film)

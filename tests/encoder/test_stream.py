@@ -330,6 +330,9 @@ def test_a_number_is_a_camera_unless_a_file_has_that_name(monkeypatch, tmp_path)
         def isOpened(self):
             return asked[-1] != 7
 
+        def grab(self):
+            return True
+
         def set(self, *_):
             pass
 

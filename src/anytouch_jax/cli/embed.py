@@ -370,6 +370,7 @@ def _numbered_frames(
     """
     from anytouch_jax.data import images
     from anytouch_jax.data.loading.samples import NAMED
+    from anytouch_jax.data.names import frame_numbers, split_series
 
     if data.suffix.lower() in images.SUFFIXES and data.is_file():
         yield 0, data.name, images.decode(data)
@@ -383,8 +384,8 @@ def _numbered_frames(
     if others:
         log(f"{', '.join(file.name for file in others.values())}: not a frame, not embedded")
     start = skipped = 0  # `start` is the first frame number of a finger: no clip spans two fingers
-    for names in images.split_series([file.name for file in files]).values():
-        numbers = [start + number for number in images.frame_numbers(names)]
+    for names in split_series([file.name for file in files]).values():
+        numbers = [start + number for number in frame_numbers(names)]
         start = numbers[-1] + 2
         for number, name in zip(numbers, names, strict=True):
             try:

@@ -36,23 +36,31 @@ class DatasetOptions:
     export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
     sensor: str | None = None
     """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new name."""
-    split_by: Literal["object", "recording"] = "object"
-    """recordings: hold out whole objects, or recordings of each object."""
+    split_by: str | None = None
+    """recordings: what is held out: object, recording (a single picture is one), a column of the labels, or the part of
+    the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default: object. For single pictures: recording."""
+    singles: bool = False  # recordings: every picture is a touch alone. By default names decide, and a few pictures.
+    films: bool = False  # recordings: every folder of pictures is a film.
+    order: Literal["names", "times"] = "names"  # recordings: order frames by their names, or by the times of the files.
     labels: Path | None = None
     """recordings: CSV table with a column object, sequence or both. Each other column becomes label.NAME, but unit,
     touch and text keep their names."""
     url: str | None = None  # gelsight_mini_pretrain, fota, webdataset: address of the shards, as s3://BUCKET/FOLDER.
-    keys: tuple[str, ...] = ()  # lerobot, freetacman: tactile cameras. bags: topics of tactile images.
+    keys: tuple[str, ...] = ()
+    """lerobot, freetacman: tactile cameras. bags: topics of tactile images. webdataset: fields, as left.jpg."""
     values: tuple[str, ...] = ()
     """lerobot: features that become labels. bags: labels from other topics, as force_z=/ft:wrench.force.z."""
 
 
 def run(options: DatasetOptions) -> int:
     """Read the dataset, write its manifest, and print the counts with the paper's."""
+    from anytouch_jax.cli.output import log
     from anytouch_jax.data import readers
 
     place = ("name", "root", "out", "keep")
     settings = readers.IndexOptions(**{name: value for name, value in vars(options).items() if name not in place})
     report = readers.index(options.name, options.root, options.out, options=settings, keep=options.keep)
+    if report.written:
+        log(f"{report.written:,} pictures were written into {options.root}")
     print("\n".join(report.lines()))
     return 0

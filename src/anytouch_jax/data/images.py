@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import io
-import itertools
 import math
 import os
 import re
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from PIL import BmpImagePlugin, ImageFile, JpegImagePlugin, PngImagePlugin, Tiff
 
 from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.schema import is_manifest
+from anytouch_jax.data.names import frame_order
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import placeholder
 
@@ -30,10 +31,6 @@ MAX_PADDING = 1 << 16  # bytes between the segments of a JPEG, which Pillow read
 MAX_ASPECT = 100  # a longer strip would fill the memory when its short side is resized
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
 BACKGROUND, PHOTO = "background", "photo"  # names of images in a recording that are not frames
-
-_COUNTED = {"frame", "frames", "frm", "f", "img", "image", "i", "picture", "pic", "photo", "shot", "sample", "step"}
-_COUNTED |= {"index", "idx", "no", "nr", "num", "n", "t", "time", "ts"}  # words before the number of a frame
-_SIDE = re.compile(r"\d|(?<![^\W_])(?:left|right|l|r|thumb|index|middle|ring|little|pinky)(?![^\W_])", re.IGNORECASE)
 
 # Since OpenCV 4.11. Orientation tags are obeyed by `_upright`, as versions of OpenCV do it for other formats.
 _JPEG_RGB: int = cv2.IMREAD_UNCHANGED
@@ -358,18 +355,116 @@ def count_frames(path: str | Path) -> int:
         video.release()
 
 
-def open_video(path: str | Path) -> cv2.VideoCapture:
-    """Open a video. Raises ImageError for a web page or a Git LFS pointer in its place."""
+def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
+    """Open a video, by PyAV if OpenCV cannot decode it.
+
+    Raises ImageError for a web page or a Git LFS pointer in its place, and for a codec that cannot be decoded.
+    """
     if Path(path).is_file() and (kind := placeholder(path)):
         raise ImageError(f"{path} is {kind}")
-    with QUIET:  # FFmpeg takes the part of a relative name before a colon for a protocol
-        return cv2.VideoCapture(os.path.abspath(path))
+    place = os.path.abspath(path)  # FFmpeg takes the part of a relative name before a colon for a protocol
+    with QUIET:
+        video = cv2.VideoCapture(place)
+        if not video.isOpened():
+            return video
+        if video.grab():
+            return cv2.VideoCapture(place)  # some formats cannot go back
+    codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace").strip("\0 ")
+    try:
+        film = PyAvFilm(place)
+        if film.grab() and film.open(place):
+            return film
+    except ImportError:
+        raise ImageError(
+            f"OpenCV cannot decode {path}, a video of the codec {codec}: pip install 'anytouch_jax[lerobot]' to read "
+            "it, or convert it with ffmpeg -i IN -c:v libx264 OUT.mp4"
+        ) from None
+    except OSError:
+        pass
+    return video
+
+
+class PyAvFilm:
+    """A film that OpenCV cannot decode, such as AV1, with the methods of cv2.VideoCapture: frames are BGR u8 (h, w, 3).
+
+    Raises ImportError without PyAV, OSError for a file that it cannot open.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path, self._frame = path, None
+        self._container: Any = None
+        self._frames: Iterator[Any] = iter(())
+        self.open(path)
+
+    def open(self, path: str) -> bool:
+        """Start again at the first frame."""
+        import av
+
+        self.release()
+        try:
+            self._container = av.open(path)
+            self._frames = self._container.decode(video=0)
+        except (av.FFmpegError, ValueError, IndexError) as error:  # IndexError: a file without a film
+            raise OSError(str(error)) from None
+        self._frame, self._number = None, 0
+        return True
+
+    def isOpened(self) -> bool:
+        """Return whether frames can be read."""
+        return self._container is not None
+
+    def grab(self) -> bool:
+        """Go to the next frame. A film that is damaged from there on ends."""
+        self._frame = None
+        with contextlib.suppress(OSError, ValueError):  # all errors of PyAV are of these types
+            self._frame = next(self._frames, None)
+        self._number += self._frame is not None
+        return self._frame is not None
+
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        """Return the frame of the last grab."""
+        return self._frame is not None, None if self._frame is None else self._frame.to_ndarray(format="bgr24")
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        """Return the next frame."""
+        self.grab()
+        return self.retrieve()
+
+    def get(self, name: int) -> float:
+        """Return a property by OpenCV's number, 0 for one that is not known."""
+        stream = self._container.streams.video[0]
+        rate = float(stream.average_rate or 0)
+        if name == cv2.CAP_PROP_FRAME_COUNT:
+            return stream.frames or round((self._container.duration or 0) / 1e6 * rate)
+        time = None if self._frame is None else self._frame.time
+        known = {
+            cv2.CAP_PROP_FPS: rate, cv2.CAP_PROP_POS_MSEC: 1000 * (time or 0), cv2.CAP_PROP_POS_FRAMES: self._number,
+            cv2.CAP_PROP_FRAME_WIDTH: stream.width, cv2.CAP_PROP_FRAME_HEIGHT: stream.height,
+        }  # fmt: skip
+        return float(known.get(name, 0))
+
+    def set(self, name: int, value: float) -> bool:
+        """Go to a frame by its number; another property cannot be set."""
+        if name != cv2.CAP_PROP_POS_FRAMES:
+            return False
+        if value < self._number:
+            self.open(self._path)
+        while self._number < value and self.grab():
+            pass
+        return self._number == value
+
+    def release(self) -> None:
+        """Close the film."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
 
 
 def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
-    """Return the frames of a folder in order (`frame_sort_key`), and its BACKGROUND and PHOTO images by name.
+    """Return the frames of a folder in order (`frame_order`), and its BACKGROUND and PHOTO images by name.
 
-    Arrays (.npy) count as frames only if there are no pictures. Raises ImageError if there are no frames.
+    Arrays (.npy) count as frames only if there are no pictures. Warns if the names show no order. Raises ImageError if
+    there are no frames.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -380,7 +475,10 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     files = [file for file in files if file.suffix.lower() != ".npy"] or files
     if not files:
         raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)}){_suggestion(folder)}")
-    return sorted(files, key=lambda file: frame_sort_key(file.name)), named
+    names, is_clear = frame_order([file.name for file in files])
+    if not is_clear:
+        warnings.warn(f"the names in {folder} show no order of its pictures: they come by name", stacklevel=2)
+    return [folder / name for name in names], named
 
 
 def _suggestion(folder: Path) -> str:
@@ -394,90 +492,3 @@ def _suggestion(folder: Path) -> str:
         command = f"anytouch data index recordings {folder} --sensor NAME"
         return f"; they lie in its sub-folders: {command} makes a manifest of them"
     return ""
-
-
-def frame_numbers(names: Sequence[str]) -> list[int]:
-    """Return the numbers of frames in order.
-
-    They are the last numbers of the names that differ (`_series_of`), if these count frames: a third of the steps or
-    more are 1. Then a missing frame is a gap. Otherwise (time stamps) they are 0, 1, 2, ...
-    """
-    counters = [numbers for _, numbers in _series_of(names)]
-    if len(set(map(len, counters))) == 1:
-        columns = [column for column in zip(*counters, strict=True) if len(set(column)) > 1]
-        numbers = list(columns[-1] if columns else [numbers[-1] for numbers in counters if numbers])
-    else:
-        numbers = [numbers[-1] for numbers in counters if numbers]
-    steps = [b - a for a, b in itertools.pairwise(numbers)]
-    is_count = len(numbers) == len(names) and min(steps, default=0) == 1 and 3 * steps.count(1) >= len(steps)
-    return numbers if is_count else list(range(len(names)))
-
-
-def split_series(names: Sequence[str]) -> dict[str, list[str]]:
-    """Return the names of a folder by series, if they are of several recorders; else all of them under "".
-
-    left_0 and right_0 (0_A and 0_B, 0_D20012 and 0_D20345) are two fingers: two series share a number. Series of sides
-    or serial numbers that alternate are apart too, as their numbers may be times. 12-00-05 is one time.
-    """
-    parts = _series_of(names)
-    series: dict[str, list[str]] = {}
-    owners: dict[tuple[int, ...], set[str]] = {}
-    for name, (key, numbers) in zip(names, parts, strict=True):
-        series.setdefault(key, []).append(name)
-        owners.setdefault(numbers, set()).add(key)
-    if len(series) > 4 and 2 * sum(len(one) == 1 for one in series.values()) > len(series):
-        return {"": list(names)}  # names without a system, such as hash values
-    shared = any(numbers and len(keys) > 1 for numbers, keys in owners.items())
-    in_time = [key for key, _ in sorted(parts, key=lambda part: part[1])]
-    changes = sum(a != b for a, b in itertools.pairwise(in_time))
-    alternate = changes > len(series) and all(_SIDE.search(key) for key in series)
-    return series if len(series) > 1 and (shared or alternate) else {"": list(names)}
-
-
-def _series_of(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
-    """Return the series of each name, and its numbers that count frames.
-
-    The series is the words of the name with their serial numbers, which stand right behind a word (D20012, cam0). A
-    number counts frames if its word says so (frame0001), or if it is the only one that differs.
-    """
-    forms: dict[str, list[list[str]]] = {}
-    pieces = [re.split(r"(\d+)", Path(name).stem) for name in names]
-    for one in pieces:
-        forms.setdefault("0".join(one[::2]), []).append(one)
-    counters = {form: _counters(alike) for form, alike in forms.items()}
-    parts = []
-    for one in pieces:
-        at = counters["0".join(one[::2])]
-        words = "".join("/" if i in at else piece for i, piece in enumerate(one)).split("/")
-        key = "_".join(word for word in (word.strip(" ._-()") for word in words) if word)
-        parts.append((key, tuple(int(one[i][-18:]) for i in at)))  # a manifest holds numbers of 64 bits
-    return parts
-
-
-def _counters(alike: list[list[str]]) -> list[int]:
-    """Return which pieces of names of one form (words and numbers in turn) count frames."""
-    counters: list[int] = []
-    serials: list[int] = []
-    for at in range(1, len(alike[0]), 2):
-        word = re.search(r"[^\W\d_]+$", alike[0][at - 1])
-        # In 12h05 or 01T12 the letter is between two numbers: it is no word.
-        is_serial = word and (word.start() > 0 or at == 1) and word[0].lower() not in _COUNTED
-        (serials if is_serial else counters).append(at)
-    values = {at: len({one[at] for one in alike}) for at in (*counters, *serials)}
-    most = max(reversed(serials), key=values.__getitem__, default=0)
-    if most and all(values[at] == 1 for at in counters) and (not counters or values[most] > 4):
-        counters.append(most)
-    return sorted(counters)
-
-
-def frame_sort_key(name: str) -> tuple[int | float, list[tuple[int, str]]]:
-    """Return a sort key for frames: numbers and time stamps by value, then other names, 2 before 10."""
-    stem = Path(name).stem
-    if re.fullmatch(r"\d+", stem):  # a whole second is often written without its point
-        return int(stem), natural(name)
-    return (float(stem), []) if re.fullmatch(r"\d+\.\d+", stem) else (math.inf, natural(name))
-
-
-def natural(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that puts 2 before 10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

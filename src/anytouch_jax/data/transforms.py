@@ -19,6 +19,7 @@ from anytouch_jax.data.images import ImageError
 _GREY = (0.2989, 0.587, 0.114)  # torchvision's weights of red, green, blue
 Flip = Literal["none", "across", "down"]
 TOUCH, VISION = 0, 1  # the two random streams of a row's augmentation
+FORM = 128  # a background may differ from the proportions of a frame by one part in so many
 UNTOUCHED = 128  # grey level of an untouched gel after background subtraction
 
 
@@ -83,17 +84,30 @@ def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.
 def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray) -> list[np.ndarray]:
     """Return background-subtracted frames: frame - background + 128, clipped to u8, for each of T frames u8 (h, w, 3).
 
-    The background is an image of the untouched gel. It is resized to the frame's size if they differ.
+    The background is an image of the untouched gel. It is resized to the frame's size if they differ. Raises ImageError
+    for one of other proportions.
     """
 
     def subtract(frame: np.ndarray) -> np.ndarray:
         height, width = frame.shape[:2]
         gel = background
         if gel.shape[:2] != (height, width):
+            check_proportions(frame.shape, gel.shape)
             gel = cv2.resize(gel, (width, height), interpolation=cv2.INTER_AREA)
         return cv2.addWeighted(frame, 1.0, gel, -1.0, UNTOUCHED)
 
     return [subtract(frame) for frame in frames]
+
+
+def check_proportions(frame: Sequence[int], background: Sequence[int]) -> None:
+    """Raise ImageError if a background (h, w, ...) has other proportions than a frame: it is turned or cropped."""
+    (height, width), (high, wide) = frame[:2], background[:2]
+    scale = max(high, wide) / max(height, width)
+    if max(abs(height * scale - high), abs(width * scale - wide)) > max(high, wide) / FORM:
+        raise ImageError(
+            f"the background has {wide} x {high} pixels and the frame {width} x {height}: one of them was turned or "
+            "cropped; give a picture taken as the frames are"
+        )
 
 
 def _resize(frame: np.ndarray, target: np.ndarray) -> None:

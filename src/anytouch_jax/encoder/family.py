@@ -286,7 +286,7 @@ def _resized(image: np.ndarray, size: Size, kernel: str) -> np.ndarray:
     """Resize by Pillow, with its antialiasing; floats stay floats."""
     if image.shape[:2] == size:
         return image
-    resampling = {"bilinear": Image.Resampling.BILINEAR, "bicubic": Image.Resampling.BICUBIC}[kernel]
+    resampling = Image.Resampling[kernel.upper()]
     if image.dtype == np.uint8:
         return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize((size[1], size[0]), resampling))
     planes = (Image.fromarray(np.ascontiguousarray(image[..., colour])) for colour in range(3))

@@ -21,6 +21,7 @@ from anytouch_jax.data.gels import ADVICE, UnitGels
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.transforms import FORM
 from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, read_npz, save_npz
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
@@ -240,7 +241,7 @@ def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = 
         (frame, proportion), background = read(row)
         if background is None:
             raise UserError(f"{table.where(row)} has no picture of the untouched gel. {ADVICE}")
-        if abs(proportion / background[1] - 1) > 0.05:
+        if abs(proportion / background[1] - 1) > 1 / FORM:
             raise UserError(f"{table.where(row)}: its background_path has other proportions than the frame.")
         values[place] = frame - background[0]
     return values

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from anytouch_jax.weights import compatible, layouts, load, registry
 from anytouch_jax.weights.convert import KEYMAPS, check_arrays, file_shapes, fill, refuse_unknown
 from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth
 from anytouch_jax.weights.safetensors import WeightsError
+from anytouch_jax.weights.stated import stated_steps
 from anytouch_jax.weights.tree import flatten, nest
 
 Size = tuple[int, int]
@@ -42,7 +44,7 @@ class Preparation:
     portrait: bool = False  # Rotate a frame that is wider than high by 90 degrees clockwise.
     crop: Literal["none", "rows", "centre", "square"] = "none"
     shorter: Count[int] | None = None  # Shorter side before a centre crop. None: 8/7 of the image size.
-    filter: Literal["bilinear", "bicubic"] = "bilinear"
+    filter: Literal["nearest", "lanczos", "bilinear", "bicubic", "box", "hamming"] = "bilinear"
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: Above0[tuple[float, float, float]] = (1.0, 1.0, 1.0)
     newest_first: bool = False  # The order of the frames for the network. Clips are given oldest first.
@@ -281,11 +283,9 @@ def load_family(
 
 
 def _folder(file: Path) -> dict[str, Any]:
-    """Return the config.json beside a file, with the statistics of Hugging Face's preprocessor_config.json."""
+    """Return the config.json beside a file, with what it and a preprocessor_config.json state as `stated`."""
     config, theirs = (load.read_settings(file.with_name(f"{name}config.json")) for name in ("", "preprocessor_"))
-    found = {ours: theirs[key] for key, ours in (("image_mean", "mean"), ("image_std", "std")) if key in theirs}
-    changes = config.get("preparation", {})
-    return config | ({"preparation": found | changes} if isinstance(changes, dict) and found | changes else {})
+    return config | {"stated": stated_steps(config, theirs)}
 
 
 def find_family(weights: Weights) -> tuple[Family, dict[str, np.ndarray]] | None:
@@ -311,8 +311,19 @@ def read_family(
     try:
         own = _completed(family, own, folder, heads)
         size = image_size if image_size is None else (image_size,) * 2 if isinstance(image_size, int) else image_size
-        form, size = form_of(family, own, folder, heads, size and tuple(size), sensors)
-        settings = {**asdict(family.preparation), **folder.get("preparation", {})}
+        changes, wanted, ignored = folder.get("stated", ({}, None, []))
+        if family.sensors != _IMAGES:  # they have steps of their authors; only the statistics may be others
+            changes, wanted, ignored = {key: x for key, x in changes.items() if key in ("mean", "std")}, None, []
+        try:
+            form, size = form_of(family, own, folder, heads, tuple(size) if size else wanted, sensors)
+        except WeightsError:
+            if size or wanted is None:
+                raise
+            ignored = [*ignored, f"an input of {wanted[0]} x {wanted[1]} pixels"]
+            form, size = form_of(family, own, folder, heads, None, sensors)
+        if ignored:
+            warnings.warn(f"the files beside {path} ask for what is not computed: {', '.join(ignored)}", stacklevel=2)
+        settings = {**asdict(family.preparation), **changes, **folder.get("preparation", {})}
         preparation = read_value(Preparation, settings, "preparation")
         entries, shapes = entries_of(family, form)
         own = {key: np.asarray(x, np.float32) for key, x in own.items()}

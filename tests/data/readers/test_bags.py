@@ -187,6 +187,110 @@ def test_a_damaged_recording_is_one_sentence(read, tmp_path):
         read("bags", sensor="digit", export=True)
 
 
+def write_topics(file, topics):
+    """An MCAP of JSON: (topic, type, messages as (seconds, content)) each."""
+    with file.open("wb") as stream:
+        writer = mcap.Writer(stream)
+        writer.start()
+        for topic, kind, messages in topics:
+            channel = writer.register_channel(topic, "json", writer.register_schema(kind, "jsonschema", b"{}"))
+            for number, (seconds, content) in enumerate(messages):
+                whole, rest = divmod(round((1000 + seconds) * 1e9), 10**9)
+                data = json.dumps({"timestamp": {"sec": whole, "nsec": rest}} | content).encode()
+                writer.add_message(channel, 10**18 + number, data, 0)
+        writer.finish()
+
+
+def image(grey=0):
+    return {"data": base64.b64encode(png(grey)).decode(), "format": "png"}
+
+
+def raw(encoding, pixels, **more):
+    pixels = np.asarray(pixels)
+    about = {"height": pixels.shape[0], "width": pixels.shape[1], "step": pixels.nbytes // pixels.shape[0]}
+    return about | {"encoding": encoding, "data": base64.b64encode(pixels.tobytes()).decode()} | more
+
+
+GEL = ("/gel", "foxglove.CompressedImage", [(i / 30, image(10 * i)) for i in range(4)])
+MOSAIC = {"rggb": (200, 120, 120, 40), "bggr": (40, 120, 120, 200), "gbrg": (120, 40, 200, 120),
+          "grbg": (120, 200, 40, 120)}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        *((raw(f"bayer_{name}8", np.tile(np.reshape(cells, (2, 2)), (8, 8)).astype("u1")), (200, 120, 40))
+          for name, cells in MOSAIC.items()),
+        (raw("bayer_rggb16", np.tile(np.reshape(MOSAIC["rggb"], (2, 2)), (8, 8)).astype("<u2") * 257), (200, 120, 40)),
+        (raw("yuv422_yuy2", np.tile(np.array([200, 128], "u1"), (16, 16, 1))), (214, 214, 214)),
+        (raw("yuv422", np.tile(np.array([128, 200], "u1"), (16, 16, 1))), (214, 214, 214)),
+        (raw("mono16", np.full((16, 16), 200 * 257, "<u2")), (200, 200, 200)),
+        (raw("mono16", np.full((16, 16), 200 * 257, ">u2"), is_bigendian=1), (200, 200, 200)),
+        (raw("32FC1", np.ones((16, 16), "f4")), "encoding 32FC1"), (raw("16UC1", np.ones((16, 16), "u2")), "16UC1"),
+        (raw("rgb8", np.ones((16, 16, 3), "u1"), step=0), "16 x 16 pixels and 0 bytes a row"),
+        (raw("rgb8", np.ones((16, 16, 3), "u1"), height=17), "cut short"),
+        (raw("yuyv", np.ones((16, 15, 2), "u1")), "15 x 16 pixels in yuyv"),
+    ],
+)  # fmt: skip
+def test_other_encodings_are_read_or_left_out_and_named(read, tmp_path, content, expected):
+    write_topics(tmp_path / "run.mcap", [GEL, ("/head", "foxglove.RawImage", [(i / 30, content) for i in range(3)])])
+    table = read("bags", sensor="digit", export=True)
+    assert table["unit"].count("/gel") == 4
+    if isinstance(expected, str):
+        ((reason, (count, example)),) = table.report.skipped.items()
+        assert expected in reason and (count, example) == (3, "run.mcap, topic /head, frame 0")
+        assert len(table.rows) == 4 and table.report.left_out == 3
+        assert not (tmp_path / "run/head").exists()
+    else:
+        picture = decode(tmp_path / table.report.manifest.value(4, "path"))
+        np.testing.assert_allclose(picture[4:12, 4:12].reshape(-1, 3), [expected] * 64, atol=1)
+
+
+def test_one_bad_picture_or_recording_beside_good_ones_is_counted_by_place(read, tmp_path):
+    bad = [(0, image(0)), (1 / 30, image(10) | {"data": base64.b64encode(png(10)[:40]).decode()}), (2 / 30, image(20))]
+    others = [("/depth", "foxglove.CompressedImage", [(0, image() | {"format": "16UC1; compressedDepth png"})]),
+              ("/film", "foxglove.CompressedVideo", [(0, {"format": "h264", "data": ""})])]  # fmt: skip
+    write_topics(tmp_path / "run.mcap", [("/gel", "foxglove.CompressedImage", bad), *others])
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "run.mcap").read_bytes()[:400])
+    table = read("bags", sensor="digit", export=True)
+    assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 20] and table["frame_index"] == [0, 1]
+    examples = {example for _, example in table.report.skipped.values()}
+    assert {
+        f"run.mcap, topic {topic}, frame {at}" for topic, at in (("/gel", 1), ("/depth", 0), ("/film", 0))
+    } < examples
+    assert any(str(tmp_path / "cut.mcap") in example for example in examples) and len(examples) == 4
+
+
+def test_a_recording_made_again_and_two_of_one_name_have_their_own_pictures(read, tmp_path):
+    for grey, topics in ((1, ("/gel", "/g/el")), (7, ("/gel", "/g/el", "/g.el"))):
+        write_topics(tmp_path / "run.mcap", [
+            (topic, "foxglove.CompressedImage", [(i / 30, image(10 * at + grey)) for i in range(3)])
+            for at, topic in enumerate(topics)
+        ])  # fmt: skip
+        table = read("bags", sensor="digit", export=True)
+        assert len(table.rows) == 3 * len(topics)
+        for path, row in table.rows.items():
+            assert decode(tmp_path / path)[0, 0, 0] == 10 * topics.index(row["unit"]) + grey
+
+
+@pytest.mark.parametrize(
+    ("shift", "topic", "found", "words"),
+    [
+        (0, "/ft", 4, None), (-1.5, "/ft", 0, "no value of /ft within 0.1 s of it (the nearest is 1.4 s away): 4"),
+        (0, "/f_t", 0, "no message of the topic /f_t, so label.f has no value; did you mean /ft?"),
+        (-0.15, "/ft", 2, "no value of /ft within 0.1 s of it (the nearest is 0.117 s away): 2"),
+    ],
+)  # fmt: skip
+def test_labels_that_are_not_found_are_reported(read, tmp_path, shift, topic, found, words):
+    write_topics(tmp_path / "run.mcap", [GEL, ("/ft", "Force", [(i / 30 + shift, {"z": i}) for i in range(4)])])
+    report = read("bags", sensor="digit", export=True, values=(f"f={topic}:z",)).report
+    assert words is None or any(words in line for line in report.lines())
+    cells = report.manifest.table.to_pylist()
+    assert sum(row.get("label.f") is not None for row in cells) == found
+    assert any("no row has a value of label.f" in note for note in report.notes) == (found == 0)
+    assert any(f"labels found: f {found}" in line for line in report.lines()) == (found > 0)
+
+
 def test_the_nearest_value_within_a_tenth_of_a_second():
     series = [(0, "a"), (10**8, "b"), (10**9, "c")]
     times = np.array([-1, 4 * 10**7, 6 * 10**7, 5 * 10**8, 10**9 + 10**8, 2 * 10**9])

@@ -118,3 +118,60 @@ def test_any_webdataset_is_read_with_a_sensor(tmp_path):
     write_tar(tmp_path / "shards" / "01.tar", {"x": (1, {"hardness": deep})})
     with pytest.raises(UserError, match=r"01\.tar, x\.json has more than 64 levels of JSON"):
         table_of(tmp_path, "webdataset", sensor="digit", val=0.0, test=0.5)
+
+
+def write_samples(file, samples):
+    """A tar with a file for each (name, data): numbers are pictures of that grey, others JSON or text."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(file, "w") as archive:
+        for name, value in samples:
+            data = png(value) if isinstance(value, int) else value.encode() if isinstance(value, str) else None
+            data = json.dumps(value).encode() if data is None else data
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+
+
+@pytest.mark.parametrize(
+    ("fields", "touches", "photo"),
+    [
+        ({"left.png": 1, "right.png": 2, "rgb.jpg": 3}, {"left": 1, "right": 2}, 3),
+        ({"tactile.png": 1, "png": 3}, {None: 1}, None),  # what else is not known to be touch
+        ({"gelsight.left.PNG": 1, "gelsight.right.png": 2, "wrist_camera.png": 3},
+         {"gelsight.left": 1, "gelsight.right": 2}, 3),
+        ({"png": 1, "photo.png": 3, "depth.png": 4, "mask.png": 5}, {None: 1}, 3),
+        ({"visual.png": 3, "background.png": 6, "touch.png": 1}, {None: 1}, 3),
+        ({"rgb.png": 3}, {}, 3),
+    ],
+)  # fmt: skip
+def test_a_sample_of_webdataset_has_touches_photographs_labels_and_captions(tmp_path, fields, touches, photo):
+    more = {"caption.txt": "rough\n and cold", "cls": "3", "force.json": {"f": [1.5, 2], "pose": {"x": 1}}, "npy": "?"}
+    samples = [(f"a/00{n}.{field}", value) for n in range(20) for field, value in (fields | more).items()]
+    samples += [("a/plain.png", 9)]
+    write_samples(tmp_path / "00.tar", samples)
+    write_samples(tmp_path / "01.tar", samples)  # the same keys in another shard
+    report, rows = table_of(tmp_path, "webdataset", sensor="digit", val=0.3, test=0.3)
+    assert len(rows) == 2 * (1 + 20 * len(touches))
+    assert len({row["sequence"] for row in rows}) == len(rows)
+    splits = {}
+    for at, row in enumerate(rows):
+        key = row["sequence"].partition("a/")[2].split("/")[0]
+        splits.setdefault(key, set()).add(row["split"])
+        if key != "plain":
+            assert decode(report.manifest.file(at))[0, 0, 0] == touches[row.get("unit")]
+            assert row["text"] == "rough and cold" and row["label.cls"] == 3
+            assert (row["label.f_0"], row["label.f_1"], row["label.pose_x"]) == (1.5, 2, 1)
+            shown = row.get("image_path") and decode(report.manifest.file(at, "image_path"))[0, 0, 0]
+            assert shown == photo
+    assert all(len(one) == 1 for one in splits.values())
+    assert (report.left_out > 0) == bool({"mask.png", "png"} & {*fields} and len(fields) in (2, 4))
+    assert report.skipped["file of a sample that is no picture, label or text"][0] == 40
+
+
+def test_fields_are_chosen_by_keys_and_shards_and_json_state_splits(tmp_path):
+    for shard, split in (("x-training-00", None), ("validation/00", None), ("00", "test")):
+        about = {"split": split} if split else {}
+        write_samples(tmp_path / f"{shard}.tar", [("k.foo.png", 1), ("k.png", 2), ("k.json", about)])
+    _, rows = table_of(tmp_path, "webdataset", sensor="digit", keys=("foo.png",))
+    assert sorted(row["split"] for row in rows) == ["test", "train", "val"]
+    assert all(row["path"].endswith("/0") for row in rows)

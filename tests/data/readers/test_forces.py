@@ -118,3 +118,7 @@ def test_films_of_freetacman(read, tmp_path):
         and "label.note" not in table.report.manifest.table.column_names
     )
     assert len(table.clips(3)) == 3
+    (tmp_path / "Cast" / "Cast_1_traj.csv").write_text(f"timestamp,TCP_x,gripper_distance,note\n{poses}5,0,0,up\n")
+    times.write_text(times.read_text() + "101\n")
+    reasons = read("freetacman", export=True).reasons
+    assert sum(reasons[one] for one in reasons if one.endswith(": 6, not 5")) == 2

@@ -229,3 +229,73 @@ def test_what_is_not_a_data_set_of_this_version_is_one_sentence(root, tmp_path):
     (root / "meta" / "info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))
     with pytest.raises(UserError, match=r"v2\.1.*convert it to v3"):
         rows_of(root)
+
+
+def edit(root, change):
+    """Change the rows of each Parquet file of data, by a function of the row and its number in the data set."""
+    for path in sorted((root / "data").glob("*/*.parquet")):
+        rows = pa.parquet.read_table(path).to_pylist()
+        pa.parquet.write_table(pa.Table.from_pylist([row | change(row["index"]) for row in rows]), path)
+
+
+@pytest.mark.parametrize(
+    ("value", "labels"),
+    [
+        (lambda n: [[float(n + i + j) for j in range(3)] for i in range(2)],
+         {f"f_{i}_{j}": [n + i + j for n in range(12)] for i in range(2) for j in range(3)}),
+        (lambda n: None if n < 2 else [float(n), 2.0],
+         {"f_0": [None, None, *range(2, 12)], "f_1": [None, None, *[2.0] * 10]}),
+        (lambda n: [float(n)] * (1 + n % 2), {"f_0": [*range(12)], "f_1": [n if n % 2 else None for n in range(12)]}),
+        (lambda n: "soft" if n % 2 else None, {"f": [None, "soft"] * 6}),
+        (lambda n: None, {}),
+    ],
+)  # fmt: skip
+def test_every_value_that_is_asked_for_is_a_label_or_reported(root, value, labels):
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["f"] = {"dtype": "float32", "shape": [1]}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    edit(root, lambda number: {"f": value(number)})
+    report = index("lerobot", root, options=IndexOptions(sensor="digit", keys=(GEL,), values=("f",)))
+    table = report.manifest.table
+    assert {name: table[name].to_pylist() for name in table.column_names if name.startswith("label.f")} == {
+        f"label.{name}": values for name, values in labels.items()
+    }
+    assert any("no row has a value of label.f" in note for note in report.notes) == (not labels)
+    assert any("not read: observation.force" in note for note in report.notes)
+
+
+@pytest.mark.parametrize(
+    ("splits", "expected"),
+    [
+        ({"train": "0:1", "validation": "1:2", "test": "2:3"}, ["train", "val", "test"]),
+        ({"train": "0", "test": "1:2"}, ["train", "test", "unused"]),
+        ({"train": "0:2", "extra": "2:3"}, ["train", "train", "unused"]),
+        ({"train": "0:3"}, None),
+    ],
+)  # fmt: skip
+def test_splits_that_the_data_set_states_are_used(root, splits, expected):
+    info = json.loads((root / "meta/info.json").read_text()) | {"splits": splits}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    report = index("lerobot", root, options=IndexOptions(sensor="digit", keys=(GEL,), val=0.0, test=1.0))
+    found = dict(
+        zip(report.manifest.table["episode"].to_pylist(), report.manifest.table["split"].to_pylist(), strict=True)
+    )
+    assert found == dict(enumerate(expected or ["test"] * 3))
+    assert any("meta/info.json" in note for note in report.notes)
+    (root / "meta/info.json").write_text(json.dumps(info | {"splits": {"train": "0:2", "test": "1:3"}}))
+    with pytest.raises(UserError, match="episode 1 is in two splits"):
+        index("lerobot", root, options=IndexOptions(sensor="digit", keys=(GEL,)))
+
+
+def test_films_recorded_again_replace_their_pictures(root):
+    _, before = rows_of(root, export=True, keys=(FILM,))
+    grey = {row["path"]: int(decode(root / row["path"])[0, 0, 0]) for row in before}
+    film = root / "videos" / FILM / "chunk-000" / "file-000.mp4"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"mp4v"), FPS, (32, 32))
+    for _ in range(9):
+        writer.write(np.full((32, 32, 3), 250, np.uint8))
+    writer.release()
+    _, after = rows_of(root, export=True, keys=(FILM,))
+    for row in after:
+        shown = int(decode(root / row["path"])[0, 0, 0])
+        assert abs(shown - (250 if row["episode"] < 2 else grey[row["path"]])) < 6

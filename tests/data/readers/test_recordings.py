@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -27,9 +29,10 @@ def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_pat
 
 
 def test_frames_whose_names_do_not_count_are_counted(tmp_path, read):
-    fill(tmp_path, [f"a/{stamp}.png" for stamp in (1700000033, 1700000066, 1700000100)])
+    fill(tmp_path, [f"a/{stamp}.png" for stamp in (1700000000033, 1700000000066, 1700000000100)])
     fill(tmp_path, ["b/first.png", "b/second.png", "c/1.png", "c/1.jpg"])
-    table = read("recordings", sensor="my_gel", val=0, test=0)
+    table = read("recordings", sensor="my_gel", val=0, test=0, films=True)
+    assert any("do not order 2 recordings clearly (first: b)" in note for note in table.report.notes)
     of = {name: [row["frame_index"] for row in table.rows.values() if row["sequence"] == name] for name in "abc"}
     assert of == {"a": [0, 1, 2], "b": [0, 1], "c": [0, 1]}
 
@@ -218,6 +221,97 @@ def test_videos_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, m
     assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {"mug", "ball"}
     assert decode(root / "mug" / "two" / "000004.png")[0, 0] == pytest.approx([10, 80, 200], abs=6)  # red first
     assert table.reasons["video that cannot be read"] == 1
+
+
+@pytest.mark.parametrize(
+    ("form", "splits"),
+    [
+        ("{split}/{kind}", ("train", "val", "test")), ("{kind}/{split}", ("Training", "valid", "TEST")),
+        ("data/{split}/{kind}", ("train_set", "dev", "testing")),
+        ("{kind}/{split}/take", ("trn", "Validation", "eval")),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("count", [1, 4])
+def test_split_words_decide_splits_and_name_nothing(tmp_path, read, form, splits, count):
+    kinds, parts = ("cotton", "denim"), ("train", "val", "test")
+    fill(tmp_path, [f"{form.format(split=split, kind=kind)}/{n:03d}.png"
+                    for split in splits for kind in kinds for n in range(count)])  # fmt: skip
+    table = read("recordings", sensor="digit", films=True)
+    of = dict(zip(splits, parts, strict=True))
+    for path, row in table.rows.items():
+        assert row["object"] in kinds and row["object"] in path and row["object"] in row["sequence"]
+        assert row["split"] == next(part for split, part in of.items() if f"{split}/" in f"{path}/")
+        assert not {*splits, *parts} & {*row["sequence"].split("/")}
+    assert len(set(table["sequence"])) == 6
+    assert "<split>/" in table.report.notes[0]
+    assert (f"{splits[1]} is split val" in table.report.notes[0]) == ("val" not in splits)
+
+
+def test_a_path_in_two_splits_is_refused_and_folders_outside_are_ranked(tmp_path, read):
+    fill(tmp_path, ["test/a/0.png", "train/a/0.png", *(f"more {k}/0.png" for k in range(3))])
+    rows = read("recordings", sensor="digit").rows.values()
+    assert sorted(row["split"] for row in rows if "more" in row["sequence"]) == ["test", "train", "val"]
+    fill(tmp_path, ["train/a/valid/0.png"])
+    with pytest.raises(UserError, match="train/a/valid names two splits, train and valid"):
+        read("recordings", sensor="digit")
+
+
+def _presses(folder, names, seconds=0.0, film=False):
+    """Write pictures of presses at random places, or of one that moves on, and the times of their files."""
+    rng = np.random.default_rng(list(folder.name.encode()))
+    folder.mkdir(parents=True, exist_ok=True)
+    for at, name in enumerate(names):
+        picture = np.full((48, 64, 3), 90, np.uint8)
+        place = (8 + 4 * at, 24) if film else tuple(int(x) for x in rng.integers(8, 40, 2))
+        cv2.imwrite(str(folder / name), cv2.circle(picture, place, 8, (220, 160, 90), -1))
+        os.utime(folder / name, (1.7e9 + seconds * at,) * 2)
+
+
+@pytest.mark.parametrize(
+    ("names", "single", "made"),
+    [
+        ([f"{n:03d}.png" for n in range(9)], False, {"film": True}),
+        ([f"{n:03d}.png" for n in range(9)], True, {}),  # numbered too: the pictures decide
+        ([f"{n:03d}.png" for n in range(9)], True, {"film": True, "seconds": 60}),  # or the times of the files
+        ([f"1731000000.{33 * n:03d}.png" for n in range(9)], False, {"film": True}),
+        ([f"IMG_20240105_12{n:02d}{n * n % 60:02d}.png" for n in range(9)], True, {"film": True}),
+        ([f"17310000{n}7.png" for n in range(9)], True, {"film": True}),  # seconds
+        ([f"{n * 7919 % 4096:x}f{n * n * 31 % 17}a.png" for n in range(9)], True, {"film": True}),
+    ],
+)  # fmt: skip
+def test_pictures_that_look_like_no_film_are_single_touches(tmp_path, read, names, single, made):
+    for kind in ("nut", "pin", "cap"):
+        _presses(tmp_path / kind, names, **made)
+    table = read("recordings", sensor="digit")
+    assert len(set(table["sequence"])) == (27 if single else 3)
+    assert len({row["object"] for row in table.rows.values() if row["split"] == "test"}) == (3 if single else 1)
+    assert ("<touch>" in table.report.notes[0]) == single
+    for choice, count in (("singles", 27), ("films", 3)):
+        assert len(set(read("recordings", sensor="digit", **{choice: True})["sequence"])) == count
+
+
+def test_single_touches_are_split_by_a_group_of_the_user(tmp_path, read):
+    fill(tmp_path, [f"{kind}/p{person}_{n}.png" for kind in ("nut", "pin") for person in range(4) for n in range(3)])
+    lines = [f"{kind}/p{p}_{n}.png,{p}" for kind in ("nut", "pin") for p in range(4) for n in range(3)]
+    (tmp_path / "labels.csv").write_text("\n".join(["sequence,person", *lines]))
+    for options in ({"split_by": r"p(\d)_"}, {"split_by": "person", "labels": tmp_path / "labels.csv"}):
+        table, splits = read("recordings", sensor="digit", singles=True, **options), {}
+        for path, row in table.rows.items():
+            splits.setdefault(path.split("/p")[1][0], set()).add(row["split"])
+        assert sorted(map(list, splits.values())) == [["test"], ["train"], ["train"], ["val"]]
+    for wrong, words in (("nobody", "is no column; give"), ("(x", "is no pattern"), ("(x)", "is in no path")):
+        with pytest.raises(UserError, match=words):
+            read("recordings", sensor="digit", split_by=wrong)
+    with pytest.raises(UserError, match="exclude each other"):
+        read("recordings", sensor="digit", singles=True, films=True)
+
+
+def test_frames_without_order_in_their_names_come_by_time_when_asked(tmp_path, read):
+    names = [f"{word}.png" for word in ("one", "two", "three", "four")]
+    _presses(tmp_path / "mug", names, seconds=1)
+    table = read("recordings", sensor="digit", films=True)
+    assert any("names do not order 1 recordings clearly (first: mug); --order times" in x for x in table.report.notes)
+    assert [path.split("/")[1] for path in read("recordings", sensor="digit", order="times")["path"]] == names
 
 
 def test_mistakes(tmp_path, read):

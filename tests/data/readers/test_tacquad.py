@@ -32,6 +32,16 @@ def test_contact_windows_pairs_photographs_and_captions(tmp_path, read):
     assert len([c for c in table.clips(3) if "/digit/" in c[0] and table.rows[c[0]]["split"] == "train"]) == 2 * 6
 
 
+@pytest.mark.parametrize("numbers", [range(0, 20, 2), [*range(4), *range(8, 12)]])
+def test_photographs_are_of_the_same_fraction_where_frames_are_missing(tmp_path, read, numbers):
+    _tree(tmp_path, items=("cup",), frames=0, photos=60)
+    for sensor in SENSORS:
+        fill(tmp_path, [f"data_indoor/cup/{sensor}/{number}.png" for number in numbers])
+    for row in read("tacquad", val=0, test=0).rows.values():
+        photo = int(row["image_path"].rpartition("/")[2].removesuffix(".png"))
+        assert photo == 60 * row["frame_index"] // (max(numbers) + 1)
+
+
 def test_one_item_is_in_one_split_and_fine_is_unused(tmp_path, read):
     _tree(tmp_path, items=[f"o{k}" for k in range(12)], frames=4, photos=4, windows="0,3,0,3,0,3")
     _tree(tmp_path, "fine", ("ball",), windows="1,2,1,2,1,2")

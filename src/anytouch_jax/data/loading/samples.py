@@ -45,7 +45,7 @@ class SampleReader:
     manifest: Manifest
     config: Config
     gels: UnitGels | None = None
-    _cache: dict[Path, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
+    _cache: dict[Path, tuple[np.ndarray, tuple[int, ...]]] = field(default_factory=dict, repr=False, compare=False)
 
     def touch(
         self, rows: np.ndarray, epoch: int | None, out: np.ndarray | None = None, prepare: Prepare | None = None
@@ -62,7 +62,8 @@ class SampleReader:
         # Frames are resized once and cached, unless the background is subtracted at their original size.
         gel = None if self.config.data.background == "keep" or self.gels is None else self.gels(int(rows[-1]))
         subtracts = self._subtracts(int(rows[-1]), epoch, gel)
-        load = None if epoch is None or (plain and subtracts) else self._resized
+        shapes: list[tuple[int, ...]] = []  # before resizing
+        load = None if epoch is None or (plain and subtracts) else partial(self._resized, shapes=shapes)
         frames = [read_image(self.manifest, row, load=load) for row in rows]
         background = gel if subtracts else None
         if subtracts and gel is None:
@@ -72,6 +73,12 @@ class SampleReader:
                     "requires; add one, or pass --data.background keep"
                 )
             background = read_image(self.manifest, rows[-1], "background_path", load or self._decode_background)
+        if background is not None:
+            resized = shapes[len(rows) :]  # of a background that was read
+            try:
+                transforms.check_proportions((shapes or [frames[0].shape])[0], (resized or [background.shape])[0])
+            except UserError as error:
+                raise SampleError(f"{self.manifest.where(rows[-1])}: {error}") from None
         if prepare is not None:
             return np.stack([prepare(frame, background) for frame in frames])
         if epoch is None or plain:
@@ -108,14 +115,16 @@ class SampleReader:
         """`decode` with a cache of this reader's lifetime: many frames share a background."""
         return lru_cache(256)(decode)
 
-    def _resized(self, file: Path) -> np.ndarray:
-        """Return an image at the model's size, read-only, from the cache if it is there."""
-        image = self._cache.get(file)
+    def _resized(self, file: Path, shapes: list[tuple[int, ...]]) -> np.ndarray:
+        """Return an image at the model's size, read-only, from the cache if it is there. Its shape goes to `shapes`."""
+        image, shape = self._cache.get(file, (None, ()))
         if image is None:
-            image = transforms.touch_evaluation([decode(file)], self.config.model.image_size)[0]
+            decoded = decode(file)
+            image, shape = transforms.touch_evaluation([decoded], self.config.model.image_size)[0], decoded.shape
             image.flags.writeable = False
             if (len(self._cache) + 1) * image.nbytes <= self.config.data.cache * 1_000_000:
-                self._cache[file] = image
+                self._cache[file] = image, shape
+        shapes.append(shape)
         return image
 
 

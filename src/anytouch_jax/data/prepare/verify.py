@@ -38,6 +38,7 @@ from anytouch_jax.data.prepare.scan import (
     finding,
     scan,
 )
+from anytouch_jax.data.transforms import FORM
 from anytouch_jax.shown import shown_short
 
 _SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
@@ -235,6 +236,21 @@ def _codes(column: pa.ChunkedArray) -> pa.Array:
     return (column if binary else column.cast(pa.string())).combine_chunks().dictionary_encode().indices
 
 
+def _background_forms(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
+    """Yield rows whose background has other proportions than the frame: encoders refuse them."""
+    frame, background = scanned.files.code["path"], scanned.files.code.get("background_path")
+    if background is None:
+        return
+    rows = np.flatnonzero((frame >= 0) & (background >= 0))
+    rows = rows[scanned.decoded[frame[rows]] & scanned.decoded[background[rows]]]
+    sizes = scanned.size[frame[rows]].astype(float), scanned.size[background[rows]].astype(float)
+    scale = sizes[1].max(1) / sizes[0].max(1)
+    odd = rows[np.abs(sizes[0] * scale[:, None] - sizes[1]).max(1) > sizes[1].max(1) / FORM]
+    words = "rows whose background_path has other proportions than the frame: it is turned or cropped"
+    columns = "path", "background_path"
+    yield from finding(manifest, "background_form", "error", odd, words, *columns, column="background_path")
+
+
 def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield touch images that occur more than once, and touch images that are also the row's photograph."""
     same = content_ids(scanned)
@@ -296,10 +312,13 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
 def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
     """Yield label values, objects and units that differ by spaces, letter case or Unicode form only.
 
-    Yield labels too of which most are numbers and some are words.
+    Yield labels too of which most are numbers and some are words, and those that are lists.
     """
     for name in manifest.table.column_names:
         column = manifest.table[name]
+        if name.startswith("label.") and pa.types.is_nested(column.type):
+            words = f"values of {name} are lists, which no probe reads; write a column for each number"
+            yield from finding(manifest, "list_label", "warning", np.flatnonzero(manifest.present(name)), words, name)
         if not pa.types.is_string(column.type) or not (name in ("object", "unit") or name.startswith("label.")):
             continue
         for group in spellings(column.unique().drop_null().to_pylist()):
@@ -512,4 +531,4 @@ def _variants(colours: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
             yield "turned", np.rot90(fields[:, ::-1] if mirror else fields, turns).ravel()
 
 
-_FILE_CHECKS = (_bad_files, _wrong_sizes, _duplicates, _swapped, picture_faults)
+_FILE_CHECKS = (_bad_files, _wrong_sizes, _background_forms, _duplicates, _swapped, picture_faults)

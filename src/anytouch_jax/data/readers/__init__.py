@@ -53,6 +53,8 @@ class IndexReport:
     manifest: Manifest
     skipped: dict[str, tuple[int, str]]
     notes: list[str]
+    left_out: int = 0  # frames without a row
+    written: int = 0  # pictures that were written into ROOT
 
     @property
     def splits(self) -> dict[str, int]:
@@ -75,14 +77,18 @@ class IndexReport:
         reader, manifest = self.reader, self.manifest
         splits = ", ".join(f"{name} {count:,}" for name, count in self.splits.items())
         image, text, touch = (int(manifest.present(name).sum()) for name in ("image_path", "text", "touch"))
+        labels = [name for name in manifest.table.column_names if name.startswith("label.")]
+        found = ", ".join(f"{name.removeprefix('label.')} {manifest.present(name).sum():,}" for name in labels)
         share = f" ({reader.paper_note})" if reader.paper_note else ""
         paper = f"{reader.paper:,} in the paper{share}" if reader.paper else "no count in the paper"
         use = "commercial use allowed" if reader.commercial else "no commercial use unless its owner allows it"
         return [
             f"{self.out}: {len(manifest):,} rows of {manifest.codes('sequence').max() + 1:,} sequences ({splits})",
             "sensors: " + ", ".join(f"{name} {count:,}" for name, count in self.sensors.items()),
+            f"frames read {len(manifest) + self.left_out:,}, rows {len(manifest):,}, without a row {self.left_out:,}",
             f"touch frames {self.frames:,}; {paper}",
             f"with photograph {image:,}, with text {text:,}, in a touch pair {touch:,}",
+            *([f"labels found: {found}"] if found else []),
             f"licence: {reader.license}; {use}" + (f" ({reader.url})" if reader.url else ""),
             f"to be cited: {reader.citation}",
             *(f"left out or noted, {reason}: {count:,} (first: {example})"
@@ -143,15 +149,16 @@ def index(
     manifest = manifests.from_columns(columns, target)
     manifest.clips(2)  # raises for a repeated frame
     _check_links(manifest, base)
-    groups = ("sequence",) if options.split_by == "recording" else ("sequence", "object")
-    manifest = _carry_over(manifest, target, rows.notes, keep=keep, groups=groups)
+    manifest = _carry_over(manifest, target, rows.notes, keep=keep, groups=rows.keep_together)
     try:
         marked = manifest.table.replace_schema_metadata({_INDEX_KEY: manifest.content_hash.encode()})
         manifests.write(replace(manifest, table=marked), target)
     except OSError as error:
         raise UserError(f"the manifest {target} cannot be written: {error.strerror}; {_OTHER_OUT}") from None
     rows.notes += [sentence for _, sentence, _ in manifests.misspelt_sensors(manifest)]
-    return IndexReport(reader, target, manifest, dict(sorted(rows.skipped.items())), rows.notes)
+    return IndexReport(
+        reader, target, manifest, dict(sorted(rows.skipped.items())), rows.notes, rows.left_out, rows.written
+    )
 
 
 def _target(base: Path, name: str, out: str | Path | None) -> Path:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
+import difflib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -15,17 +18,33 @@ import numpy as np
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.data.images import decode_bytes
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, save_png
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
+from anytouch_jax.data.readers.exports import Export, exported
 from anytouch_jax.errors import UserError
 
 FAR = 100_000_000  # nanoseconds: a label that is further from its frame is empty
-_CHANNELS = {"rgb8": (3, None), "bgr8": (3, cv2.COLOR_BGR2RGB), "rgba8": (4, cv2.COLOR_RGBA2RGB),
-             "bgra8": (4, cv2.COLOR_BGRA2RGB), "mono8": (1, cv2.COLOR_GRAY2RGB), "8UC1": (1, cv2.COLOR_GRAY2RGB),
-             "8UC3": (3, cv2.COLOR_BGR2RGB)}  # fmt: skip
+_BAYER = {"rggb": cv2.COLOR_BayerBG2RGB, "bggr": cv2.COLOR_BayerRG2RGB, "gbrg": cv2.COLOR_BayerGR2RGB,
+          "grbg": cv2.COLOR_BayerGB2RGB}  # OpenCV names the second row  # fmt: skip
+_ENCODINGS: dict[str, tuple[int, int, int | None]] = {  # channels, bytes of each, change of colours
+    "rgb8": (3, 1, None), "bgr8": (3, 1, cv2.COLOR_BGR2RGB), "rgba8": (4, 1, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, 1, cv2.COLOR_BGRA2RGB), "mono8": (1, 1, cv2.COLOR_GRAY2RGB), "8UC1": (1, 1, cv2.COLOR_GRAY2RGB),
+    "8UC3": (3, 1, cv2.COLOR_BGR2RGB), "8UC4": (4, 1, cv2.COLOR_BGRA2RGB), "mono16": (1, 2, cv2.COLOR_GRAY2RGB),
+    "rgb16": (3, 2, None), "bgr16": (3, 2, cv2.COLOR_BGR2RGB),
+    "yuv422": (2, 1, cv2.COLOR_YUV2RGB_UYVY), "uyvy": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2RGB_YUYV), "yuyv": (2, 1, cv2.COLOR_YUV2RGB_YUYV),
+    **{f"bayer_{name}{8 * size}": (1, size, change) for name, change in _BAYER.items() for size in (1, 2)},
+}  # fmt: skip
+
+
+class BagError(DatasetError):
+    """A recording that is damaged."""
 
 
 class Message(NamedTuple):
-    """A message of a recording: its topic, the time when it was logged in nanoseconds, its type, its content."""
+    """A message of a recording: its topic, the time when it was logged in nanoseconds, its type, its content.
+
+    The content is None if its encoding is not read.
+    """
 
     topic: str
     time: int
@@ -38,35 +57,77 @@ def _bags(index: DatasetIndex) -> None:
 
     The time of a frame is that of its header, else that of the log, in nanoseconds (column `time`). Labels are the
     values of other topics that are nearest in time, at most a tenth of a second away. Their `values` read
-    NAME=TOPIC:FIELD.
+    NAME=TOPIC:FIELD. What is no picture that can be read is left out, and counted by topic.
     """
-    sensor = index.need_sensor()
+    index.need_sensor()
     places = _labels_wanted(index.options.values)
+    index.wanted += [f"label.{name}" for name in places]
     for path in _bag_files(index):
         index.need_export(f"the recording {path}")
-        frames: dict[str, list[tuple[int, str]]] = {}
-        series: dict[str, list[tuple[int, Any]]] = {name: [] for name in places}
-        wanted = {*index.options.keys, *(topic for topic, _ in places.values())} if index.options.keys else None
-        for message in read_messages(index.root / path, wanted):
+        try:
+            _add_recording(index, path, places)
+        except BagError as error:
+            index.skip("recording that cannot be read", str(error))
+
+
+def _add_recording(index: DatasetIndex, path: str, places: dict[str, tuple[str, str]]) -> None:
+    """Write the pictures of a recording, all or none, and add its rows."""
+    file, keys = index.root / path, index.options.keys
+    sources = sorted(one for one in file.iterdir() if one.is_file()) if file.is_dir() else [file]
+    series: dict[str, list[tuple[int, Any]]] = {name: [] for name in places}
+    wanted = {*keys, *(topic for topic, _ in places.values())} if keys else None
+    frames: dict[str, list[int]] = {}
+    counts: Counter[str] = Counter()  # of all pictures of a topic
+    topics: set[str] = set()
+    exports: dict[str, Export] = {}
+    with ExitStack() as stack:
+        for message in read_messages(file, wanted):
+            topics.add(message.topic)
             for name, (topic, field) in places.items():
                 if message.topic == topic:
                     series[name].append((_time(message), _field(message.content, field, message.topic)))
-            if index.options.keys and message.topic not in index.options.keys:
+            if keys and message.topic not in keys:
                 continue
-            if (picture := picture_of(message)) is not None:
-                own = frames.setdefault(message.topic, [])
-                stem = Path(path).with_suffix("").as_posix()
-                own.append((_time(message), f"{stem}/{message.topic.strip('/').replace('/', '.')}/{len(own):06d}.png"))
-                save_png(index.root / own[-1][1], picture)
-        if not frames:
-            index.skip("recording without images of the chosen topics", path)
-        for topic, rows in frames.items():
-            times = np.array([time for time, _ in rows])
-            labels = {f"label.{name}": nearest_values(times, one) for name, one in series.items()}
-            index.add(
-                [name for _, name in rows], sensor=sensor, unit=topic, sequence=f"{path}{topic}",
-                frame_index=list(range(len(rows))), time=times.tolist(), split=index.split_of(path), **labels,
-            )  # fmt: skip
+            where = f"{path}, topic {message.topic}, frame {counts[message.topic]}"
+            try:
+                picture = picture_of(message)
+            except UserError as error:
+                index.leave_out(str(error), where)
+                picture = None
+                counts[message.topic] += 1
+            if picture is None:
+                continue
+            counts[message.topic] += 1
+            if message.topic not in exports:
+                folder = f"{Path(path).with_suffix('').as_posix()}/{message.topic.strip('/').replace('/', '.')}"
+                stream = f"{file.name}{message.topic}"
+                exports[message.topic] = stack.enter_context(exported(index, folder, stream, sources))
+            own = frames.setdefault(message.topic, [])
+            exports[message.topic].save(f"{len(own):06d}.png", picture)
+            own.append(_time(message))
+    if not frames:
+        index.skip("recording without images of the chosen topics", path)
+    for name, (topic, _) in places.items():
+        if frames and topic not in topics:
+            near = difflib.get_close_matches(topic, topics, 1)
+            hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(sorted(topics))}"
+            index.notes.append(f"{path} has no message of the topic {topic}, so label.{name} has no value{hint}")
+    for topic, times in frames.items():
+        stamps = np.array(times)
+        labels = {f"label.{name}": nearest_values(stamps, one) for name, one in series.items()}
+        for name, one in series.items():
+            if one and (empty := [at for at, value in enumerate(labels[f"label.{name}"]) if value is None]):
+                known = np.array([time for time, _ in one])
+                away = min(float(np.abs(known - stamps[at]).min()) for at in empty) / 1e9
+                index.skip(
+                    f"frame without label.{name}: no value of {places[name][0]} within {FAR / 1e9:g} s of it (the "
+                    f"nearest is {away:.3g} s away)", f"{path}, topic {topic}, frame {empty[0]}", len(empty),
+                )  # fmt: skip
+        index.add(
+            [f"{exports[topic].folder}/{at:06d}.png" for at in range(len(times))], sensor=index.options.sensor,
+            unit=topic, sequence=f"{path}{topic}", frame_index=list(range(len(times))), time=times,
+            split=index.split_of(path), **labels,
+        )  # fmt: skip
 
 
 def nearest_values(times: np.ndarray, series: list[tuple[int, Any]]) -> list[Any]:
@@ -103,7 +164,7 @@ def _bag_files(index: DatasetIndex) -> Iterator[str]:
 
 
 def read_messages(path: Path, topics: set[str] | None = None) -> Iterator[Message]:
-    """Yield the messages of a recording in the order of their times, of some topics or of all. Raises DatasetError."""
+    """Yield the messages of a recording in the order of their times, of some topics or of all. Raises BagError."""
     try:
         if path.suffix == ".mcap":
             yield from _mcap_messages(path, topics)
@@ -120,7 +181,7 @@ def read_messages(path: Path, topics: set[str] | None = None) -> Iterator[Messag
     except (UserError, GeneratorExit):
         raise
     except Exception as error:  # both packages have many kinds of errors for a damaged file
-        raise DatasetError(f"{path} cannot be read: {error}; record it again, or repair it with mcap recover") from None
+        raise BagError(f"{path}: {error}; record it again, or repair it with mcap recover") from None
 
 
 def _mcap_messages(path: Path, topics: set[str] | None) -> Iterator[Message]:
@@ -153,30 +214,40 @@ def _mcap_messages(path: Path, topics: set[str] | None) -> Iterator[Message]:
                     protobuf = DecoderFactory()
                 content = protobuf.decoder_for(encoding, schema)(message.data)
             else:
-                continue
+                content = None
             yield Message(channel.topic, message.log_time, kind, content)
 
 
 def picture_of(message: Message) -> np.ndarray | None:
-    """Return the picture RGB u8 of a message of sensor_msgs or foxglove, None for another. Raises DatasetError."""
+    """Return the picture RGB u8 of a message of sensor_msgs or foxglove, None for another. Raises UserError."""
     kind, content = message.kind.rsplit("/", 1)[-1].rsplit(".", 1)[-1], message.content
-    if kind == "CompressedImage":
-        data = base64.b64decode(content.data) if isinstance(content.data, str) else bytes(content.data)
-        return decode_bytes(data, f"a message of {message.topic}")
-    if kind not in ("Image", "RawImage") or not hasattr(content, "encoding"):
+    if not re.search(r"Image|Video", kind):
         return None
-    if content.encoding not in _CHANNELS:
-        raise DatasetError(
-            f"{message.topic} has pictures of encoding {content.encoding}; choose other topics by --keys"
-        )
-    (channels, change), width, height = _CHANNELS[content.encoding], int(content.width), int(content.height)
-    raw = base64.b64decode(content.data) if isinstance(content.data, str) else content.data
-    flat = np.frombuffer(raw, np.uint8) if isinstance(raw, bytes) else np.asarray(raw, np.uint8)
-    step = int(content.step)
-    if height * step > flat.size or step < width * channels or not width or not height:
-        raise DatasetError(f"{message.topic} has a picture that is cut short")
-    picture = flat[: height * step].reshape(height, step)[:, : width * channels].reshape(height, width, channels)
-    return np.ascontiguousarray(picture if change is None else cv2.cvtColor(np.ascontiguousarray(picture), change))
+    if content is None or kind not in ("CompressedImage", "Image", "RawImage"):
+        raise DatasetError(f"{kind} of a form that is not read")
+    data = base64.b64decode(content.data) if isinstance(content.data, str) else bytes(content.data)
+    if kind == "CompressedImage":
+        if "compressedDepth" in str(content.format):
+            raise DatasetError("picture of depth")
+        return decode_bytes(data, "picture")
+    if content.encoding not in _ENCODINGS:
+        raise DatasetError(f"picture of encoding {content.encoding}, which is not read")
+    (channels, size, change), width, height = _ENCODINGS[content.encoding], int(content.width), int(content.height)
+    step, row = int(content.step), width * channels * size
+    if step < row or not width or not height:
+        raise DatasetError(f"picture of {width} x {height} pixels and {step} bytes a row")
+    if height * step > len(data):
+        raise DatasetError("picture that is cut short")
+    flat = np.frombuffer(data, np.uint8, height * step).reshape(height, step)[:, :row]
+    picture = np.ascontiguousarray(flat)
+    if size == 2:
+        wide = picture.view(">u2" if getattr(content, "is_bigendian", False) else "<u2")
+        picture = ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    picture = picture.reshape(height, width, channels)
+    try:
+        return picture if change is None else cv2.cvtColor(picture, change)
+    except cv2.error as error:  # of an odd width or height
+        raise DatasetError(f"picture of {width} x {height} pixels in {content.encoding}: {error.err}") from None
 
 
 def _time(message: Message) -> int:

@@ -18,21 +18,27 @@ from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-import numpy as np
-
 from anytouch_jax.bars import Item, tracked
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling, parse_json
-from anytouch_jax.data.images import count_frames, encode, frames_from_video, natural
 from anytouch_jax.data.manifest.remote import open_store
 from anytouch_jax.data.manifest.schema import REQUIRED
+from anytouch_jax.data.names import natural
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_folder, atomic_write, csv_lines
+from anytouch_jax.files import csv_lines
 
 Columns = dict[str, list[Any]]
 Frames = dict[int, str]  # frame number -> file name, by number
 Folder = tuple[str, list[str], list[str]]  # its path below a base, its folders, its files
+_WORDS = {"train": "train", "training": "train", "trn": "train", "val": "val", "valid": "val", "validation": "val",
+          "dev": "val", "test": "test", "testing": "test", "tst": "test", "eval": "test", "evaluation": "test",
+          "holdout": "test"}  # fmt: skip
+_MORE = r"(?:set|sets|split|data|dataset|images?|imgs?|frames|pictures|samples)"  # around a word, as in train_set
+_SPLIT = re.compile(rf"[\W_]*(?:{_MORE}[\W_]+)?({'|'.join(_WORDS)})(?:[\W_]*{_MORE})?[\W_]*", re.IGNORECASE)
+MOST_LABELS = 1000  # of one value
+TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)  # in names of cameras and fields
 PARTS = ("train", "val", "test")  # published splits
 NUMBERED = r"(\d+)\.(?:png|jpe?g)"
+EXPORT_RECORD = ".anytouch.json"  # in a folder of pictures that a reader has written
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini", "__MACOSX")
 _ALLOWED = {  # names in a pickle
     ("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode"), ("collections", "OrderedDict"),
@@ -53,6 +59,7 @@ class IndexOptions:
     `lists`: a folder with list files, searched before ROOT. `task`: the lists of Touch and Go that decide the split.
     `fold`: the `split_<k>.npy` of Feel. `export`: write pictures into ROOT for datasets of arrays or videos. `sensor`,
     `split_by`, `labels`: for recordings, their sensor, what is held out, and a table of labels by object or sequence.
+    `singles`, `films`: whether pictures are single touches or films (default: by their names). `order`: of frames.
     `url`: the address of shards that are not in ROOT. `keys`: tactile cameras, or topics of images. `values`: what else
     becomes a label, as NAME=PLACE.
     """
@@ -64,7 +71,10 @@ class IndexOptions:
     fold: int = 0
     export: bool = False
     sensor: str | None = None
-    split_by: Literal["object", "recording"] = "object"
+    split_by: str | None = None
+    singles: bool = False
+    films: bool = False
+    order: Literal["names", "times"] = "names"
     labels: Path | None = None
     url: str | None = None
     keys: tuple[str, ...] = ()
@@ -110,8 +120,12 @@ class DatasetIndex:
         self.name, self.root, self.options = name, root, options or IndexOptions()
         self.skipped: dict[str, tuple[int, str]] = {}
         self.notes: list[str] = []
+        self.keep_together = ["sequence", "object"]  # columns whose values stay in one split
         self.contact: dict[str, list[str]] | None = None  # the authors' list of contact frames: path -> its cells
         self._contact_rows = 0
+        self.wanted: list[str] = []  # columns that the user asked for
+        self.left_out = 0  # frames without a row
+        self.written = 0  # pictures that were written into ROOT
         self.table: Columns = {name: [] for name in REQUIRED}
 
     @staticmethod
@@ -124,6 +138,11 @@ class DatasetIndex:
         if count:
             before, first = self.skipped.get(reason, (0, example))
             self.skipped[reason] = before + count, first
+
+    def leave_out(self, reason: str, example: str, count: int = 1) -> None:
+        """Count frames that get no row, see `skip`."""
+        self.left_out += count
+        self.skip(reason, example, count)
 
     def find_folder(self, *choices: str, inside: Sequence[str] = ("",)) -> str | None:
         """Return the first of the folders `choices` that exists and holds one of `inside` (if any), else None."""
@@ -149,6 +168,8 @@ class DatasetIndex:
             raise DatasetError(f"{self.root / folder} cannot be listed: {error.strerror}") from None
         for entry in entries:
             name, reason = entry.name, None
+            if name == EXPORT_RECORD:
+                continue
             is_text = name.encode(errors="ignore").decode() == name
             if name.startswith(".") or name in SYSTEM_FILES:
                 reason = "hidden or system file"
@@ -220,7 +241,7 @@ class DatasetIndex:
             if not parts or len(parts[1]) > 18:  # a manifest holds numbers of 64 bits
                 self.skip("file that is not a frame by its name", f"{folder}/{name}", int(count))
             elif int(parts[1]) in frames:
-                self.skip("second file of one frame number", f"{folder}/{name}", int(count))
+                self.leave_out("second file of one frame number", f"{folder}/{name}", int(count))
             else:
                 frames[int(parts[1])] = name
         return dict(sorted(frames.items()))
@@ -293,36 +314,44 @@ class DatasetIndex:
         self.add([f"{folder}/{name}".lstrip("/") for name in frames.values()], frame_index=list(frames), **cells)
 
     def columns(self) -> Columns:
-        """Return all columns, without optional ones that are null on every row; report unmatched contact frames."""
+        """Return all columns, without optional ones that are null on every row; report unmatched contact frames.
+
+        A note says which of the columns that were asked for have no value.
+        """
         if self.contact is not None:
             missing = len(self.contact) - self._contact_rows
             self.skip("listed contact frame that is not on disk", "see the contact list", missing)
         has_value = {name: any(value is not None for value in column) for name, column in self.table.items()}
+        lost = [name for name in dict.fromkeys(self.wanted) if not has_value.get(name)]
+        self.notes += [f"no row has a value of {name}, so the manifest has no such column" for name in lost]
         return {name: column for name, column in self.table.items() if name in REQUIRED or has_value[name]}
 
 
-def save_png(file: Path, picture: np.ndarray) -> None:
-    """Write a picture RGB u8 (h, w, 3) as PNG, unless the file exists."""
-    if not file.is_file():
-        atomic_write(file, encode(np.ascontiguousarray(picture)), sync=False)
+def split_word(name: str) -> str | None:
+    """Return the split that a folder's name says, in any case: Training, valid, test_set; None for others."""
+    match = _SPLIT.fullmatch(name)
+    return match and _WORDS[match[1].lower()]
 
 
-def export_video(video: Path) -> int:
-    """Write the frames of a video as 000000.png, ... into a folder of its name, whole or not; return their number.
+def label_cells(name: str, values: list[Any]) -> dict[str, list[Any]]:
+    """Return values by label: NAME of numbers or text, NAME_0, ... of vectors, NAME_0_0 of tables, NAME_key of objects.
 
-    Raises ImageError for a video that cannot be read, UserError if nothing can be written.
+    A row without a value, or with a shorter vector, has None. Raises DatasetError for more than MOST_LABELS.
     """
-    count = 0
-    try:
-        with atomic_folder(video.with_suffix("")) as target:
-            for frame in tracked(frames_from_video(video), "frames written", count_frames(video) or None):
-                save_png(target / f"{count:06d}.png", frame)
-                count += 1
-    except OSError as error:
-        raise UserError(
-            f"the frames of {video} cannot be written next to it: {error.strerror}; make its folder writable"
-        ) from None
-    return count
+    rows = [dict(_flat(value)) for value in values]
+    places = dict.fromkeys(place for row in rows for place in row)
+    if len(places) > MOST_LABELS:
+        raise DatasetError(f"{name} has {len(places)} values a frame, too many for labels; choose another")
+    return {"_".join([name, *place]): [row.get(place) for row in rows] for place in places or [()]}
+
+
+def _flat(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the numbers and texts of a value, with their places in its lists and objects."""
+    if isinstance(value, list | dict):
+        for at, one in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _flat(one, (*place, str(at)))
+    elif value is not None:
+        yield place, int(value) if isinstance(value, bool) else value
 
 
 def hash_split(dataset: str, group: str, options: IndexOptions) -> str:

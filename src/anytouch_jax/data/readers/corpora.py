@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ import pyarrow.parquet
 
 from anytouch_jax.config import parse_json
 from anytouch_jax.data.manifest.files import ShardError, tar_members
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
+from anytouch_jax.data.manifest.schema import typed_label
+from anytouch_jax.data.readers.common import TACTILE, DatasetError, DatasetIndex, DatasetReader, label_cells, split_word
 from anytouch_jax.errors import UserError
 
 _CC_BY, _TACTILE_MNIST = "CC-BY-4.0", "CC-BY-2.0"
@@ -33,6 +35,13 @@ _LABELS = {
     **{name: name for name in ("x_mm", "y_mm", "z_mm", "quat_x", "quat_y", "quat_z", "quat_w")},
 }  # fmt: skip
 _PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+_TEXTS = ("txt", "text", "cls")
+_CAPTION = re.compile(r"caption|text|prompt|sentence|instruction|description", re.IGNORECASE)
+_BACKGROUND = re.compile(r"background|untouched|no_?contact|reference|(?<![a-z])(?:bg|ref)(?![a-z])", re.IGNORECASE)
+_DERIVED = re.compile(r"depth|mask|seg|normal|flow|marker|diff|label", re.IGNORECASE)
+_PHOTO = re.compile(r"photo|rgb|vision|visual|colou?r|camera|(?<![a-z])cam|scene|image|img|wrist|head|kinect|realsense|"
+                    r"third|overhead|front", re.IGNORECASE)  # fmt: skip
+_SIDE = re.compile(r"^(?:\d+|[a-d]|l|r|left|right|thumb|index|middle|ring|little|pinky|finger_?\d*)$", re.IGNORECASE)
 _SENSORS = {
     "gelsight_mini": r"mini", "digit": r"digit|tvl", "gelsight_wedge": r"wedge", "gelsight_svelte": r"svelte",
     "gelsight_finray": r"finray", "densetact": r"densetact", "gelslim": r"objectfolder",
@@ -80,10 +89,11 @@ def _gelsight_mini(index: DatasetIndex) -> None:
 
 
 def _webdataset(index: DatasetIndex) -> None:
-    """Tars of WebDataset with `key.jpg` and `key.json`. Simple values of the JSON become labels, `object` the object.
+    """Tars of WebDataset: a sample is the files of one key, which ends at the first point of their names.
 
-    Every picture is a sequence, because shards are in a random order. A folder called train or val gives the split,
-    which else is by hash of the object, or of the key.
+    Pictures are touches, photographs or backgrounds by their field (`kind_of_picture`). Values of .json and .cls become
+    labels, `object` the object, .txt the caption. Every touch is a sequence, because shards are in a random order. A
+    folder or a shard called train or val gives the split, or else `split` of the JSON, or the hash of object or key.
     """
     sensor = index.need_sensor()
     _tars(index, lambda path: sensor)
@@ -106,48 +116,117 @@ def _fota(index: DatasetIndex) -> None:
 
 
 def _tars(index: DatasetIndex, sensor_of: Any) -> None:
+    shards: dict[tuple[str, str], str] = {}  # the shard of a sample's key
     for path, opened in index.shards(".tar"):
         inside = path.removeprefix(index.options.url or "").lstrip("/")
         sensor, folders = sensor_of(inside), inside.split("/")[:-1]
-        part = next((name for name in reversed(folders) if name in ("train", "val", "test")), None)
-        dataset = "/".join(name for name in folders if name != part) or index.name
+        words = [*reversed(folders), *re.split(r"[\W\d_]+", Path(inside).stem)]
+        part = next((split for word in words if (split := split_word(word))), None)
+        dataset = "/".join(name for name in folders if split_word(name) is None) or index.name
         with opened() as file:
             try:
                 members = tar_members(Path(path), file)
             except ShardError as error:
                 raise DatasetError(str(error)) from None
-            values: dict[str, dict[str, Any]] = {}
-            for name, offset, size in members:
-                if name.endswith(".json"):
-                    file.seek(offset)
-                    values[name.removesuffix(".json")] = _parsed(file.read(size), f"{path}, {name}")
-        for number, (name, *_) in enumerate(members):
-            key, suffix = str(Path(name).with_suffix("")), Path(name).suffix.lower()
-            if suffix not in _PICTURES:
-                index.skip("file of a tar that is no picture", f"{path}/{name}", suffix not in (".json", ".txt"))
-                continue
-            own = values.get(key, {})
-            obj = own.pop("object", own.pop("object_name", None))
-            labels = {f"label.{name.removeprefix('has_')}": value for name, value in own.items()}
-            index.add(
-                [f"{path}/{number}"], sensor=sensor, dataset=dataset, sequence=f"{dataset}/{part or ''}/{key}",
-                frame_index=0, object=None if obj is None else str(obj),
-                split=part or index.split_of(str(obj or key)), **labels,
-            )  # fmt: skip
+            samples: dict[str, dict[str, int]] = {}  # key -> field -> number of the file in the tar
+            for number, (name, *_) in enumerate(members):
+                folder, _, base = name.removeprefix("./").rpartition("/")
+                key, _, field = base.partition(".")
+                samples.setdefault(f"{folder}/{key}".strip("/"), {}).setdefault(field.lower(), number)
+            texts = {
+                (key, field): _read_text(file, path, members[number])
+                for key, fields in samples.items() for field, number in fields.items()
+                if field.rpartition(".")[2] in ("json", *_TEXTS)
+            }  # fmt: skip
+        for key, fields in samples.items():
+            shown = dataset if shards.setdefault((f"{dataset}/{part}", key), path) == path else f"{dataset}/{inside}"
+            own = {field: texts[key, field] for field in fields if (key, field) in texts}
+            place = f"{shown}/{part or ''}/{key}"
+            _add_sample(index, path, place, fields, own, sensor=sensor, dataset=dataset, split=part, key=key)
     _one_type(index)
 
 
+def _add_sample(
+    index: DatasetIndex, path: str, place: str, fields: dict[str, int], texts: dict[str, Any], *, split: str | None,
+    key: str, **cells: Any,
+) -> None:  # fmt: skip
+    """Add a row for each tactile picture of a sample; its other files are photographs, captions and labels."""
+    pictures = {field: kind_of_picture(field, index.options.keys) for field in fields
+                if f".{field.rpartition('.')[2]}" in _PICTURES}  # fmt: skip
+    is_named = "touch" in {pictures[field] for field in pictures if "." in field}
+    touches = [field for field, kind in pictures.items()
+               if kind == "touch" and ("." in field or not is_named or field in index.options.keys)]  # fmt: skip
+    for field in fields:
+        kind, where = pictures.get(field), f"{path}/{key}.{field}"
+        if kind == "other" or (kind == "touch" and field not in touches):
+            index.leave_out("picture that no word calls tactile (--keys names its field)", where)
+        elif kind is None and field not in texts:
+            index.skip("file of a sample that is no picture, label or text", where)
+    values: dict[str, Any] = {}
+    captions = []
+    for field, text in texts.items():
+        name, _, kind = field.rpartition(".")
+        if kind == "json":
+            values |= text
+        elif kind in ("txt", "text") and (not name or _CAPTION.search(name)):
+            captions.append(" ".join(str(text).split()))
+        else:
+            values[name or kind] = text
+    stated = split_word(str(values.get("split"))) if split is None else None
+    if stated is not None:
+        values.pop("split")
+    obj = values.pop("object", values.pop("object_name", None))
+    labels: dict[str, Any] = {}
+    for name, value in values.items():
+        labels |= {f"label.{one.removeprefix('has_')}": cell[0] for one, cell in label_cells(name, [value]).items()}
+    others = {kind: f"{path}/{fields[field]}" for field, kind in reversed(pictures.items())}
+    if not touches:
+        index.skip("sample without a tactile picture", f"{path}/{key}")
+    for field in touches:
+        unit = field.rpartition(".")[0] or None
+        index.add(
+            [f"{path}/{fields[field]}"], sequence=place if len(touches) == 1 else f"{place}/{unit or field}",
+            unit=unit if len(touches) > 1 else None, frame_index=0, object=None if obj is None else str(obj),
+            text=" ".join(captions) or None, image_path=others.get("photo"), background_path=others.get("background"),
+            split=split or stated or index.split_of(str(obj or key)), **cells, **labels,
+        )  # fmt: skip
+
+
+def kind_of_picture(field: str, keys: Sequence[str] = ()) -> str:
+    """Return what the picture of a field of a sample is: touch, photo, background or other. `keys` are tactile fields.
+
+    A field such as jpg, without a name, and one of a side, such as left.jpg, are tactile.
+    """
+    name = field.rpartition(".")[0]
+    if keys:
+        return "touch" if field in keys or name in keys else "photo" if _PHOTO.search(name) else "other"
+    kinds = (("background", _BACKGROUND), ("other", _DERIVED), ("touch", TACTILE), ("photo", _PHOTO), ("touch", _SIDE))
+    return next((kind for kind, words in kinds if words.search(name)), "other") if name else "touch"
+
+
+def _read_text(file: Any, path: str, member: tuple[str, int, int]) -> Any:
+    """Return the values of a JSON file of a tar, or its text as a number if it is one. Raises DatasetError."""
+    name, offset, size = member
+    file.seek(offset)
+    data = file.read(size)
+    if name.lower().endswith(".json"):
+        return _parsed(data, f"{path}, {name}")
+    try:
+        text = data.decode("utf-8-sig").strip()
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path}, {name} is not text in UTF-8; correct it or download it again") from None
+    return typed_label(pa.chunked_array([pa.array([text])]))[0].as_py() if name.lower().endswith(".cls") else text
+
+
 def _parsed(data: bytes, where: str) -> dict[str, Any]:
-    """Return the simple values of a JSON object. Raises DatasetError."""
+    """Return a JSON object, or its value under the name `value`. Raises DatasetError."""
     try:
         values = parse_json(data)
         while isinstance(values, str):  # T3's writer encodes twice
             values = parse_json(values)
     except UserError as error:
         raise DatasetError(f"{where} {error}; correct it or download it again") from None
-    if not isinstance(values, dict):
-        return {}
-    return {str(name): _plain(value) for name, value in values.items() if isinstance(value, str | int | float)}
+    return {str(name): value for name, value in values.items()} if isinstance(values, dict) else {"value": values}
 
 
 def _plain(value: Any) -> Any:
@@ -177,6 +256,6 @@ READERS = {
     ),
     "webdataset": DatasetReader(
         _webdataset, "<folder>/000000.tar", "nothing, unless their owner asks for it", "as their owner says",
-        uses=("val", "test", "url", "sensor"),
+        uses=("val", "test", "url", "sensor", "keys"),
     ),
 }  # fmt: skip

@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.bars import tracked
-from anytouch_jax.data.images import natural
+from anytouch_jax.data.images import encode
+from anytouch_jax.data.names import natural
 from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
@@ -33,7 +34,6 @@ from anytouch_jax.data.readers.common import (
     read_json,
     read_lines,
     read_pickle,
-    save_png,
 )
 from anytouch_jax.files import atomic_write
 
@@ -134,7 +134,7 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
                     number = numbers[obj] = numbers.get(obj, -1) + 1
                     for key in PICTURES.keys() & grasp.keys():
                         sub, ending = PICTURES[key]
-                        save_png(root / obj / sub / f"{number}{ending}.png", np.asarray(grasp[key][()]))
+                        _save(root / obj / sub / f"{number}{ending}.png", np.asarray(grasp[key][()]))
                     lines.append([obj, number, int(np.ravel(success)[0])])
         except (OSError, KeyError, ValueError) as error:
             raise DatasetError(f"{root / name} is not a file of Feel: {error}") from None
@@ -142,6 +142,15 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
     csv.writer(text, lineterminator="\n").writerows(lines)
     atomic_write(root / "feel.csv", text.getvalue())
     return len(lines)
+
+
+def _save(file: Path, picture: np.ndarray) -> None:
+    """Write a picture RGB u8 (h, w, 3) as PNG. Raises ValueError for a file that has another."""
+    data = encode(np.ascontiguousarray(picture))
+    if not file.is_file():
+        atomic_write(file, data, sync=False)
+    elif file.read_bytes() != data:
+        raise ValueError(f"{file} holds another picture; move it elsewhere")
 
 
 def _grasps(group: Any) -> Iterator[Any]:

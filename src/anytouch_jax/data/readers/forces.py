@@ -19,12 +19,10 @@ from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
     DatasetReader,
-    export_video,
     read_json,
     read_pickle,
-    save_png,
 )
-from anytouch_jax.files import atomic_write
+from anytouch_jax.data.readers.exports import Export, export_video, exported
 
 _SPARSH = "Higuera et al., Sparsh: Self-supervised touch representations for vision-based tactile sensing, CoRL 2024"
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
@@ -48,8 +46,11 @@ def _force(index: DatasetIndex) -> None:
         slides = content.get("trajectories", content) if isinstance(content, dict) else None
         if not isinstance(slides, dict) or not files:
             raise DatasetError(f"{index.root / folder} has no slides or no frames; download it again")
-        written = index.tracked(frames, "frames written")
-        names = [_picture(index, frame, f"{folder}/frames/{i:06d}") for i, frame in enumerate(written)]
+        sources = [index.root / folder / name for name in files]
+        with exported(index, f"{folder}/frames", "frames", sources) as pictures:
+            written = enumerate(index.tracked(frames, "frames written"))
+            names = [_picture(pictures, frame, f"{i:06d}", sources[0]) for i, frame in written]
+        names = [f"{pictures.folder}/{name}" for name in names]
         contact = np.ravel(content.get("in_contact", np.ones(len(names))))
         free = np.flatnonzero(contact == 0)
         gel = names[int(free[0])] if len(free) and free[0] < len(names) else None
@@ -65,6 +66,7 @@ def _force(index: DatasetIndex) -> None:
             except (KeyError, TypeError, ValueError, IndexError) as error:
                 raise DatasetError(f"{index.root / folder}, slide {name}: {error} does not fit; download it") from None
             slips = [int(slip[i]) if i < len(slip) else None for i in range(len(where))]
+            index.skip("frame of a slide without slip", f"{folder}, slide {name}", slips.count(None))
             used.update(where.tolist())
             index.add(
                 [names[i] for i in where], sequence=f"{folder}/{name}", frame_index=where.tolist(), split=part, **cells,
@@ -100,8 +102,12 @@ def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
             turns, shifts = poses[:count, :3, :3], poses[:count, :3, 3]
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise DatasetError(f"{path}: {error} is missing or of an odd shape; download it again") from None
+        index.leave_out("frame or pose without the other", f"{path}, {finger}", abs(len(frames) - len(poses)))
         name = f"{part}/{folder}/{bag.removesuffix('.pkl')}/{finger}"
-        names = [_picture(index, frames[i], f"{name}/{i:06d}") for i in index.tracked(range(count), "frames written")]
+        with exported(index, name, finger, [path]) as pictures:
+            written = index.tracked(range(count), "frames written")
+            names = [_picture(pictures, frames[i], f"{i:06d}", path) for i in written]
+        names = [f"{pictures.folder}/{one}" for one in names]
         gel = f"bgs/digit_{finger}.png"
         yaw = np.degrees(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]))  # the last of Euler's angles "xyz"
         index.add(
@@ -118,17 +124,16 @@ def _list(path: Path) -> list[Any]:
     return frames
 
 
-def _picture(index: DatasetIndex, frame: Any, name: str) -> str:
-    """Write a frame of a pickle, an encoded picture or an array, and return its path below ROOT."""
+def _picture(pictures: Export, frame: Any, name: str, path: Path) -> str:
+    """Write a frame of a pickle, an encoded picture or an array, and return the name of its file."""
     if isinstance(frame, bytes):
-        suffix = next((end for magic, end in _MAGIC.items() if frame.startswith(magic)), ".png")
-        if not (file := index.root / f"{name}{suffix}").is_file():
-            atomic_write(file, frame, sync=False)
-        return f"{name}{suffix}"
+        name += next((end for magic, end in _MAGIC.items() if frame.startswith(magic)), ".png")
+        pictures.save(name, frame)
+        return name
     picture = np.asarray(frame)
     if picture.dtype != np.uint8 or picture.ndim != 3:
-        raise DatasetError(f"a frame for {index.root / name} is no picture; download the data again")
-    save_png(index.root / f"{name}.png", picture)
+        raise DatasetError(f"frame {name} of {path} is no picture; download the data again")
+    pictures.save(f"{name}.png", picture)
     return f"{name}.png"
 
 
@@ -173,45 +178,56 @@ def _freetacman(index: DatasetIndex) -> None:
     columns of <task>_<n>_traj.csv, such as `gripper_distance`, become labels if it has a row a frame.
     """
     wanted = index.options.keys or ("tactile",)
-    for folder, folders, files in index.tracked(list(index.walk())):
+    for folder, _, files in index.tracked(list(index.walk())):
         for name in (name for name in files if name.endswith(".mp4")):
             stem = Path(name).stem
             if not any(key in stem for key in wanted):
                 index.skip("film of another camera", f"{folder}/{name}")
                 continue
             index.need_export(f"{name} and other films")
-            place = f"{folder}/{stem}".lstrip("/")
             try:
-                if stem not in folders:
-                    export_video(index.root / folder / name)
-            except ImageError:
-                index.skip("film that cannot be read", place)
+                place = export_video(index, f"{folder}/{name}".lstrip("/"))
+            except ImageError as error:
+                index.skip("film that cannot be read", str(error))
                 continue
             frames = index.frames(place)
-            times: Any = _times(index.root / folder / f"{stem}_timestamps.txt", len(frames))
+            times: Any = _times(index, index.root / folder / f"{stem}_timestamps.txt", len(frames))
             task, camera = folder.split("/")[-1] or stem.split("_")[0], next(key for key in wanted if key in stem)
             demonstration = stem.partition(f"_{camera}")[0]
-            poses: Any = _poses(index.root / folder / f"{demonstration}_traj.csv", len(frames))
+            poses: Any = _poses(index, index.root / folder / f"{demonstration}_traj.csv", len(frames))
             index.add_recording(
                 frames, place, split=index.split_of(demonstration), sensor="freetacman", object=task, sequence=place,
                 unit=stem[stem.index(camera) :], time=times, **poses,
             )  # fmt: skip
 
 
-def _poses(path: Path, count: int) -> dict[str, list[Any]]:
+def _poses(index: DatasetIndex, path: Path, count: int) -> dict[str, list[Any]]:
     """Return the number columns of a trajectory as labels, {} if there are not `count` rows. Raises ManifestError."""
-    if not path.is_file() or (table := read_text_csv(path)).num_rows != count:
+    if not path.is_file():
+        index.skip("recording without a trajectory (no labels)", str(path))
+        return {}
+    if (table := read_text_csv(path)).num_rows != count:
+        index.skip(
+            f"trajectory that has not a line for each frame (no labels): {table.num_rows}, not {count}", str(path)
+        )
         return {}
     columns = {name: typed_label(table[name]) for name in table.column_names}
-    return {f"label.{name}": column.to_pylist() for name, column in columns.items() if not is_text(column.type)}
+    texts = [name for name, column in columns.items() if is_text(column.type)]
+    index.skip("column of a trajectory that is no number (no label)", f"{path}, {''.join(texts[:1])}", len(texts))
+    return {f"label.{name}": column.to_pylist() for name, column in columns.items() if name not in texts}
 
 
-def _times(path: Path, count: int) -> list[float] | None:
+def _times(index: DatasetIndex, path: Path, count: int) -> list[float] | None:
     """Return the time stamps of a film, one a line, None if there are not `count` of them."""
     try:
         times = [float(line.split()[-1]) for line in path.read_text().splitlines() if line.strip()]
-    except (OSError, ValueError):
+    except (OSError, ValueError, IndexError):
+        index.skip("film without readable time stamps (no column time)", str(path))
         return None
+    if len(times) != count:
+        index.skip(
+            f"time stamps that have not a line for each frame (no column time): {len(times)}, not {count}", str(path)
+        )
     return times if len(times) == count else None
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,18 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from anytouch_jax.data.images import ImageError, frames_from_video
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, read_json, save_png
+from anytouch_jax.data.readers.common import (
+    TACTILE,
+    DatasetError,
+    DatasetIndex,
+    DatasetReader,
+    label_cells,
+    read_json,
+    split_word,
+)
+from anytouch_jax.data.readers.exports import Export, exported
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path
-
-TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)
 
 
 def _lerobot(index: DatasetIndex) -> None:
@@ -46,31 +53,81 @@ def _lerobot(index: DatasetIndex) -> None:
         wrong = f"there is no camera {unknown[0]}" if unknown[0] else "no camera is called tactile"
         raise DatasetError(f"{index.root}: {wrong}; choose with --keys from {', '.join(cameras)}")
     episodes = {int(row["episode_index"]): row for row in _parquet_rows(index, "meta/episodes/")}
-    tasks = _tasks(index)
+    tasks, splits = _tasks(index), _stated_splits(index, info, episodes)
     films = [key for key in keys if features[key]["dtype"] == "video"]
-    for key in films:
-        _export_films(index, info, key, episodes)
+    folders = {key: _export_films(index, info, key, episodes) for key in films}
     wanted = ["episode_index", "frame_index", "timestamp", "index", "task_index", *index.options.values]
     for name in index.options.values:
         if name not in features:
             raise DatasetError(f"{index.root} has no feature {name}; it has {', '.join(features)}")
-    for path in index.paths(".parquet", "data/"):
-        columns = pa.parquet.read_schema(index.root / path).names
-        table = pa.parquet.read_table(index.root / path, columns=[name for name in wanted if name in columns])
-        rows = table.to_pylist()
-        labels = _vector_labels(rows, index.options.values)
+    files = [(path, set(pa.parquet.read_schema(index.root / path).names)) for path in index.paths(".parquet", "data/")]
+    for name in index.options.values:
+        index.skip(f"file without the column {name}", *_without(name, files))
+    rows_of = {
+        path: pa.parquet.read_table(index.root / path, columns=[one for one in wanted if one in columns]).to_pylist()
+        for path, columns in files
+    }
+    cells = {
+        name: label_cells(name, [row.get(name) for rows in rows_of.values() for row in rows])
+        for name in index.options.values
+    }
+    index.wanted += [f"label.{label}" for names in cells.values() for label in names]
+    others = [name for name in features if name not in (*cameras, *wanted)]
+    if others:
+        index.notes.append(f"features that are not read: {', '.join(others)}; --values makes labels of those it names")
+    first = 0
+    for path, rows in rows_of.items():
+        labels = {f"label.{label}": values[first : first + len(rows)]
+                  for names in cells.values() for label, values in names.items()}  # fmt: skip
+        first += len(rows)
         labels |= {"label.task": [tasks.get(row.get("task_index")) for row in rows]} if tasks else {}
         episode, frame = ([int(row[name]) for row in rows] for name in ("episode_index", "frame_index"))
+        index.skip("frame of an episode in no stated split (split unused)", path, sum(e not in splits for e in episode))
         for key in keys:
             paths = [f"{path}/{key}/{at}" for at in range(len(rows))]
             if key in films:
-                paths = [_frame_path(key, e, f) for e, f in zip(episode, frame, strict=True)]
+                paths = [f"{folders[key][e]}/frame-{f:06d}.png" for e, f in zip(episode, frame, strict=True)]
             index.add(
                 paths, sensor=sensor, unit=key, sequence=[f"episode-{e:06d}/{key}" for e in episode],
-                frame_index=frame, split=[index.split_of(f"episode-{e:06d}") for e in episode], episode=episode,
+                frame_index=frame, split=[splits.get(e, "unused") for e in episode], episode=episode,
                 index=[int(row["index"]) for row in rows], timestamp=[float(row["timestamp"]) for row in rows],
                 **labels,
             )  # fmt: skip
+
+
+def _without(name: str, files: list[tuple[str, set[str]]]) -> tuple[str, int]:
+    missing = [path for path, columns in files if name not in columns]
+    return "".join(missing[:1]), len(missing)
+
+
+def _stated_splits(index: DatasetIndex, info: dict[str, Any], episodes: Iterable[int]) -> dict[int, str]:
+    """Return the split of each episode: those of meta/info.json, as "0:2", if it states several; else by hash.
+
+    Raises DatasetError for splits that cannot be read or that share an episode.
+    """
+    stated: dict[int, str] = {}
+    splits = dict(info.get("splits") or {})
+    if len(splits) < 2:
+        if splits and index.options.val + index.options.test:
+            index.notes.append(
+                f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by hash; --val 0 "
+                "--test 0 keeps all in train"
+            )
+        return {number: index.split_of(f"episode-{number:06d}") for number in episodes}
+    for name, ranges in splits.items():
+        split = split_word(str(name))
+        if split is None:
+            index.notes.append(f"split {name} of meta/info.json has no name that is known: its episodes are unused")
+        try:
+            ends = [part.split(":") for part in str(ranges).strip("[]").split(",")]
+            numbers = [number for end in ends for number in range(int(end[0]), int(end[-1]) + (len(end) == 1))]
+        except ValueError:
+            raise DatasetError(f"{index.root}: split {name} of meta/info.json is {ranges}; write it as 0:2") from None
+        for number in numbers:
+            if stated.setdefault(number, split or "unused") != (split or "unused"):
+                raise DatasetError(f"{index.root}: episode {number} is in two splits of meta/info.json; correct them")
+    index.notes.append(f"the splits are those of meta/info.json: {', '.join(splits)}")
+    return stated
 
 
 def _parquet_rows(index: DatasetIndex, base: str) -> Iterator[dict[str, Any]]:
@@ -93,14 +150,16 @@ def _tasks(index: DatasetIndex) -> dict[int, str]:
     return {int(row.pop("task_index")): str(next(iter(row.values()))) for row in rows}
 
 
-def _frame_path(key: str, episode: int, frame: int) -> str:
-    return f"images/{key}/episode-{episode:06d}/frame-{frame:06d}.png"
+def _export_films(
+    index: DatasetIndex, info: dict[str, Any], key: str, episodes: dict[int, dict[str, Any]]
+) -> dict[int, str]:
+    """Write the frames of a camera's films, which hold several episodes each, as PNG; return the episodes' folders.
 
-
-def _export_films(index: DatasetIndex, info: dict[str, Any], key: str, episodes: dict[int, dict[str, Any]]) -> None:
-    """Write the frames of a camera's films, which hold several episodes each, as PNG. Raises DatasetError."""
+    Raises DatasetError.
+    """
     index.need_export(f"films of {key}")
     fps, films = float(info["fps"]), dict[str, list[tuple[int, int, int]]]()
+    folders: dict[int, str] = {}
     for number, row in episodes.items():
         try:
             chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
@@ -110,49 +169,37 @@ def _export_films(index: DatasetIndex, info: dict[str, Any], key: str, episodes:
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{index.root}: meta/episodes says nothing of the film of {key}: {error}") from None
     for path, parts in films.items():
-        parts, last = sorted(parts), max(first + length for first, length, _ in parts)
-        ends = [index.root / _frame_path(key, number, length - 1) for _, length, number in parts]
-        if all(end.is_file() for end in ends):
-            continue
-        try:
-            count = 0
-            pictures = index.tracked(_pictures(index.root / path), "frames written", last)
-            for count, picture in enumerate(pictures, 1):
-                for first, length, number in parts:
-                    if first <= count - 1 < first + length:
-                        save_png(index.root / _frame_path(key, number, count - 1 - first), picture)
-                if count == last:
-                    break
-        except ImageError as error:
-            raise DatasetError(f"{error}; download it again, or for AV1 pip install 'anytouch_jax[lerobot]'") from None
-        if count < last:
-            raise DatasetError(f"{index.root / path} has {count} frames and the episodes {last}; download it again")
+        film = index.root / path
+        if not film.is_file():
+            raise DatasetError(f"there is no film {film}; download all of the data set")
+        with ExitStack() as stack:
+            exports = {
+                number: stack.enter_context(exported(
+                    index, f"images/{key}/episode-{number:06d}", f"{key}, episode {number}", [film], [first, length]
+                ))
+                for first, length, number in parts
+            }  # fmt: skip
+            if any(export.is_new for export in exports.values()):
+                _write_episodes(index, film, sorted(parts), exports)
+        folders |= {number: export.folder for number, export in exports.items()}
+    return folders
 
 
-def _pictures(path: Path) -> Iterator[np.ndarray]:
-    """Yield the pictures RGB u8 of a film. LeRobot writes AV1, which OpenCV cannot decode. Raises ImageError."""
+def _write_episodes(
+    index: DatasetIndex, film: Path, parts: list[tuple[int, int, int]], exports: dict[int, Export]
+) -> None:
+    last, count = max(first + length for first, length, _ in parts), 0
     try:
-        import av
-    except ImportError:
-        yield from frames_from_video(path)
-        return
-    try:
-        with av.open(path) as film:
-            yield from (frame.to_ndarray(format="rgb24") for frame in film.decode(video=0))
-    except (av.FFmpegError, OSError, ValueError, IndexError) as error:  # IndexError: a file without a film
-        raise ImageError(f"{path} is not a video that can be read: {error}") from None
-
-
-def _vector_labels(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[Any]]:
-    """Return label.NAME of numbers and label.NAME_0, ... of vectors."""
-    labels: dict[str, list[Any]] = {}
-    for name in names:
-        values: list[Any] = [row.get(name) for row in rows]
-        if isinstance(values[0] if values else None, list):
-            labels |= {f"label.{name}_{i}": [value[i] for value in values] for i in range(len(values[0]))}
-        else:
-            labels[f"label.{name}"] = values
-    return labels
+        for count, picture in enumerate(index.tracked(frames_from_video(film), "frames written", last), 1):
+            for first, length, number in parts:
+                if first <= count - 1 < first + length:
+                    exports[number].save(f"frame-{count - 1 - first:06d}.png", picture)
+            if count == last:
+                break
+    except ImageError as error:
+        raise DatasetError(f"{error}; or download it again") from None
+    if count < last:
+        raise DatasetError(f"{film} has {count} frames and the episodes {last}; download it again")
 
 
 def camera_names(cameras: Sequence[str]) -> list[str]:

@@ -11,7 +11,8 @@ import pyarrow.compute as pc
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import PATHS
-from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, save_png
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
+from anytouch_jax.data.readers.exports import exported
 
 
 def _real_touch(index: DatasetIndex) -> None:
@@ -60,8 +61,10 @@ def _taxim_presses(index: DatasetIndex) -> None:
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DatasetError(f"{path} is not a calibration pack of taxim: {error}") from None
         names = [f"press_{i:02d}" for i in range(len(images))]
-        for name, image in zip(("background", *names), (gel, *images), strict=True):
-            save_png(index.root / place / f"{name}.png", image[..., ::-1])
+        with exported(index, place, sensor, [path]) as pictures:
+            for name, image in zip(("background", *names), (gel, *images), strict=True):
+                pictures.save(f"{name}.png", image[..., ::-1])
+        place = pictures.folder
         cells = {"sensor": sensor, "unit": f"taxim/{sensor}", "frame_index": 0}
         index.add(
             [f"{place}/{name}.png" for name in names],

@@ -15,25 +15,33 @@ objects, or recordings without objects, are held out. With `--split-by recording
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 import unicodedata
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
+import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.data import images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
-from anytouch_jax.data.manifest.schema import EMPTY, typed_label
+from anytouch_jax.data.manifest.schema import EMPTY, REQUIRED, typed_label
+from anytouch_jax.data.names import frame_numbers, frame_order, looks_like_film, natural, split_series
 from anytouch_jax.data.readers.common import (
     DatasetError,
     DatasetIndex,
     DatasetReader,
-    Frames,
     IndexOptions,
-    export_video,
     read_lines,
+    split_word,
 )
+from anytouch_jax.data.readers.exports import export_video, find_export, is_current
+from anytouch_jax.errors import UserError
 
 CAPTION = "caption.txt"
 MANIFESTS = (".csv", ".parquet")  # of an earlier index
@@ -42,35 +50,114 @@ LABEL_KEYS = ("object", "sequence")
 PLAIN_COLUMNS = ("unit", "touch", "text")  # columns of a label table that do not become label.<name>
 
 
+_TINY = (32, 24)
+_FILM = 0.75  # largest difference of neighbouring pictures of a film, as a share of that of any two
+_SLOW = 5  # seconds between the files of single pictures
+_STILL = 1.0  # grey levels: pictures that differ by less show nothing
+
+
+class _Place(NamedTuple):
+    """How a folder was understood. `kinds` names its parts, `name` is its path without its split."""
+
+    split: str | None
+    object: str | None
+    name: str
+    parts: tuple[str, ...]
+    kinds: tuple[str, ...]
+
+
+class _Recording(NamedTuple):
+    """A folder's frames of one finger, in order. `place` is how its folder was understood."""
+
+    folder: str
+    unit: str
+    names: list[str]
+    place: _Place
+
+
 def read(index: DatasetIndex) -> None:
-    """Add every folder of pictures. Raises UserError without a sensor."""
+    """Add every folder of pictures. Raises UserError without a sensor, and for options that exclude each other."""
     root, options = index.root, index.options
     sensor = index.need_sensor()
+    if options.singles and options.films:
+        raise UserError("--singles and --films exclude each other; give one of them, or none")
     if options.export:
         _export_videos(index)
-    recordings: dict[str, dict[str, Frames]] = {}  # folder -> finger -> frames
+    found: dict[str, dict[str, list[str]]] = {}  # folder -> finger -> names
     shared: dict[str, dict[str, Any]] = {}  # folder -> cells from the files in it and in the folders above
     for folder, folders, files in index.walk():
         shared[folder] = shared.get(folder.rpartition("/")[0], {}) | _shared_cells(root, folder, files)
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
             index.skip(f"folder called {BACKGROUND} or {PHOTO}, where one picture is expected", folder)
             continue
-        # A video with a folder of its name has been exported.
-        files = [name for name in files if not (_is_video(name) and Path(name).stem in folders)]
+        if not options.export:
+            _skip_videos(index, folder, folders, files)
         if fingers := _fingers(index, files, folder):
-            recordings[folder] = fingers
-    splits = _splits(index, list(recordings))
-    for folder, fingers in recordings.items():
-        for unit, frames in fingers.items():
-            sequence = f"{folder}/{unit}".strip("/") or "."
-            index.add_recording(frames, folder, split=splits[folder], sensor=sensor, sequence=sequence,
-                                unit=unit or None, object=folder.split("/")[0] or None, dataset=root.name,
-                                **shared[folder])  # fmt: skip
-    if options.labels is not None and recordings:
-        _join_labels(index, options.labels.expanduser())
-    for split in ("val", "test"):
-        if recordings and split not in splits.values() and getattr(options, split):
-            index.notes.append(f"there are too few objects or recordings for split {split}")
+            found[folder] = fingers
+    places = _understand(found)
+    recordings = [
+        _Recording(folder, unit, names, places[folder])
+        for folder, fingers in found.items()
+        for unit, names in fingers.items()
+    ]
+    films = _films(index, recordings)
+    sequences = _sequences([(one.place, one.unit, one.names) for one in recordings], films)
+    parts: list[str] = []  # of every row: the recording that is never split, a folder or a single picture
+    given: list[str | None] = []  # of every row: the split that a folder decides
+    for one, is_film, sequence in zip(recordings, films, sequences, strict=True):
+        paths = [f"{one.folder}/{name}".lstrip("/") for name in one.names]
+        index.add(
+            paths, sensor=sensor, unit=one.unit or None, object=one.place.object, dataset=root.name, sequence=sequence,
+            frame_index=_frame_numbers(index, one.names) if is_film else 0, **shared[one.folder],
+        )  # fmt: skip
+        parts += [one.folder] * len(paths) if is_film else paths
+        given += [one.place.split] * len(paths)
+    if recordings:
+        index.notes.insert(0, _sentence([one.place for one in recordings], films))
+        if options.labels is not None:
+            _join_labels(index, options.labels.expanduser(), parts)
+        _assign_splits(index, parts, given, "recording" if 2 * sum(films) < len(films) else "object")
+
+
+def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
+    """Return whether the pictures of each recording are a film, and put them in order; else each is a touch alone.
+
+    A film counts its frames or gives steady times in their names. Where each object has one folder, a few pictures of
+    it must look so too: they may be numbered single touches.
+    """
+    options, unclear = index.options, list[str]()
+    films = [options.films or options.order == "times"] * len(recordings)
+    for at, one in enumerate(recordings):
+        one.names[:], is_clear = frame_order(one.names)
+        if options.order == "times":
+            times = {name: os.stat(index.root / one.folder / name).st_mtime_ns for name in one.names}
+            one.names.sort(key=times.__getitem__)
+            is_clear = len(set(times.values())) == len(times)
+        films[at] = not options.singles and (films[at] or looks_like_film(one.names) or len(one.names) == 1)
+        if films[at] and not is_clear:
+            unclear.append(one.folder or ".")
+    if unclear:
+        what = "times of the files" if options.order == "times" else "names"
+        advice = "" if options.order == "times" else "; --order times takes the times of the files"
+        index.notes.append(f"the {what} do not order {len(unclear)} recordings clearly (first: {unclear[0]}){advice}")
+    if options.singles or options.films or options.order == "times":
+        return films
+    several = [at for at, one in enumerate(recordings) if films[at] and len(one.names) > 1]
+    objects = [(recordings[at].place.split, recordings[at].place.object, recordings[at].unit) for at in several]
+    if len(set(objects)) == len(objects):
+        spread = np.unique(np.linspace(0, len(several) - 1, min(8, len(several))).astype(int))
+        chosen = [recordings[several[at]] for at in spread]
+        if not _moves_like_film([[index.root / one.folder / name for name in one.names] for one in chosen]):
+            films = [is_film and at not in several for at, is_film in enumerate(films)]
+        elif len({one for _, one, _ in objects}) > 1:
+            index.notes.append("each object has one recording; if its pictures are single touches, give --singles")
+    if alone := [one.folder for one, is_film in zip(recordings, films, strict=True) if not is_film]:
+        where = f"{len(alone)} folders (first: {alone[0] or '.'})"
+        index.notes.append(
+            f"the pictures of {where} do not look like a film: each is a single touch; --films makes a recording of "
+            "each folder"
+        )
+    return films
 
 
 def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]:
@@ -89,18 +176,56 @@ def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]
     return dict(zip(order, parts, strict=True))
 
 
-def _splits(index: DatasetIndex, folders: list[str]) -> dict[str, str]:
-    """Return the split of every recording: that of its object, or a part of each object's recordings."""
-    options = index.options
-    objects: dict[str, list[str]] = {}
-    for folder in folders:
-        objects.setdefault(folder.split("/")[0], []).append(folder)
-    if options.split_by == "recording":
-        return {name: split for one in objects.values() for name, split in ranked_split(one, options).items()}
-    if len(objects) > 1 and options.val + options.test > 0:
+def _frame_numbers(index: DatasetIndex, names: list[str]) -> list[int]:
+    return frame_numbers(names) if index.options.order == "names" else list(range(len(names)))
+
+
+def _assign_splits(index: DatasetIndex, parts: list[str], given: list[str | None], default: str) -> None:
+    """Fill column split: what a folder decides, else by rank of the groups that `--split-by` names.
+
+    Groups are ranked inside each object, unless they are the objects or span several. `parts` (rows,) are never split.
+    """
+    options, table = index.options, index.table
+    by = options.split_by or default
+    index.keep_together = ["sequence", "object"] if by == "object" else ["sequence"]
+    values = parts if by == "recording" else _group_values(table, by)
+    groups: dict[str, str] = {}  # of each part
+    objects: dict[str, set[str | None]] = {}
+    for part, value, obj, split in zip(parts, values, table["object"], given, strict=True):
+        if split is None:
+            objects.setdefault(groups.setdefault(part, part if value is None else str(value)), set()).add(obj)
+    pools: dict[Any, set[str]] = {}
+    is_whole = by == "object" or any(len(one) > 1 for one in objects.values())
+    for group, of in objects.items():
+        pools.setdefault(None if is_whole else min(map(str, of)), set()).add(group)
+    ranked = {group: split for pool in pools.values() for group, split in ranked_split(pool, options).items()}
+    table["split"] = [split or ranked[groups[part]] for part, split in zip(parts, given, strict=True)]
+    if by == "object" and len(objects) > 1 and options.val + options.test > 0:
         index.notes.append("whole objects are held out; for a classifier of objects: --split-by recording")
-    split = ranked_split(objects, options)
-    return {folder: split[folder.split("/")[0]] for folder in folders}
+    for split in ("val", "test"):
+        if split not in table["split"] and getattr(options, split):
+            reason = "there are too few objects or recordings for" if objects else "no folder is of"
+            index.notes.append(f"{reason} split {split}")
+
+
+def _group_values(table: dict[str, list[Any]], by: str) -> list[Any]:
+    """Return the group of every row: a column, or the first part in parentheses of a pattern in its path."""
+    if "(" in by:
+        try:
+            find = re.compile(by).search
+        except re.error as error:
+            raise UserError(
+                f"--split-by {by!r} is no pattern: {error}; write a part of the path as '(p[0-9]+)_'"
+            ) from None
+        matches = [find(path) for path in table["path"]]
+        if not any(matches):
+            raise UserError(f"--split-by {by!r} is in no path, such as {table['path'][0]}; correct the pattern")
+        return [match and match[1] for match in matches]
+    column = table.get(by, table.get(f"label.{by}"))
+    if column is None:
+        known = ", ".join(name for name in table if name not in REQUIRED)
+        raise UserError(f"--split-by {by!r} is no column; give object, recording, a pattern, or one of {known}")
+    return column
 
 
 def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
@@ -119,25 +244,114 @@ def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
     return cells
 
 
-def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, Frames]:
-    """Return the pictures of a folder in order with their numbers, by finger; arrays only if there is nothing else."""
+def _understand(folders: Iterable[str]) -> dict[str, _Place]:
+    """Return how each folder of pictures is understood. Raises DatasetError for one in two splits.
+
+    Split words decide the split at any level. The object is the first other folder, without those above all splits.
+    """
+    parts = {folder: tuple(part for part in folder.split("/") if part) for folder in folders}
+    above, rest = list[tuple[str, ...]](), list[int]()
+    for folder, names in parts.items():
+        words = [split_word(name) for name in names]
+        if len(set(words) - {None}) > 1:
+            named = " and ".join(name for name, word in zip(names, words, strict=True) if word)
+            raise DatasetError(f"{folder} names two splits, {named}; rename one of these folders")
+        if any(words):
+            above.append(names[: next(at for at, word in enumerate(words) if word)])
+            rest.append(words.count(None))
+    wrapping = [len(set(level)) == 1 for level in zip(*above, strict=False)]
+    shared = max(0, min([(*wrapping, False).index(False), *(count - 1 for count in rest if count)]))
+    return {folder: _place(names, shared) for folder, names in parts.items()}
+
+
+def _place(names: tuple[str, ...], shared: int) -> _Place:
+    words = [split_word(name) for name in names]
+    split = next((word for word in words if word), None)
+    kinds, obj, shared = list[str](), None, shared if split else 0
+    for at, (name, word) in enumerate(zip(names, words, strict=True)):
+        is_object = word is None and obj is None and at >= shared
+        obj = name if is_object else obj
+        kinds.append("<split>" if word else "<object>" if is_object else name if at < shared else "<recording>")
+    own = [name for name, word in zip(names, words, strict=True) if not word]
+    return _Place(split, obj, "/".join(own), names, tuple(kinds))
+
+
+def _sequences(recordings: Sequence[tuple[_Place, str, list[str]]], films: Sequence[bool]) -> list[list[str]]:
+    """Return the sequence of every picture of each recording (place, finger, pictures): its own if it is no film.
+
+    No two recordings have one: the split is added where names repeat between splits, and else a number.
+    """
+    names = [
+        [f"{place.name}/{unit}"] * len(pictures) if is_film else [f"{place.name}/{picture}" for picture in pictures]
+        for (place, unit, pictures), is_film in zip(recordings, films, strict=True)
+    ]
+    names = [[name.strip("/") or "." for name in one] for one in names]
+    splits = [place.split for place, *_ in recordings]
+    of_split = {(name, split) for one, split in zip(names, splits, strict=True) for name in one}
+    if len(of_split) > len({name for name, _ in of_split}):
+        names = [[f"{name} ({split})" if split else name for name in one]
+                 for one, split in zip(names, splits, strict=True)]  # fmt: skip
+    counts: Counter[str] = Counter()
+    for one in names:
+        counts.update({*one})
+        one[:] = [name if counts[name] < 2 else f"{name} ({counts[name]})" for name in one]
+    return names
+
+
+def _sentence(places: Sequence[_Place], films: Sequence[bool]) -> str:
+    """Return how the tree was understood: its levels, the folders of splits, and what a picture is."""
+    forms: Counter[str] = Counter()
+    words: dict[str, str] = {}
+    for place, is_film in zip(places, films, strict=True):
+        last = "frames" if is_film else "<touch>"
+        form = [kind for at, kind in enumerate(place.kinds) if kind != "<recording>" or place.kinds[at - 1] != kind]
+        forms["/".join([*form, last])] += 1
+        words |= {part: str(split_word(part)) for part, kind in zip(place.parts, place.kinds, strict=True)
+                  if kind == "<split>" and split_word(part) != part}  # fmt: skip
+    first, *others = [form for form, _ in forms.most_common(3)]
+    more = f" (also {', '.join(others)})" if others else ""
+    named = ", ".join(f"{word} is split {split}" for word, split in words.items())
+    return f"folders are understood as {first}{more}" + (f"; {named}" if named else "")
+
+
+def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
+    """Return whether neighbouring pictures are more alike than others, and were not stored seconds apart.
+
+    A few pictures of each folder are read. Pictures that cannot be read, or show nothing, do not count.
+    """
+    near, far, gaps = list[float](), list[float](), list[float]()
+    for paths in folders:
+        starts = np.unique(np.linspace(0, len(paths) - 2, 4).astype(int))
+        try:
+            tiny = {at: _tiny(paths[at]) for at in sorted({*starts.tolist(), *(starts + 1).tolist()})}
+            gaps += [abs(os.stat(paths[at + 1]).st_mtime - os.stat(paths[at]).st_mtime) for at in starts]
+        except (images.ImageError, OSError):
+            continue
+        near += [float(np.abs(tiny[at] - tiny[at + 1]).mean()) for at in starts]
+        far += [float(np.abs(tiny[a] - tiny[b]).mean()) for a, b in combinations(tiny, 2) if b - a > 1]
+    is_slow = bool(gaps) and float(np.median(gaps)) > _SLOW
+    is_alike = not far or float(np.mean(far)) < _STILL or float(np.mean(near)) < _FILM * float(np.mean(far))
+    return is_alike and not is_slow
+
+
+def _tiny(path: Path) -> np.ndarray:
+    return cv2.resize(images.decode(path), _TINY, interpolation=cv2.INTER_AREA).mean(axis=2).astype(np.float32)
+
+
+def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, list[str]]:
+    """Return the pictures of a folder by finger; arrays only if there is nothing else."""
     names = []
-    for name in sorted(files, key=images.frame_sort_key):
+    for name in sorted(files, key=natural):
         path, stem, suffix = f"{folder}/{name}".lstrip("/"), Path(name).stem.lower(), Path(name).suffix.lower()
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
-        elif _is_video(name):
-            index.skip("video (--export writes its frames as pictures)", path)
-        elif suffix not in (*SUFFIXES, *MANIFESTS) and name.lower() != CAPTION:
+        elif suffix not in (*SUFFIXES, *MANIFESTS, *VIDEOS) and name.lower() != CAPTION:
             index.skip("file that is no picture", path)
     arrays = [name for name in names if Path(name).suffix.lower() == ".npy"]
     if arrays and len(arrays) < len(names):
         index.skip("array next to pictures", f"{folder}/{arrays[0]}", len(arrays))
         names = [name for name in names if name not in arrays]
-    if not names:
-        return {}
-    series = images.split_series(names)
-    return {unit: dict(zip(images.frame_numbers(one), one, strict=True)) for unit, one in series.items()}
+    return split_series(names) if names else {}
 
 
 def _is_video(name: str) -> bool:
@@ -145,37 +359,42 @@ def _is_video(name: str) -> bool:
 
 
 def _export_videos(index: DatasetIndex) -> None:
-    """Write the frames of every video as 000000.png, ... into a folder of its name, unless that exists.
-
-    A video that cannot be read is skipped. Raises UserError if nothing can be written.
-    """
-    for folder, folders, files in index.tracked(list(index.walk(count=False))):  # before any is made
-        for video in (index.root / folder / name for name in files if _is_video(name)):
-            if video.stem in folders:
-                continue
-            folders.append(video.stem)
+    """Write the frames of every video into a folder of its name. A video that cannot be read is skipped."""
+    for folder, _, files in index.tracked(list(index.walk(count=False))):  # before any is made
+        for video in (f"{folder}/{name}".lstrip("/") for name in files if _is_video(name)):
             try:
-                count = export_video(video)
-            except images.ImageError:
-                index.skip("video that cannot be read", str(video))
-            else:
-                if 0.98 * (declared := images.count_frames(video)) > count + 2:  # some containers only estimate it
-                    index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
+                export_video(index, video)
+            except images.ImageError as error:
+                index.skip("video that cannot be read", str(error))
 
 
-def _join_labels(index: DatasetIndex, path: Path) -> None:
+def _skip_videos(index: DatasetIndex, folder: str, folders: list[str], files: list[str]) -> None:
+    """Report the videos of a folder without pictures, or with those of an earlier video."""
+    for name in filter(_is_video, files):
+        path = f"{folder}/{name}".lstrip("/")
+        place, record = find_export(index.root, path.removesuffix(Path(name).suffix), name)
+        if record is not None and not is_current(record, [index.root / path]):
+            index.skip(f"video that was changed after its pictures in {place} (--export writes them again)", path)
+        elif record is None and Path(name).stem not in folders:
+            index.skip("video (--export writes its frames as pictures)", path)
+
+
+def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
     """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes first.
 
-    Names match in any Unicode form. Lines without a recording, and recordings without a line, are skipped. Raises
-    DatasetError for a table that is missing, has no key, or has a column or a key twice.
+    A sequence may be named by its folder or picture in `parts` too. Names match in any Unicode form. Lines without a
+    recording, and recordings without a line, are skipped. Raises DatasetError for a table that is missing, has no key,
+    or has a column or a key twice.
     """
     names, lines = _read_labels(path)
     table, size = index.table, len(index.table["path"])
     labels: dict[str, list[Any]] = {name: [None] * size for name in names if name not in LABEL_KEYS}
+    index.wanted += [name if name in PLAIN_COLUMNS else f"label.{name.removeprefix('label.')}" for name in labels]
     used: set[tuple[str | None, str | None]] = set()
     unlabelled: dict[str, None] = {}
-    for row, (obj, sequence) in enumerate(zip(table["object"], table["sequence"], strict=True)):
-        names_of = _plain(obj), _plain(sequence)
+    for row, (obj, sequence, part) in enumerate(zip(table["object"], table["sequence"], parts, strict=True)):
+        by_part = any(key in lines for key in ((None, _plain(part)), (_plain(obj), _plain(part))))
+        names_of = _plain(obj), _plain(part if by_part else sequence)
         keys = [key for key in ((names_of[0], None), (None, names_of[1]), names_of) if any(key) and key in lines]
         used.update(keys)
         for name, cell in (item for key in keys for item in lines[key].items()):
@@ -234,6 +453,6 @@ READERS = {
         "<object>/<recording>/0.png",
         "nothing, unless their owner asks for it",
         "as their owner says",
-        uses=("val", "test", "split_by", "sensor", "labels", "export"),
+        uses=("val", "test", "split_by", "sensor", "labels", "export", "singles", "films", "order"),
     )
 }

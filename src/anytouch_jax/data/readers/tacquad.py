@@ -81,8 +81,9 @@ def _add_item(index: DatasetIndex, place: str, spans: list[tuple[int, int]], cel
         contact = [first <= number <= last for number in frames]
         index.skip("contact frame that is not on disk", path, max(last - first + 1, 0) - sum(contact))
         start, free = min(frames, default=0), "unused" if cells["split"] == "unused" else "background"
-        photos = index.frames(f"{place}/img_{folder}")  # of the same fraction of the recording
-        names = [photos.get(number * len(photos) // len(frames), "") for number in frames]
+        photos = index.frames(f"{place}/img_{folder}")  # of the same fraction of the recording; numbers may have gaps
+        most, length = max(photos, default=-1) + 1, max(frames, default=0) + 1
+        names = [photos.get(number * most // length, "") for number in frames]
         index.add(
             [f"{path}/{name}" for name in frames.values()],
             sensor=sensor,

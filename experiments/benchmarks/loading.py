@@ -25,7 +25,6 @@ from anytouch_jax.config import Config, preset
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown_table
 
 SIZES = ((320, 240), (640, 480))
 PLAIN, PLAIN_LINEAR = "decode + resize", "decode + linear resize"
@@ -66,28 +65,6 @@ class Opened:
     peak_mb: float
 
 
-def loader_table(rows: Sequence[LoaderSpeed]) -> str:
-    """Return a table with a line a variant."""
-    heads = ("pictures", "what is done", "images/s", "share of decode + resize", "by processor time")
-    cells = [
-        (f"{x.size[0]} x {x.size[1]}", x.variant, f"{x.images_per_second:.0f}", f"{x.share:.0%}", f"{x.cpu_share:.0%}")
-        for x in rows
-    ]
-    about = f"{rows[0].threads} threads, pictures resized to {rows[0].pixels} x {rows[0].pixels}, JPEG"
-    return f"{about}\n\n{markdown_table(heads, cells)}\n"
-
-
-def opened_table(rows: Sequence[Opened]) -> str:
-    """Return a table with a line a manifest and stage."""
-    heads = ("rows", "stage", "read", "prepare", "first batch", "memory, read", "memory, largest")
-    cells = [
-        (f"{x.rows:,}", str(x.stage), *(f"{seconds:.2f} s" for seconds in (x.read, x.prepare, x.first_batch)),
-         f"{x.read_mb:.0f} MB", f"{x.peak_mb:.0f} MB")
-        for x in rows
-    ]  # fmt: skip
-    return markdown_table(heads, cells) + "\n"
-
-
 def measure_loading(
     folder: str | Path,
     *,
@@ -98,8 +75,8 @@ def measure_loading(
     pixels: int = 224,
     rows: int = 2_500_000,
     stages: Sequence[int] = (1, 2),
-    log: Callable[[str], None] | None = None,
-) -> list[LoaderSpeed | Opened]:
+    log: Callable[[str], None] = lambda _: None,
+) -> dict[str, list[LoaderSpeed] | list[Opened]]:
     """Measure in `folder`, which gets `pictures` files of every size and, if `rows`, a manifest of so many rows.
 
     Raises UserError for sizes that make no sense.
@@ -109,18 +86,16 @@ def measure_loading(
     root = Path(folder)
     speeds: list[LoaderSpeed] = []
     for size in sizes:
-        if log:
-            log(f"loading: {size[0]} x {size[1]}, {rounds} rounds of {pictures} pictures")
+        log(f"loading: {size[0]} x {size[1]}, {rounds} rounds of {pictures} pictures")
         manifest = write_pictures(root / f"{size[0]}x{size[1]}", size, pictures)
         speeds += _speeds(manifest, size, rounds, threads, pixels)
     opened = []
     if rows:
         path = write_large(root / "large", rows, sizes[0])
         for stage in stages:
-            if log:
-                log(f"loading: a manifest of {rows:,} rows, stage {stage}")
+            log(f"loading: a manifest of {rows:,} rows, stage {stage}")
             opened.append(open_large(path, stage, threads))
-    return [*speeds, *opened]
+    return {"loader": speeds, "large manifest": opened}
 
 
 def write_pictures(folder: Path, size: tuple[int, int], count: int) -> Path:

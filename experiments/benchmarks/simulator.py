@@ -1,12 +1,4 @@
-"""Benchmarks of the simulator: its mechanics against a converged solution, its pictures against real presses.
-
-Mechanics: time a frame against the error, for each fidelity, grid and number of iterations.
-
-Pictures: held-out ball presses, compared with Taxim's own renderer in the same run. Both renderers start from a height
-map of 480 x 640 samples of the same press and end with a picture of 480 x 640 pixels. They are timed alternately. Ours
-was fitted on the even presses and is scored on the odd ones. Taxim's tables were made from all presses, so its figures
-are in-sample. Both have the real background frame.
-"""
+"""Benchmarks of the simulator: time a frame against the error, for each fidelity, grid and number of iterations."""
 
 from __future__ import annotations
 
@@ -16,11 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.resources import files
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,16 +17,12 @@ import numpy.typing as npt
 from jax import Array
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult, press
 from anytouch_jax.sim.contact.shear import Shear, shear_step
 from anytouch_jax.sim.recorder import Recorder
 from anytouch_jax.sim.scene import Scenes, draw_recording, draw_touch, objects_and_splits
-from anytouch_jax.sim.sensing import optics, sensors
 from anytouch_jax.sim.sensing.optics import render
 from anytouch_jax.sim.sensing.sensors import SENSORS, identity_unit
-from experiments.benchmarks import presses as real
-from experiments.benchmarks.presses import COARSE, INDENTERS, PITCH, Presses
 
 Fields = npt.NDArray[Any]
 Surface = Callable[[Fields, Fields], Fields]
@@ -255,15 +240,6 @@ def _picture(displacement: Any, tangential: Any, setting: PressSetting) -> Field
     return np.asarray(_renderer()(*fields, setting.size / len(displacement)), np.float32)
 
 
-def pareto_points(rows: Sequence[FidelityRow]) -> dict[str, tuple[float, float]]:
-    """Return (ms a frame, worst rms error in %) of every variant by name."""
-    points = {}
-    for row in rows:
-        name = f"{row.fidelity} {row.grid}" + ("" if row.iterations is None else f", {row.iterations}")
-        points[name] = (row.press_ms + row.shear_ms, 100 * max(row.rms.values()))
-    return points
-
-
 def _picture_error(result: Fields, right: Fields, bare: Fields) -> float:
     """Mean absolute difference over the pixels that the touch changes by more than `LEVELS`; 0 where there are none."""
     changed = abs(right - bare).max(-1) > LEVELS
@@ -310,232 +286,3 @@ def recording_speed(
                 if turn:  # the first one compiles
                     taken[name].append(len(several) * batch * frames / (time.perf_counter() - start))
     return [Recorded(name, float(np.median(values))) for name, values in taken.items()]
-
-
-def recording_table(rows: Sequence[Recorded]) -> str:
-    """A table with a line a sensor."""
-    cells = [(one.sensor, f"{one.frames_per_second:.0f}") for one in rows]
-    return markdown_table(("recordings by", "frames/s"), cells) + "\n"
-
-
-def fidelity_table(rows: Sequence[FidelityRow]) -> str:
-    """A table with a line a variant; errors in percent of the largest displacement, or grey levels of the picture
-    (see `FidelityRow.image`), times in milliseconds a frame."""
-    names = list(rows[0].rms) if rows else []
-    heads = ["fidelity", "grid", "iterations", "press ms", "shear ms"]
-    heads += [f"{name}: rms / max %" for name in names] + ["shear rms %", "slip points", "force %", "converged"]
-    heads += [f"{name}: picture" for name in names]
-    lines = []
-    for row in rows:
-        cells = [row.fidelity, str(row.grid), "own" if row.iterations is None else str(row.iterations)]
-        cells += [f"{row.press_ms:.2f}", f"{row.shear_ms:.2f}"]
-        cells += [f"{100 * row.rms[name]:.2f} / {100 * row.largest[name]:.2f}" for name in names]
-        cells += [
-            f"{100 * row.shear:.2f}",
-            f"{100 * row.slip:.1f}",
-            f"{100 * row.force:.2f}",
-            f"{row.converged} of {len(row.rms)}",
-        ]
-        lines.append(cells + [f"{row.image[name]:.2f}" for name in names])
-    return markdown_table(heads, lines) + "\n"
-
-
-# Pictures against real ones -------------------------------------------------------------------------------------------
-
-SSIM_SIGMA, SSIM_C1, SSIM_C2 = 1.5, (0.01 * 255) ** 2, (0.03 * 255) ** 2  # Wang et al. 2004
-
-
-@dataclass(frozen=True)
-class PressScore:
-    """One renderer on the held-out presses of one sensor; means over presses.
-
-    `mae` in 0..255, `psnr` in dB and `ssim` inside the drawn circle, `ring_mae` between one and two radii. `ms`:
-    median milliseconds a frame, None where nothing is computed. `in_sample`: fitted on the scored presses too.
-    """
-
-    sensor: str
-    renderer: str
-    presses: int
-    mae: float
-    psnr: float
-    ssim: float
-    ring_mae: float
-    ms: float | None
-    in_sample: bool
-
-
-@dataclass(frozen=True)
-class Renderer:
-    """A way to draw a press: `height(k)` makes the input of `draw` outside of the clock; u8 (480, 640, 3) comes out."""
-
-    name: str
-    height: Callable[[int], Any]
-    draw: Callable[[Any], Any]
-    in_sample: bool = False
-    timed: bool = True
-
-
-def score_presses(
-    names: Sequence[str] = tuple(INDENTERS), *, limit: int | None = None, rivals: bool = True
-) -> list[PressScore]:
-    """Score the renderers on the odd presses of each sensor; `limit` of them, without Taxim where `rivals` is false.
-
-    Raises UserError for a sensor without real presses, or without the package `taxim`.
-    """
-    rows: list[PressScore] = []
-    for name in names:
-        presses = real.read_presses(name)
-        which = real.halves(len(presses.radius))[1][:limit]
-        renderers = [_constant(presses), _ours(name, presses), _ours(name, presses, shadow=False)]
-        if rivals:
-            renderers += _taxim(name, presses)
-        rows += compare_renderers(name, presses, which, renderers)
-    return rows
-
-
-def compare_renderers(sensor: str, presses: Presses, which: Fields, renderers: Sequence[Renderer]) -> list[PressScore]:
-    """Draw each press in `which` with each renderer in turn; a first drawing that is not counted compiles."""
-    if len(which) == 0:
-        raise UserError(f"there is no press of {sensor} to score")
-    measures: dict[str, list[Fields]] = {r.name: [] for r in renderers}
-    clock: dict[str, list[float]] = {r.name: [] for r in renderers}
-    for renderer in renderers:
-        jax.block_until_ready(renderer.draw(renderer.height(int(which[0]))))
-    for k in map(int, which):
-        for renderer in renderers:
-            height = jax.block_until_ready(renderer.height(k))
-            start = time.perf_counter()
-            image = jax.block_until_ready(renderer.draw(height))
-            clock[renderer.name].append(1e3 * (time.perf_counter() - start))
-            drawn = np.asarray(image)
-            measures[renderer.name].append(image_errors(drawn, presses.frames[k], presses.centre[k], presses.radius[k]))
-    rows = []
-    for r in renderers:
-        mae, psnr, ssim, ring = (float(x) for x in np.mean(measures[r.name], axis=0))
-        ms = float(np.median(clock[r.name])) if r.timed else None
-        rows.append(PressScore(sensor, r.name, len(which), mae, psnr, ssim, ring, ms, r.in_sample))
-    return rows
-
-
-def image_errors(image: Fields, real: Fields, centre: Fields, radius: float) -> Fields:
-    """Mean absolute error, PSNR and SSIM inside the circle, mean absolute error in the ring: (4,) of u8 images."""
-    rows, columns = np.mgrid[: real.shape[0], : real.shape[1]]
-    distance = np.hypot(columns - centre[0], rows - centre[1])
-    inside, ring = distance < radius, (distance >= radius) & (distance < 2 * radius)
-    error = image.astype(np.float64) - real.astype(np.float64)
-    square = max(float((error[inside] ** 2).mean()), 1e-6)
-    psnr = 10 * np.log10(255**2 / square)
-    return np.array(
-        [np.abs(error[inside]).mean(), psnr, ssim_map(image, real)[inside].mean(), np.abs(error[ring]).mean()]
-    )
-
-
-def ssim_map(a: Fields, b: Fields) -> Fields:
-    """Structural similarity (h, w, c) of two u8 images in Gaussian windows of 1.5 pixels (Wang et al. 2004)."""
-    x, y = a.astype(np.float64), b.astype(np.float64)
-
-    def mean(image: Fields) -> Fields:
-        return cv2.GaussianBlur(image, (11, 11), SSIM_SIGMA)
-
-    mx, my = mean(x), mean(y)
-    vx, vy, cov = mean(x * x) - mx**2, mean(y * y) - my**2, mean(x * y) - mx * my
-    numerator = (2 * mx * my + SSIM_C1) * (2 * cov + SSIM_C2)
-    return np.asarray(numerator / ((mx**2 + my**2 + SSIM_C1) * (vx + vy + SSIM_C2)))
-
-
-def press_table(rows: Sequence[PressScore]) -> str:
-    """A table of scores, with the ratio of Taxim's time to ours where both were timed."""
-    head = ["sensor", "renderer", "presses", "MAE", "PSNR dB", "SSIM", "ring MAE", "ms/frame", "x ours"]
-    lines = []
-    for row in rows:
-        ours = next((r.ms for r in rows if r.sensor == row.sensor and r.renderer == "ours"), None)
-        ratio = f"{row.ms / ours:.1f}" if row.ms and ours else ""
-        name = row.renderer + (" (in-sample)" if row.in_sample else "")
-        ms = "" if row.ms is None else f"{row.ms:.1f}"
-        figures = [f"{row.mae:.2f}", f"{row.psnr:.2f}", f"{row.ssim:.4f}", f"{row.ring_mae:.2f}", ms, ratio]
-        lines.append([row.sensor, name, str(row.presses), *figures])
-    return markdown_table(head, lines)
-
-
-def _constant(presses: Presses) -> Renderer:
-    return Renderer("background only", lambda k: presses.background, lambda image: image, timed=False)
-
-
-def _ours(name: str, presses: Presses, *, shadow: bool = True) -> Renderer:
-    """Height map -> contact -> picture by the project's renderer, with the real background at full size."""
-    sensor, indenter = SENSORS[name], INDENTERS[name]
-    unit, size = sensors.identity_unit(sensor), presses.background.shape[:2]
-    model = real.fit_photometry(name)[0 if shadow else 1]
-    behind = jnp.asarray(presses.background.transpose(2, 0, 1), jnp.float32) / 255
-    cut = jax.jit(lambda c, r: real.ball_cut(c * PITCH, r * PITCH, indenter, size, PITCH))
-
-    @jax.jit
-    def draw(height: Any) -> Any:
-        coarse = height.reshape(size[0] // COARSE, COARSE, size[1] // COARSE, COARSE).mean((1, 3))
-        dent = real.settle(coarse, COARSE * PITCH, indenter.reach)
-        return optics.render(dent, None, COARSE * PITCH, sensor, unit, resolution=size, photometry=model, behind=behind)
-
-    def height(k: int) -> Any:
-        return cut(jnp.asarray(presses.centre[k]), jnp.asarray(presses.radius[k]))
-
-    return Renderer("ours" if shadow else "ours, no shadow", height, draw)
-
-
-def _taxim(name: str, presses: Presses) -> list[Renderer]:
-    """Taxim's own JAX renderer with and without shadow, and at the recorded centres where ours were moved."""
-    try:
-        from taxim.taxim_jax import TaximJax
-    except ImportError as error:
-        raise UserError("Taxim's own renderer comes with the package taxim: pip install taxim") from error
-    folder = Path(str(files("taxim"))) / "calib" / name
-    with jax.numpy_rank_promotion("allow"):  # Taxim relies on it; a strict caller stays strict elsewhere
-        simulator = TaximJax(calib_folder=folder)
-    gel = np.load(folder / "gelmap.npy").astype(np.float64) * simulator.sensor_params.pixmm
-    ball = _taxim_ball(name, presses)
-    gel -= gel.max()
-
-    def draw(shadow: bool) -> Callable[[Any], Any]:
-        def one(height: Any) -> Any:
-            with jax.numpy_rank_promotion("allow"):
-                return jnp.round(simulator.render_direct(height, with_shadow=shadow) * 255).astype(jnp.uint8)
-
-        return one
-
-    drawn = np.concatenate([presses.centre, presses.radius[:, None]], 1)
-    circles = [("", drawn)]
-    if not np.array_equal(drawn, presses.recorded):
-        circles.append((", recorded circles", presses.recorded))
-
-    def height(at: Fields) -> Callable[[int], Any]:
-        return lambda k: jnp.asarray(taxim_height(at[k, :2], at[k, 2], ball, gel), jnp.float32)
-
-    return [
-        Renderer(f"taxim{', shadow' if shadow else ''}{label}", height(at), draw(shadow), in_sample=True)
-        for label, at in circles
-        for shadow in (False, True)
-    ]
-
-
-def _taxim_ball(name: str, presses: Presses) -> float:
-    """Radius in mm of the ball that the tables of `name` were made with.
-
-    GelSight: published, 4.00 / 2 mm. Mini: unpublished; the last tilt that its table holds values for (bin 110 of 124
-    over a quarter turn) at its largest circle gives 57.9 pixels.
-    """
-    if name == "gelsight":
-        return INDENTERS[name].radius
-    return float(presses.recorded[:, 2].max() * PITCH / np.sin(110 / 124 * np.pi / 2))
-
-
-def taxim_height(centre: Fields, radius: float, ball: float, gel: Fields) -> Fields:
-    """Taxim's input (h, w) mm: the ball, placed so that it meets the undeformed `gel` (h, w) mm on the drawn circle.
-
-    Taxim counts from the gel's highest point, smaller is nearer to the camera; both ball and `gel` do.
-    """
-    rows, columns = np.mgrid[: gel.shape[0], : gel.shape[1]]
-    distance = np.hypot(columns - centre[0], rows - centre[1])
-    on_circle = np.abs(distance - radius) < 1
-    edge = np.sqrt(max(ball**2 - (radius * PITCH) ** 2, 1e-6))
-    square = (distance * PITCH) ** 2
-    height = edge - np.sqrt(np.maximum(ball**2 - square, 0)) + gel[on_circle].mean()
-    return np.where(square < ball**2, height, 1.0)

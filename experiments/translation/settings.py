@@ -16,6 +16,11 @@ TRANSLATIONS = {
     "digit-tac3d": "DIGIT to Tac3D",
 }
 PIXELS = "pixels"
+TRANSLATORS = {
+    "anytouch": "AnyTouch", "anytouch_between": "AnyTouch, half-way to stage 2", "stage1": "AnyTouch, stage 1",
+    "anytouch_layer_decay": "AnyTouch, layer decay", "t3": "T3-style", PIXELS: "pixels, no encoder",
+}  # fmt: skip
+TUNES = {"frozen": "frozen", "fine": "fine-tuned", "scratch": "from scratch"}
 OURS = ("anytouch", "stage1")  # its variants, and its stage 1
 
 

@@ -22,7 +22,7 @@ def measured(tmp_path_factory):
 
 def test_every_variant_is_compared_with_plain_decoding(measured):
     _, rows = measured
-    speeds = [one for one in rows if isinstance(one, m.LoaderSpeed)]
+    speeds = rows["loader"]
     names = [one.variant for one in speeds if one.size == (32, 24)]
     assert names[:2] == [m.PLAIN, m.PLAIN_LINEAR] and m.NO_JITTER in names and names[-2:] == [m.ALL, m.ONE_THREAD]
     assert {f"only {name}" for name in ("brightness", "contrast", "saturation", "hue")} < set(names)
@@ -33,7 +33,7 @@ def test_every_variant_is_compared_with_plain_decoding(measured):
 
 def test_a_large_manifest_is_opened_up_to_its_first_batch(measured):
     folder, rows = measured
-    opened = [one for one in rows if isinstance(one, m.Opened)]
+    opened = rows["large manifest"]
     assert [(one.rows, one.stage) for one in opened] == [(450, 1), (450, 2)]
     for one in opened:
         assert min(one.read, one.prepare, one.first_batch) > 0 and 20 < one.read_mb <= one.peak_mb

@@ -20,7 +20,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import plain
 from anytouch_jax.train.step import merge
 from experiments.benchmarks import machine
-from experiments.benchmarks.variants import BASELINE, Program, Variant, cold, compiled, traced_as, variants_of
+from experiments.benchmarks.variants import BASELINE, Program, Variant, cold, compiled, variants_of
 from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of
 
 Tree = Any
@@ -95,7 +95,7 @@ def values_in(variant: Variant, small: Workload, params: Tree, noise: Any) -> di
     work = variant.of(small)
     wide = work.config.model.dtype == "float64"
     batch = normalised(make_batch(work))
-    with jax.enable_x64(wide), cold(), traced_as(variant):
+    with jax.enable_x64(wide), cold(), jax.default_matmul_precision(variant.precision):
         if wide:
             params, batch, noise = jax.tree.map(widened, (params, batch, noise))
         values = jax.jit(values_of(work.config, work.trains))(params, batch, noise)

@@ -47,13 +47,3 @@ def rows_by_kind(folder: Path) -> dict[str, Rows]:
     for rows in result.values():
         rows.sort(key=lambda row: (WORKS.index(row[0].partition(",")[0]), row[0]))
     return result
-
-
-def options_table(variants: Mapping[str, Record]) -> list[tuple[str, str]]:
-    """Return the options of a step that save no time, with their range of ratios."""
-    ratios: dict[str, list[float]] = {}
-    for one in variants.values():
-        for row in (row for several in one["results"].values() for row in several):
-            if row["variant"].startswith("float32, ") and one["machine"]["device"] == "cpu":
-                ratios.setdefault(row["variant"].removeprefix("float32, "), []).append(row["ratio"])
-    return [(name, f"{min(one):.2f} to {max(one):.2f} of the time of a step") for name, one in ratios.items()]

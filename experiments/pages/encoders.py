@@ -135,9 +135,9 @@ def trust(folder: Path) -> Page:
     faults = [(fault, f"{one[0]} of {one[1]}", f"{one[2]}") for fault, one in counts.items()]
     reported, made = (sum(one[i] for one in counts.values()) for i in (0, 1))
     alarmed = sum(len({alarm.partition(":")[0] for alarm in one["alarms"]}) for one in units.values())
-    findings.append(f"{reported} of {made} made faults of sensor units are reported, and {alarmed} of "
-                    f"{sum(one['units'] for one in units.values())} good units raise an alarm.")  # fmt: skip
-    answer = f"Sets of classes, of which 90 % should hold the right one, do so this often. {findings[-1]}"
+    findings.append(f"{reported} of {made} made faults of sensor units are reported.")
+    findings.append(f"{alarmed} of {sum(one['units'] for one in units.values())} good units raise an alarm.")
+    answer = f"Of sets that should hold the class in 90 %, this share does. {findings[-2]}"
     return Page(
         "trust", [rows, faults], findings, (answer, f"{rows[0][3].shown()} %"), words={"units": ", ".join(units)}
     )

@@ -6,27 +6,26 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.benchmarks.table import HEAD, Rows, options_table, rows_by_kind
+from experiments.benchmarks.table import HEAD, Rows, rows_by_kind
 from experiments.compare.table import families_table
 from experiments.pages.page import Page, Table
 from experiments.records import read_records
 
 
 def _choice(kind: str, rows: Rows) -> tuple[str, str]:
-    """Return what to choose on a kind of processor, in words and figures."""
+    """Return what to choose on a kind of processor, and the figures of that."""
     words, figures = [], []
     for preset in dict.fromkeys(row[0].partition(", ")[2] for row in rows if row[1] == "ours, bfloat16"):
         half = [row[3].mean for row in rows if row[0].endswith(f", {preset}") and row[1] == "ours, bfloat16"]
-        words.append(f"{'bfloat16' if max(half) < 0.95 else 'float32'} for preset {preset}")
-        figures.append(f"{preset}: bfloat16 takes {min(half):.2f} to {max(half):.2f} of the time")
-    engines = [row for row in rows if row[0].startswith("one touch") and row[4] < 1e-4]
-    if engines:
+        words.append(f"preset {preset} in {'bfloat16' if max(half) < 0.95 else 'float32'}")
+        figures.append(f"bfloat16 at {preset}: {min(half):.2f} to {max(half):.2f} of the time.")
+    if engines := [row for row in rows if row[0].startswith("one touch") and row[4] < 1e-4]:
         best = min(engines, key=lambda row: row[3].mean)
-        words.append(f"embed one touch by `{best[1]}`")
-        figures.append(f"it takes {best[3].mean:.2f} of the time of XLA")
+        words.append(f"one touch by `{best[1]}`")
+        figures.append(f"`{best[1]}`: {best[3].mean:.2f} of the time of XLA.")
     if torch := [row[3].mean for row in rows if row[1].startswith("PyTorch")]:
-        figures.append(f"the ways of PyTorch take {min(torch):.2f} to {max(torch):.2f}")
-    return f"{kind}: {', '.join(words)}.", ", ".join(figures)
+        figures.append(f"PyTorch: {min(torch):.2f} to {max(torch):.2f} of our time in float32.")
+    return f"On {kind}: {', '.join(words)}.", " ".join(figures)
 
 
 def speed(folder: Path) -> Page:
@@ -35,7 +34,7 @@ def speed(folder: Path) -> Page:
     choices = [_choice(kind, rows) for kind, rows in by_kind.items()]
     names = ("tried", "search", "view", "simulator", "compare", "variants")
     tried, searches, views, contacts, families, variants = (read_records(folder / f"{name}.jsonl") for name in names)
-    spent = [(one["question"], f"{one['answer']}: {one['figure']}") for one in tried.values() if one.get("speed")]
+    spent = [(one["question"], one["answer"], one["figure"]) for one in tried.values() if one.get("speed")]
     search = [
         (f"{one['count']:,}", one["way"], one["processor_ms"], one["opened_processor_s"], 100 * (1 - one["recall"]))
         for one in searches.values()
@@ -52,7 +51,7 @@ def speed(folder: Path) -> Page:
     gpu = any(one["machine"]["device"] != "cpu" for one in variants.values())
     words = {"gpu": "" if gpu else "No figure of a GPU is recorded. `make bench-gpu` measures yours."}
     own = [Table(f"On {kind}", HEAD, rows) for kind, rows in by_kind.items()]
-    tables = [*own, [*options_table(variants), *spent], search, live, contact, families_table(families)]
+    tables = [*own, spent, search, live, contact, families_table(families)]
     return Page(
-        "speed", tables, [f"{one} {figure[0].upper()}{figure[1:]}." for one, figure in choices], choices[0], words=words
+        "speed", tables, [f"{one} {figure[0].upper()}{figure[1:]}" for one, figure in choices], choices[0], words=words
     )

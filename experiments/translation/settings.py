@@ -25,8 +25,8 @@ OURS = ("anytouch", "stage1")  # its variants, and its stage 1
 
 
 def runs_of(results: Path) -> dict[str, Record]:
-    """Return the records of translations by key, without those of retrieval and of overlap."""
-    return {key: record for key, record in read_records(results).items() if "settings" in record}
+    """Return the records of translations by key."""
+    return read_records(results)
 
 
 def one_table(several: Sequence[dict[str, Any]], results: Path) -> None:

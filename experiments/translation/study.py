@@ -33,12 +33,11 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
-from experiments.records import read_records, write_record
+from experiments.records import write_record
 from experiments.tables import env, plan
 from experiments.tables.work import Work
 from experiments.translation import encoders as own_encoders
 from experiments.translation import pairs, training
-from experiments.translation.encoders import score_retrieval
 from experiments.translation.generator import Fit
 from experiments.translation.networks import Translation
 from experiments.translation.pictures import picture_grid
@@ -62,16 +61,6 @@ SCENES = Scenes(
     seed=7, grade="fine", units="one", frames=6, size=128, vision=0.0, text=0.0,
 )  # fmt: skip
 PAIRS = WORK / f"pairs-{TOUCHES}-{version(SCENES.sensors)}"
-
-
-def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
-    """How many objects of the pairs the encoder was trained on in its last stage, if its manifests are still there."""
-    files = [Path(path) for path in encoder.config.data.manifests]
-    if not files or not all(file.is_file() for file in files):
-        return "unknown"
-    learned = manifests.read(files)
-    trained = {learned.value(int(row), "object") for row in learned.rows_of("train")}
-    return str(len(trained & set(table.column("object").to_pylist()) - {None}))
 
 
 def view_of(encoder: Encoder) -> tuple[int, bool]:
@@ -151,11 +140,6 @@ def make_all() -> None:
         raise SystemExit(0)
     known = encoders(table)
     plain = view_of(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
-    if not (RUNS or QUICK):  # a trial has too few touches for galleries of 50
-        fine = manifests.read(Work(STUDY).manifest("fine"))
-        for name, seed in product(known, SEEDS):
-            one = known[name][seed]
-            score_retrieval(RESULTS, name, seed, one, source_of(one), fine)
     content = {task: of_sensors(table, task) for task in TASKS}
     wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in own_encoders.NOT_TUNED]
     plans = [*wanted, (PIXELS, "scratch")]
@@ -167,9 +151,6 @@ def make_all() -> None:
         every[stem] = (about, encoder)
     others = [record["settings"] for key, record in runs_of(RESULTS).items() if key not in every]
     one_table([*(about for about, _ in every.values()), *others], RESULTS)
-    before = read_records(RESULTS).get("overlap", {})  # of encoders that have rows already
-    shared = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
-    write_record(RESULTS, "overlap", before | {name: " to ".join(several) for name, several in shared.items()})
     for source, target in TASKS:
         mine = [(*one, key) for key, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
         done = runs_of(RESULTS)

@@ -22,7 +22,6 @@ def test_pouring(tmp_path, tiny_run, monkeypatch, capsys):
     results = tmp_path / "pouring-quick.jsonl"
     learned = {f"{name}-{mode}-0" for name in ("none", "static", "anytouch") for mode in ("frozen", "fine-tuned")}
     assert {*read_records(results)} == learned | {"blind-bound-0", "count-bound-0", "load-bound-0", "expert-bound-0"}
-    assert (tmp_path / "figures" / "pouring_frames.png").exists()
     before = results.stat().st_mtime_ns
     visit(monkeypatch, "pouring/study.py")
     assert results.stat().st_mtime_ns == before
@@ -52,7 +51,6 @@ def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(tmp
     kinds = ("anytouch", "anytouch_between", "anytouch_layer_decay", "t3")
     both = {f"{name}-{tune}-0" for name in kinds for tune in ("frozen", "fine")}
     assert names == both | {"stage1-frozen-0", "pixels-scratch-0"}
-    assert set(read_records(results)["overlap"].values()) == {"0"}
     stages = [path.name for path in (tmp_path / "study" / "trained").glob("stage1-*")]
     configs = [json.loads((tmp_path / "study" / "trained" / name / "config.json").read_text()) for name in stages]
     assert len(stages) == 2 and {one["run"]["steps"] for one in configs} == {5}  # AnyTouch's and T3-style

@@ -1,10 +1,10 @@
-"""Benchmarks of steps, embeddings, the simulator and the loader: a line of JSON each, and a table.
+"""Benchmarks of steps and embeddings: a line of JSON, and a table.
 
     python -m experiments.benchmarks.run stage1 embed --preset small
     python -m experiments.benchmarks.run --preset large --batch 64 --batches 8 16 32 64 128 256
 
 The variants take turns in one process. Quiet the machine first. `make bench` runs everything, and `make bench-gpu` the
-second line: steps and embeddings need only jax, flax, optax and numpy, and read the package from `src`. What is done is
+second line. Only jax, flax, optax and numpy, and read the package from `src`. What is done is
 stored at once, since a machine that is lent may go away. With `--out experiments/results/variants.jsonl` the page of
 speed has the times.
 """
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -30,8 +29,7 @@ from experiments.benchmarks.variants import variants_of
 from experiments.benchmarks.workloads import workloads
 from experiments.records import read_records, write_record
 
-NETWORK = ("stage1", "stage2", "embed")
-WHAT = (*NETWORK, "simulator", "loader")
+WHAT = ("stage1", "stage2", "embed")
 QUICK = {"rounds": 2, "batch": 2, "peak_size": 512}
 SHOWN = (
     "variant", "name", "samples", "ratio", "seconds", "peak_share", "error_gradient", "error_output", "gradient",
@@ -97,38 +95,13 @@ def swept(options: argparse.Namespace) -> Iterator[tuple[str, Rows]]:
                 yield f"{work.name}, preset {options.preset}, {one.name}, by batch", found
 
 
-def simulated(options: argparse.Namespace, _: str) -> Iterator[tuple[str, Rows]]:
-    """Measure contact at every fidelity against a converged float64 solution, then whole recordings."""
-    from experiments.benchmarks import simulator
-
-    small: dict[str, Any] = {}
-    if options.quick:
-        variants = [simulator.SolverVariant(one, 28) for one in ("exact", "fast")]  # type: ignore[arg-type]
-        small = {"variants": variants, "scenes": {"sphere": simulator.SCENES["sphere"]}, "reference": 56}
-    yield "contact", simulator.speed_against_error(**small, rounds=options.rounds)
-    small = {"sensors": ("digit",), "batch": 2, "frames": 2, "size": 32} if options.quick else {}
-    yield "recordings", simulator.recording_speed(rounds=options.rounds, **small)
-
-
-def loaded(options: argparse.Namespace, _: str) -> Iterator[tuple[str, Rows]]:
-    """Measure the loader next to plain decoding, and a manifest of millions of rows."""
-    from experiments.benchmarks import loading
-
-    toy: dict[str, Any] = {"sizes": ((64, 48),), "pictures": 4, "rounds": 1, "pixels": 28, "rows": 2000}
-    with tempfile.TemporaryDirectory() as folder:
-        yield from loading.measure_loading(folder, log=log, **(toy if options.quick else {})).items()
-
-
-PARTS = dict.fromkeys(NETWORK, network) | {"simulator": simulated, "loader": loaded}
-
-
 def run(options: argparse.Namespace) -> int:
     """Measure, store each section at once and print its table."""
     here = machine.describe()
     log(here.sentence())
     about = {"machine": plain(here), "preset": options.preset, "rounds": options.rounds, "quick": options.quick}
     key = f"{options.preset}, {here.vectors if here.device == 'cpu' else here.device}{', quick' * options.quick}"
-    parts = [PARTS[what](options, what) for what in dict.fromkeys(options.what) or WHAT]
+    parts = [network(options, what) for what in dict.fromkeys(options.what) or WHAT]
     for title, rows in chain(*parts, swept(options)):
         records = [speed.record_of(row) for row in rows]
         before = read_records(options.out).get(key, {}).get("results", {})

@@ -22,12 +22,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet
 from tyro.conf import arg
 
 from anytouch_jax.errors import UserError
 from experiments.benchmarks import machine
-from experiments.benchmarks.loading import write_large
 from experiments.command import run_script
 from experiments.records import write_record
 
@@ -50,6 +53,26 @@ class ViewOptions:
     rows: int = 2_500_000  # Rows of the manifest that is opened. 0 opens none.
     picture: Path | None = None  # Also save what the page shows.
     out: Path = Path("experiments/results/view.jsonl")  # JSON lines.
+
+
+def write_large(folder: Path, rows: int) -> Path:
+    """Write a manifest of so many frames of videos of 200 frames. All rows show one of 200 pictures."""
+    rng = np.random.default_rng(0)
+    (folder / "frames").mkdir()
+    for frame in range(200):
+        shade = cv2.resize(rng.uniform(40, 215, (5, 6, 3)).astype(np.float32), (320, 240))
+        cv2.imwrite(str(folder / f"frames/{frame:010d}.jpg"), np.clip(shade, 0, 255).astype(np.uint8))
+    video, frame = np.arange(rows) // 200, np.arange(rows) % 200
+    names = [f"frames/{number:010d}.jpg" for number in range(200)]
+    table = pa.table({
+        "path": pa.array(names).take(pa.array(frame)), "frame_index": pa.array(frame),
+        "sequence": pc.binary_join_element_wise("video_", pa.array(video).cast(pa.string()), ""),
+        "sensor": pa.array(np.array(["gelsight", "digit", "gelslim"])[video % 3]),
+        "split": pa.array(np.array(["train", "train", "train", "val", "test"])[video % 5]),
+        "object": pc.binary_join_element_wise("object ", pa.array(video // 50).cast(pa.string()), ""),
+    })  # fmt: skip
+    pa.parquet.write_table(table, folder / "large.parquet")
+    return folder / "large.parquet"
 
 
 @contextmanager

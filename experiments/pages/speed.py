@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from experiments.benchmarks.table import HEAD, Rows, rows_by_kind
 from experiments.compare.table import families_table
 from experiments.pages.page import Page, Table
@@ -32,26 +30,17 @@ def speed(folder: Path) -> Page:
     """What to choose, by kind of processor."""
     by_kind = dict(sorted(rows_by_kind(folder).items(), key=lambda item: item[0] != "AVX2"))
     choices = [_choice(kind, rows) for kind, rows in by_kind.items()]
-    names = ("tried", "search", "view", "simulator", "compare", "variants")
-    tried, searches, views, contacts, families, variants = (read_records(folder / f"{name}.jsonl") for name in names)
+    names = ("tried", "view", "compare", "variants")
+    tried, views, families, variants = (read_records(folder / f"{name}.jsonl") for name in names)
     spent = [(one["question"], one["answer"], one["figure"]) for one in tried.values() if one.get("speed")]
-    search = [
-        (f"{one['count']:,}", one["way"], one["processor_ms"], one["opened_processor_s"], 100 * (1 - one["recall"]))
-        for one in searches.values()
-    ]
     live = [
         (name, *(one[what][part] for what in ("encoder", "age") for part in ("p50", "p99")))
         for name, one in views.items() if "age" in one
     ]  # fmt: skip
-    contact = [
-        (one["fidelity"], f"{one['grid']} pixels", str(one["iterations"] or "until it converges"),
-         one["press_ms"] + one["shear_ms"], 100 * np.mean([*one["rms"].values()]), np.mean([*one["image"].values()]))
-        for record in contacts.values() for one in record["results"]["contact"]
-    ]  # fmt: skip
     gpu = any(one["machine"]["device"] != "cpu" for one in variants.values())
     words = {"gpu": "" if gpu else "No figure of a GPU is recorded. `make bench-gpu` measures yours."}
     own = [Table(f"On {kind}", HEAD, rows) for kind, rows in by_kind.items()]
-    tables = [*own, spent, search, live, contact, families_table(families)]
+    tables = [*own, spent, live, families_table(families)]
     return Page(
         "speed", tables, [f"{one} {figure[0].upper()}{figure[1:]}" for one, figure in choices], choices[0], words=words
     )

@@ -44,27 +44,16 @@ def test_what_was_measured_outlives_what_fails_later(tiny, tmp_path, capsys, mon
         raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
 
     monkeypatch.setattr(speed, "errors", fail)
-    monkeypatch.setitem(bench.PARTS, "loader", fail)
+    monkeypatch.setattr(speed, "batch_sweep", fail)
+    work = workloads.Workload("stage1 stills", tiny_config(1), 2, 1)
+    monkeypatch.setattr(bench, "workloads", lambda *_: [work])
     out = tmp_path / "bench.jsonl"
     with pytest.raises(RuntimeError, match="out of memory"):
-        run("embed", "loader", "--quick", "--out", out)
+        run("stage1", "--quick", "--batches", 1, "--variants", "float32", "--out", out)
     assert "no errors, the float64 reference failed: RESOURCE_EXHAUSTED" in capsys.readouterr().err
     (record,) = read_records(out).values()
     (rows,) = record["results"].values()
     assert all(row["ratio"] > 0 and row["error_output"] is None for row in rows)
-
-
-@pytest.mark.slow
-def test_loader_and_simulator(tmp_path):
-    out = tmp_path / "bench.jsonl"
-    assert run("loader", "simulator", "--quick", "--out", out) == 0
-    (record,) = read_records(out).values()
-    found = record["results"]
-    assert {row["variant"] for row in found["loader"]} >= {"decode + resize", "all augmentations"}
-    assert [row["stage"] for row in found["large manifest"]] == [1, 2]
-    assert {row["fidelity"] for row in found["contact"]} == {"exact", "fast"}
-    assert [row["sensor"] for row in found["recordings"]] == ["digit", "all, two at a time"]
-    assert all(row["frames_per_second"] > 0 for row in found["recordings"])
 
 
 def test_mistakes(tiny, tmp_path, capsys):

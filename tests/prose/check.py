@@ -19,6 +19,7 @@ WORDS, NUMBERS, CELL, README_WORDS = 30, 3, 25, 700
 PAGES = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "experiments/**/*.md")
 MADE = (
     "docs/results/",
+    "docs/tutorials/",
     "docs/reference/",
     "docs/contributing.md",
     "docs/changelog.md",

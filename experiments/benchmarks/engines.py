@@ -42,10 +42,10 @@ ENGINES = {
 SENSOR, BATCH = 0, 16
 
 
-def touches_of(encoder: Encoder, table: Any, split: str, frames: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return up to `most` prepared touches u8 (n, frames, H, W, 3) of a split, and their sensor rows (n,)."""
+def touches_of(encoder: Encoder, table: Any, split: str, frames: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return `count` prepared touches u8 (n, frames, H, W, 3) of a split, and their sensor rows (n,)."""
     rows = retrieval.deepest_rows(table, split=split, frames=frames)
-    rows = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+    rows = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
     clips: list[np.ndarray] = []
     given, _ = embed_rows(encoder, table, rows, frames, edit=lambda part, _: (clips.append(part), part)[1], log=silent)
     sensors = table.text_column("sensor")[given]
@@ -113,7 +113,7 @@ def main() -> None:
         shown = name if options.frames == 1 else f"{name}, clips"
         with TemporaryDirectory() as folder:
             several = encoders_on(source, table, options.frames, Path(folder))
-            wrong = errors(several, touches_of(source, table, "test", options.frames, 500))
+            wrong = errors(several, touches_of(source, table, "test", options.frames, CALIBRATION))
             for number, (engine, found) in enumerate(timed(several, options.frames, options.rounds).items()):
                 record = {"encoder": shown, "engine": engine, "error": wrong[engine], "data": table.content_hash}
                 write_record(options.out, f"{shown}/{number}", record | found | {"machine": about})

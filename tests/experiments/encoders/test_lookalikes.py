@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from touch_world import make_touches
 
-from anytouch_jax.data.manifest import manifest as manifests
 from experiments.encoders import lookalikes
-from experiments.encoders.train import leave_out
 from experiments.pages.encoders import lookalikes as page
 from experiments.records import write_record
 
@@ -36,11 +34,3 @@ def test_a_perfect_encoder_finds_every_touch_and_noise_finds_chance(tmp_path, mo
     assert record["scores"]["a"]["share"] < 0.1 and record["scores"]["b"]["share"] == 1.0
     write_record(tmp_path / "lookalikes.jsonl", "fine digit", record | {"encoders": {"a": "mark"}, "left_out": "digit"})
     assert "fine alignment, queries by digit, left out of stage 2" in [row[0] for row in page(tmp_path).tables[0]]
-
-
-def test_a_manifest_without_a_sensor(tmp_path):
-    data = make_touches(tmp_path / "data", touches={"test": 2, "train": 2}, frames=1)
-    rest = leave_out(data, "digit")
-    left = manifests.read(rest)
-    assert set(left.text_column("sensor")) == set(manifests.read(data).text_column("sensor")) - {"digit"}
-    assert left.file(0).exists()

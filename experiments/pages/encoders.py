@@ -60,25 +60,37 @@ def real(folder: Path) -> Page:
     return Page("real", [rows, sorted(curves, key=lambda row: -row[1])], findings, readme=readme)
 
 
+BACKGROUNDS = {
+    "own": "the unit's own picture", "rule": "the rule: its own picture, else the median of 100 frames",
+    "median": "the median of 100 training frames", "all": "the median of all training frames",
+    "ten": "the median of 10 training frames", "half": "the median of the 50 flattest of 100 frames",
+    "recordings": "the median of the medians of recordings", "estimated": "an estimate by `anytouch data contact`",
+    "first": "the first frame of the recording", "pixels": "raw pixels, minus the median of 100 frames",
+}  # fmt: skip
+
+
 def backgrounds(folder: Path) -> Page:
     """An encoder on real recordings, by what is subtracted."""
-    records = read_records(folder / "backgrounds.jsonl")
-    words = {
-        "own": "the unit's own picture", "estimated": "an estimate by `anytouch data contact`",
-        "first": "the first frame of the recording",
-    }  # fmt: skip
-    rows: list[Any] = []
+    records, rows = read_records(folder / "backgrounds.jsonl"), []
     findings: list[Finding | str] = []
     for task in reversed(TASKS):
-        own = _score(records["own"], f"{task}, linear")
-        for kind in (kind for kind in words if kind in records):
-            linear, near = (_score(records[kind], f"{task}, {head}") for head in HEADS)
-            change = _minus(linear, own) if kind != "own" else None
-            rows.append((task, words[kind], _share(linear), _share(near), change))
-            findings += [Finding(words[kind], words["own"], change, task)] if kind != "own" else []
+        scores = {kind: [_score(records[kind], f"{task}, {head}") for head in HEADS] for kind in BACKGROUNDS
+                  if kind in records}  # fmt: skip
+        for kind, (linear, near) in scores.items():
+            change = _minus(linear, scores["own"][0])
+            rows.append((task, BACKGROUNDS[kind], _share(linear), _share(near), change))
+            if kind in ("rule", "median", "first"):
+                findings.append(Finding(BACKGROUNDS[kind], BACKGROUNDS["own"], change, task))
+        if "pixels" in scores and "median" in scores:
+            change = _minus(scores["median"][0], scores["pixels"][0])
+            findings.append(Finding("the encoder, minus the median of 100 frames,", "raw pixels", change, task))
     if alone := read_records(folder / "tried.jsonl").get("untouched_gel"):
-        findings.append(f"Of simulated recordings without such a picture, {alone['figure']}.")
-    return Page("backgrounds", [rows], findings, words={"encoder": next(iter(records.values()))["encoder"]})
+        findings.insert(0, f"Of simulated recordings without such a picture, {alone['figure']}.")
+    answer = Finding(BACKGROUNDS["rule"], BACKGROUNDS["own"], rows[1][-1], rows[1][0])
+    return Page(
+        "backgrounds", [rows], findings, (f"{answer.words}.", answer.figure),
+        words={"encoder": next(iter(records.values()))["encoder"]},
+    )  # fmt: skip
 
 
 def motion(folder: Path) -> Page:

@@ -61,11 +61,11 @@ def real(folder: Path) -> Page:
 
 
 BACKGROUNDS = {
-    "own": "the unit's own picture", "rule": "the rule: its own picture, else the median of 100 frames",
-    "median": "the median of 100 training frames", "all": "the median of all training frames",
-    "ten": "the median of 10 training frames", "half": "the median of the 50 flattest of 100 frames",
+    "own": "the unit's own picture", "rule": "the rule: its own picture, else the median of a hundred frames",
+    "median": "the median of a hundred training frames", "all": "the median of all training frames",
+    "ten": "the median of 10 training frames", "half": "the median of the flattest half of them",
     "recordings": "the median of the medians of recordings", "estimated": "an estimate by `anytouch data contact`",
-    "first": "the first frame of the recording", "pixels": "raw pixels, minus the median of 100 frames",
+    "first": "the first frame of the recording", "pixels": "raw pixels, minus the median of a hundred frames",
 }  # fmt: skip
 
 
@@ -83,7 +83,7 @@ def backgrounds(folder: Path) -> Page:
                 findings.append(Finding(BACKGROUNDS[kind], BACKGROUNDS["own"], change, task))
         if "pixels" in scores and "median" in scores:
             change = _minus(scores["median"][0], scores["pixels"][0])
-            findings.append(Finding("the encoder, minus the median of 100 frames,", "raw pixels", change, task))
+            findings.append(Finding("the encoder, minus the median of a hundred frames,", "raw pixels", change, task))
     if alone := read_records(folder / "tried.jsonl").get("untouched_gel"):
         findings.insert(0, f"Of simulated recordings without such a picture, {alone['figure']}.")
     answer = Finding(BACKGROUNDS["rule"], BACKGROUNDS["own"], rows[1][-1], rows[1][0])

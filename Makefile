@@ -128,7 +128,7 @@ bench-torch: $(STAMP) ## next to PyTorch, in a separate venv: [PRESET= BATCH= OU
 	$(PY) -m experiments.benchmarks.pytorch.run $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
-	$(PYTHON) -m experiments.benchmarks.run $(if $(WHAT),$(WHAT),stage1 stage2 embed) --preset large --batch $(if $(BATCH),$(BATCH),64) --batches 8 16 32 64 128 256 512$(if $(OUT), --out $(OUT))
+	$(PYTHON) -m experiments.benchmarks.run $(if $(WHAT),$(WHAT),stage1 stage2 embed) --preset large --batch $(if $(BATCH),$(BATCH),64)$(if $(OUT), --out $(OUT))
 
 compare: $(STAMP) ## encoders of all families: what they cost, and what your files know: [ENCODERS="a=FILE b=FILE" DATA=manifest LABEL= OUT=runs/compare/compare.jsonl]
 	$(PY) -m experiments.compare.run$(if $(ENCODERS), --encoders $(ENCODERS) --data $(DATA) --label $(LABEL))$(if $(OUT), --out $(OUT))

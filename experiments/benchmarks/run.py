@@ -1,7 +1,7 @@
 """Benchmarks of steps and embeddings: a line of JSON, and a table.
 
     python -m experiments.benchmarks.run stage1 embed --preset small
-    python -m experiments.benchmarks.run --preset large --batch 64 --batches 8 16 32 64 128 256
+    python -m experiments.benchmarks.run --preset large --batch 64
 
 The variants take turns in one process. Quiet the machine first. `make bench` runs everything, and `make bench-gpu` the
 second line. Only jax, flax, optax and numpy, and read the package from `src`. What is done is
@@ -49,14 +49,12 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("what", nargs="*", help=f"what to measure: {', '.join(WHAT)} (default: all)")
     parser.add_argument("--preset", default="tiny", choices=("tiny", "small", "base", "large"))
     parser.add_argument("--batch", type=int, help="samples a step (default: 16, 16, 8, 4 by preset)")
-    parser.add_argument("--batches", type=int, nargs="*", default=[], help="at last time the fastest variant at these")
     parser.add_argument("--rounds", type=int, default=9, help="rounds in which all variants take turns")
     parser.add_argument("--variants", nargs="*", default=[], help="names of variants (default: all)")
     parser.add_argument("--no-errors", action="store_true", help="leave out the float64 reference, which compiles long")
     parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
     parser.add_argument("--out", type=Path, default=Path("runs/bench/bench.jsonl"), help="file of results")
     parser.add_argument("--quick", action="store_true", help="two rounds of tiny batches, to see that everything works")
-    parser.set_defaults(measured=[])
     options = parser.parse_args(args)
     if unknown := set(options.what) - {*WHAT}:
         raise UserError(f"There is nothing to measure as {min(unknown)}. Choose among {', '.join(WHAT)}.")
@@ -69,7 +67,7 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
 
 
 def network(options: argparse.Namespace, what: str) -> Iterator[tuple[str, Rows]]:
-    """Measure the workloads of a part, each variant against float64, then the fastest at other batches."""
+    """Measure the workloads of a part, each variant against float64."""
     for work in workloads(what, options.preset, options.batch):
         known = variants_of(work, jax.default_backend())
         chosen = [one for one in known if not options.variants or one.name in options.variants]
@@ -81,18 +79,7 @@ def network(options: argparse.Namespace, what: str) -> Iterator[tuple[str, Rows]
         except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
             yield work.name, [speed.SpeedRow(work.name, "none", work.samples, note=str(error).splitlines()[0])]
             continue
-        options.measured.append((work, rows))
         yield f"{work.name}, preset {options.preset}", rows
-
-
-def swept(options: argparse.Namespace) -> Iterator[tuple[str, Rows]]:
-    """Measure the fastest variant of each step, and those with remat, for every batch that fits."""
-    for work, rows in options.measured if options.batches else ():
-        fastest = min((row for row in rows if not row.note), key=lambda row: row.seconds).variant
-        for one in variants_of(work, jax.default_backend()) if work.trains else ():
-            if one.name == fastest or "remat" in one.name:
-                found = speed.batch_sweep(one, work, options.batches, max(2, options.rounds // 3))
-                yield f"{work.name}, preset {options.preset}, {one.name}, by batch", found
 
 
 def run(options: argparse.Namespace) -> int:
@@ -102,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
     about = {"machine": plain(here), "preset": options.preset, "rounds": options.rounds, "quick": options.quick}
     key = f"{options.preset}, {here.vectors if here.device == 'cpu' else here.device}{', quick' * options.quick}"
     parts = [network(options, what) for what in dict.fromkeys(options.what) or WHAT]
-    for title, rows in chain(*parts, swept(options)):
+    for title, rows in chain(*parts):
         records = [speed.record_of(row) for row in rows]
         before = read_records(options.out).get(key, {}).get("results", {})
         write_record(options.out, key, about | {"results": before | {title: records}})

@@ -280,19 +280,6 @@ def _iqr(values: Any) -> float:
     return float(high - low)
 
 
-def batch_sweep(variant: Variant, work: Workload, batches: Sequence[int], rounds: int = 5) -> list[SpeedRow]:
-    """A row a batch size, for memory against batch; the sweep ends with the first size that does not fit."""
-    rows: list[SpeedRow] = []
-    for samples in batches:
-        try:
-            rows += measure(work.resized(samples), [variant], rounds=rounds, with_errors=False)
-        except (UserError, RuntimeError) as error:  # XLA's out-of-memory is a RuntimeError
-            rows.append(_empty(work.resized(samples), variant, str(error).splitlines()[0]))
-            break
-        gc.collect()
-    return rows
-
-
 def record_of(row: Any) -> dict[str, Any]:
     """Return a record as JSON takes it: a number that is not finite is null."""
     values: dict[str, Any] = plain(row)

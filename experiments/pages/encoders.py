@@ -61,9 +61,9 @@ def real(folder: Path) -> Page:
 
 
 BACKGROUNDS = {
-    "own": "the unit's own picture", "rule": "the rule: its own picture, else the median of a hundred frames",
+    "own": "the unit's own picture", "rule": "the rule (its own picture, else a median)",
     "median": "the median of a hundred training frames", "all": "the median of all training frames",
-    "ten": "the median of 10 training frames", "half": "the median of the flattest half of them",
+    "ten": "the median of 10 training frames", "half": "the median of the flattest half of a hundred",
     "recordings": "the median of the medians of recordings", "estimated": "an estimate by `anytouch data contact`",
     "first": "the first frame of the recording", "pixels": "raw pixels, minus the median of a hundred frames",
 }  # fmt: skip

@@ -30,17 +30,13 @@ def speed(folder: Path) -> Page:
     """What to choose, by kind of processor."""
     by_kind = dict(sorted(rows_by_kind(folder).items(), key=lambda item: item[0] != "AVX2"))
     choices = [_choice(kind, rows) for kind, rows in by_kind.items()]
-    names = ("tried", "view", "compare", "variants")
-    tried, views, families, variants = (read_records(folder / f"{name}.jsonl") for name in names)
+    names = ("tried", "compare", "variants")
+    tried, families, variants = (read_records(folder / f"{name}.jsonl") for name in names)
     spent = [(one["question"], one["answer"], one["figure"]) for one in tried.values() if one.get("speed")]
-    live = [
-        (name, *(one[what][part] for what in ("encoder", "age") for part in ("p50", "p99")))
-        for name, one in views.items() if "age" in one
-    ]  # fmt: skip
     gpu = any(one["machine"]["device"] != "cpu" for one in variants.values())
     words = {"gpu": "" if gpu else "No figure of a GPU is recorded. `make bench-gpu` measures yours."}
     own = [Table(f"On {kind}", HEAD, rows) for kind, rows in by_kind.items()]
-    tables = [*own, spent, live, families_table(families)]
+    tables = [*own, spent, families_table(families)]
     return Page(
         "speed", tables, [f"{one} {figure[0].upper()}{figure[1:]}" for one, figure in choices], choices[0], words=words
     )

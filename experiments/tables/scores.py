@@ -140,9 +140,7 @@ def _q2(leaf: Leaf, work: Places) -> dict[str, Any]:
         found = {"class token": contact_vector(table, rows)}
     else:
         encoder = encoder_of(leaf, work)
-        both = embed_rows(encoder, table, rows, pooling="both", log=quiet)[1]
-        width = encoder.config.model.embed
-        found = {"class token": both[:, :width], "patches": both[:, width:]}
+        found = {"class token": embed_rows(encoder, table, rows, log=quiet)[1]}
     metric: retrieval.Metric = "euclidean" if leaf.name == CONTACT else "cosine"
     results = [row for view, values in found.items() for row in _space(table, rows, values, view, metric)]
     return {"rows": results, "points": _points(table, rows, found["class token"], leaf.seed), "data": ["own"]}

@@ -40,7 +40,6 @@ from experiments.translation import encoders as own_encoders
 from experiments.translation import pairs, training
 from experiments.translation.generator import Fit
 from experiments.translation.networks import Translation
-from experiments.translation.pictures import picture_grid
 from experiments.translation.settings import PIXELS, TASKS, one_table, runs_of
 
 QUICK = env.switch("QUICK")
@@ -87,8 +86,8 @@ def settings(
 
 
 def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, key: str) -> None:
-    """Train, score on held-out objects and write the record of a run. The first seed also draws its pictures."""
-    (x, y), val, (test_x, test_y), shown = data
+    """Train, score on held-out objects and write the record of a run."""
+    (x, y), val, (test_x, test_y) = data
     begun = time.perf_counter()
     field = () if y.dtype == np.uint8 else y.shape[1:]
     shape = None if encoder else Translation(replace(preset("tiny").model, image_size=about["size"]), field=field)
@@ -109,8 +108,6 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, key: str)
         "seconds": round(seconds, 1),
         "critic": made.design.has_critic,
     }
-    if about["fit"]["seed"] == SEEDS[0]:
-        picture_grid(OUT / "figures" / f"{NAME}-{key}.png", made, test_x[shown], test_y[shown])
     write_record(RESULTS, key, record)
     print(f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
 
@@ -159,10 +156,8 @@ def make_all() -> None:
             continue
         split = pairs.find_pairs(table, source, target)
         data = [pairs.read_pairs(table, part, plain[0], subtract=plain[1]) for part in split]
-        force = [table.value(int(row), "label.force") for row in split.test.source]
-        shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
         for about, encoder, key in todo:
-            one_run(about, encoder, (*data, shown), key)
+            one_run(about, encoder, data, key)
 
 
 def main() -> None:

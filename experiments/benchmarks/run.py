@@ -1,12 +1,9 @@
 """Benchmarks of steps and embeddings: a line of JSON, and a table.
 
     python -m experiments.benchmarks.run stage1 embed --preset small
-    python -m experiments.benchmarks.run --preset large --batch 64
 
-The variants take turns in one process. Quiet the machine first. `make bench` runs everything, and `make bench-gpu` the
-second line. Only jax, flax, optax and numpy, and read the package from `src`. What is done is
-stored at once, since a machine that is lent may go away. With `--out experiments/results/variants.jsonl` the page of
-speed has the times.
+The variants take turns in one process. Quiet the machine first. Only jax, flax, optax and numpy are needed. What is
+done is stored at once. With `--out experiments/results/variants.jsonl` the page of speed has the times.
 """
 
 from __future__ import annotations
@@ -27,6 +24,7 @@ from anytouch_jax.evaluate.statistics import markdown_table, plain
 from experiments.benchmarks import machine, speed
 from experiments.benchmarks.variants import variants_of
 from experiments.benchmarks.workloads import workloads
+from experiments.command import with_status
 from experiments.records import read_records, write_record
 
 WHAT = ("stage1", "stage2", "embed")
@@ -111,11 +109,7 @@ def table_of(records: Sequence[Mapping[str, Any]]) -> str:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line `args` and return the exit status."""
-    try:
-        return run(parse(args))
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
+    return with_status(lambda: run(parse(args)))
 
 
 if __name__ == "__main__":

@@ -36,17 +36,13 @@ DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the othe
 
 
 class Row(NamedTuple):
-    """One row and mode over all its seeds: `poured` g of each run, `runs` names them ("seed/number"), and `lost` runs
-    were never turned back."""
+    """One row and mode over all its seeds: `poured` g of each run, and `runs` names them ("seed/number")."""
 
     name: str
     mode: str
     poured: Array
     runs: tuple[str, ...]
     target: float
-    sources: tuple[str, ...]
-    settings: str
-    lost: int
 
     @property
     def wrong(self) -> Array:
@@ -123,9 +119,7 @@ def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
     parts = sorted(parts, key=lambda part: part["seed"])
     runs = tuple(f"{part['seed']}/{number}" for part in parts for number in range(len(part["poured"])))
     poured = np.concatenate([np.asarray(part["poured"], np.float64) for part in parts])
-    sources = tuple(dict.fromkeys(part["source"] for part in parts))
-    lost = sum(int(steps) >= part.get("limit", Task().limit) for part in parts for steps in part["steps"])
-    return Row(name, mode, poured, runs, float(parts[0]["target"]), sources, settings.pop(), lost)
+    return Row(name, mode, poured, runs, float(parts[0]["target"]))
 
 
 def difference(a: Row, b: Row) -> Value:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import jax
 
 from anytouch_jax.errors import UserError
+from experiments.command import with_status
 from experiments.pages import __main__ as pages
 from experiments.tables import plan
 from experiments.tables.execute import check_results, execute, is_done
@@ -67,7 +68,8 @@ def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
 
 def main(argv: Sequence[str] | None = None) -> int:
     asked = options(argv)
-    try:
+
+    def run() -> int:
         chosen = choose(asked)
         if asked.plan:
             return _print(chosen)
@@ -75,12 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _render(chosen)
         check_results(chosen.leaves, chosen.out / "matrix.jsonl")
         return _execute(chosen)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; the same command continues", file=sys.stderr)
-        return 130
+
+    return with_status(run)
 
 
 class Chosen(NamedTuple):

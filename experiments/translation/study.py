@@ -7,15 +7,13 @@ smallest. Each translation is compared with copying the mean target, and with a 
 
 `make translation` trains the encoders too, one of each a seed, on the scenes of `make experiments` without the objects
 of the pairs (`encoders.py`). In the environment: `RUNS="anytouch=runs/stage2 t3=a,b,c"` takes encoders of yours (a
-path, or one a seed). `REMAINING="coarse.parquet ..."` writes `coarse_remaining.parquet` next to each and stops: train
-encoders of yours on that. `STEPS1=3000` gives stage 1 so many steps, and its table a separate page. `STUDY=`, `WORK=`
+path, or one a seed). `STEPS1=3000` gives stage 1 so many steps, and its table a separate page. `STUDY=`, `WORK=`
 and `OUT=` are folders of the scenes, the pairs and the results. `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` change the
 size, and `QUICK=1` is a trial of minutes.
 """
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from dataclasses import asdict, replace
@@ -131,10 +129,6 @@ def make_all() -> None:
     """Make every missing run, task by task: frames are read once a task."""
     simulate(SCENES, PAIRS, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
     table = manifests.read(PAIRS / "manifest.parquet")
-    if os.environ.get("REMAINING"):
-        for word in os.environ["REMAINING"].split():
-            own_encoders.write_remaining(Path(word), table)
-        raise SystemExit(0)
     known = encoders(table)
     plain = view_of(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
     content = {task: of_sensors(table, task) for task in TASKS}

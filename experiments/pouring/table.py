@@ -123,10 +123,9 @@ def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
 
 
 def difference(a: Row, b: Row) -> Value:
-    """The error of `a` minus that of `b` in g over the runs that both have.
+    """Return the error of `a` minus that of `b` in g over the runs that both have, with its interval over seeds.
 
-    The interval is over seeds (Student's t): the runs of a seed share one learned policy. Raises UserError without a
-    run in common.
+    The runs of a seed share one learned policy. Raises UserError without a run in common.
     """
     shared = [run for run in a.runs if run in b.runs]
     if not shared:

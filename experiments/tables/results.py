@@ -48,10 +48,7 @@ class Column(NamedTuple):
 
 
 def read(path: Path) -> list[Run]:
-    """Return the runs of a file of results, in the order of their keys.
-
-    Raises UserError for a record that is no run of the matrix.
-    """
+    """Return the runs of a file of results, in the order of keys. Raises UserError for a record that is no run."""
     runs = []
     for key, about in read_records(path).items():
         try:

@@ -41,7 +41,7 @@ train-stage1: RUN ?= runs/stage1
 train-stage2 probe: RUN ?= runs/stage2
 
 # The demo learns from scratch in minutes on two cores: small towers, contact frames less the untouched gel, and each
-# touch against all others of its batch (experiments/tables/teaching.py says why).
+# touch against all others of its batch (experiments/tables/plan.py says why).
 TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
 DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --data.background subtract --data.contact-only --data.jitter 0 0 0 0
 DEMO1 := $(DEMO0) --steps $(DEMO_STEPS1) --batch 48
@@ -58,7 +58,7 @@ OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if 
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all test-jax lint format bench bench-torch bench-gpu compare pouring translation long-clips experiments results notebooks corpus weights figures release-check docs clean
+.PHONY: help setup demo simulate train-stage1 train-stage2 probe parity test test-all test-jax lint format bench bench-torch bench-gpu compare pouring translation experiments results notebooks corpus weights figures release-check docs clean
 
 help: ## list the targets
 	@echo "make TARGET [NAME=value ...]"
@@ -129,7 +129,7 @@ bench-torch: $(STAMP) ## next to PyTorch, in a separate venv: [PRESET= BATCH= OU
 	$(PY) -m experiments.benchmarks.pytorch.run $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
 bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
-	$(PYTHON) -m experiments.benchmarks.gpu $(WHAT)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
+	$(PYTHON) -m experiments.benchmarks.run $(if $(WHAT),$(WHAT),stage1 stage2 embed) --preset large --batch $(if $(BATCH),$(BATCH),64)$(if $(OUT), --out $(OUT))
 
 compare: $(STAMP) ## encoders of all families: what they cost, and what your files know: [ENCODERS="a=FILE b=FILE" DATA=manifest LABEL= OUT=runs/compare/compare.jsonl]
 	$(PY) -m experiments.compare.run$(if $(ENCODERS), --encoders $(ENCODERS) --data $(DATA) --label $(LABEL))$(if $(OUT), --out $(OUT))
@@ -140,12 +140,8 @@ pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: [RUNS="any
 translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: [RUNS="anytouch=path t3=path" STUDY= STEPS1=3000 QUICK=1 OUT=]
 	RUNS="$(RUNS)" STUDY="$(STUDY)" STEPS1="$(STEPS1)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.translation.study
 
-long-clips: RUN ?= runs/stage2
-long-clips: $(STAMP) $(scenes) ## longer clips, what they add and what they cost: [RUN= DATA= QUICK=1 OUT=]
-	RUN="$(RUN)" DATA="$(DATA)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.tables.long_clips
-
-experiments: $(STAMP) ## the paper's tables on simulated and real touch, run by run: [QUICK=1 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT= REAL=]
-	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))$(if $(REAL), --real $(REAL))
+experiments: $(STAMP) ## the paper's tables on simulated touch, run by run: [QUICK=1 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT=]
+	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))
 
 results: $(STAMP) ## the pages of experiments/results from their data alone: [OUT=]
 	$(PY) -m experiments.pages $(OUT)

@@ -1,12 +1,14 @@
-"""Pages of the documentation site that are made from the package: commands, API and results.
+"""Pages of the documentation site that are made from the package: commands, API, results and tutorials.
 
-python -m docs.generate        writes docs/reference/commands.md, docs/reference/api.md and docs/results/
+python -m docs.generate        writes docs/reference/, docs/results/ and docs/tutorials/
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import io
+import json
 import os
 import re
 import shutil
@@ -18,6 +20,7 @@ from anytouch_jax.cli.app import COMMANDS, main
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 RESULTS = ROOT / "experiments" / "results"
+NOTEBOOKS = ROOT / "experiments" / "notebooks"
 _LOW = "---\nsearch:\n  boost: 0.2\n---\n\n"  # a search finds how-to pages before results and references
 _ROOMS = {
     "encoder": "Encoders",
@@ -69,8 +72,29 @@ def api_page() -> str:
     return "\n".join(parts)
 
 
+def tutorial(notebook: Path, folder: Path) -> str:
+    """Return a notebook as a page: its text, its code and what that printed. Pictures go to `folder`."""
+    parts = [_LOW]
+    for number, cell in enumerate(json.loads(notebook.read_text(encoding="utf-8"))["cells"]):
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for place, output in enumerate(cell.get("outputs", ())):
+            if printed := "".join(output.get("text", ())).strip():
+                parts.append(f"```text\n{printed}\n```")
+            if picture := output.get("data", {}).get("image/png"):
+                name = f"{notebook.stem}-{number}-{place}.png"
+                (folder / name).write_bytes(base64.b64decode("".join(picture)))
+                parts.append(f"![Output of the cell above]({name})")
+    return "\n\n".join(parts) + "\n"
+
+
 def write() -> None:
     """Write the generated pages."""
+    shutil.rmtree(DOCS / "tutorials", ignore_errors=True)
+    (DOCS / "tutorials").mkdir()
+    for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
+        page = DOCS / "tutorials" / f"{notebook.stem}.md"
+        page.write_text(tutorial(notebook, page.parent), encoding="utf-8")
     (DOCS / "reference").mkdir(exist_ok=True)
     (DOCS / "reference" / "commands.md").write_text(commands_page(), encoding="utf-8")
     (DOCS / "reference" / "api.md").write_text(api_page(), encoding="utf-8")

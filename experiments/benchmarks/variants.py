@@ -9,14 +9,11 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
-from unittest import mock
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from anytouch_jax.nn import functional, layers
 from anytouch_jax.train.mesh import donated
 from experiments.benchmarks.workloads import Workload, embed_of, make_batch, step_of
 
@@ -25,24 +22,18 @@ Tree = Any
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to compute the same: changes of `config.model`, and what no setting of the model changes.
+    """A way to compute the same: changes of `config.model`, and `precision` of float32 products.
 
-    `activation` jax: GELU as jax.nn writes it, its derivative traced. `donate`: the step may overwrite its state; None
-    as in training. `dense`: a slot for image and text in every row. `precision`: of float32 products (a GPU may take
-    TF32 for them).
+    A GPU may take TF32 for them.
     """
 
     name: str
     model: Mapping[str, Any] = field(default_factory=dict)
-    activation: str = "own"
-    donate: bool | None = None
-    dense: bool = False
     precision: str | None = "highest"
 
     def of(self, work: Workload) -> Workload:
-        """`work` as this variant computes it."""
-        config = replace(work.config, model=replace(work.config.model, **self.model))
-        return replace(work, config=config, dense=self.dense)
+        """Return `work` as this variant computes it."""
+        return replace(work, config=replace(work.config, model=replace(work.config.model, **self.model)))
 
 
 BASELINE = Variant("float32")
@@ -51,9 +42,7 @@ _STEPS = (
     BASELINE,
     Variant("bfloat16", BFLOAT16),
     Variant("float32, attention by XLA", {"attention": "xla"}),
-    Variant("float32, GELU of jax.nn", activation="jax"),
     Variant("float32, remat", {"remat": True}),
-    Variant("float32, state donated", donate=True),
 )
 
 
@@ -70,10 +59,7 @@ def variants_of(work: Workload, backend: str = "cpu") -> tuple[Variant, ...]:
             return fast
         remat = BFLOAT16 | {"attention": "cudnn", "remat": True}
         return (*fast, Variant("bfloat16, cuDNN attention, remat", remat, precision=None))
-    if not work.trains:
-        return _STEPS[:2]
-    dense = (Variant("float32, dense slots", dense=True),) if work.name == "stage2 align" else ()
-    return _STEPS + dense
+    return _STEPS if work.trains else _STEPS[:2]
 
 
 @dataclass
@@ -107,34 +93,17 @@ def cold() -> Iterator[None]:
         compilation_cache.reset_cache()
 
 
-@contextlib.contextmanager
-def traced_as(variant: Variant) -> Iterator[None]:
-    """Trace with a variant's activation and precision of products."""
-    gelu = partial(jax.nn.gelu, approximate=False) if variant.activation == "jax" else layers.gelu
-
-    def forget() -> None:
-        functional._cached_skeleton.cache_clear()  # it keeps modules, and they their activation
-        if variant.activation == "jax":
-            jax.clear_caches()  # they keep what was traced with another activation
-
-    forget()
-    with mock.patch.object(layers, "gelu", gelu), jax.default_matmul_precision(variant.precision):
-        yield
-    forget()
-
-
 def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
     """Compile a variant, timed, cold. `state` is a TrainState, or parameters for an embedding (shapes will do)."""
     work = variant.of(work)
     batch = make_batch(work)
     if work.trains:
-        donate = donated() if variant.donate is None else (0,) if variant.donate else ()
-        function = jax.jit(step_of(work.config), donate_argnums=donate)
+        function = jax.jit(step_of(work.config), donate_argnums=donated())
         args = (state, batch, jax.eval_shape(lambda: jax.random.key(0)))
         batch = jax.device_put(batch)
     else:
         function, args = jax.jit(embed_of(work.config)), (state, *batch[:2])
-    with cold(), traced_as(variant):
+    with cold(), jax.default_matmul_precision(variant.precision):
         start = time.perf_counter()
         lowered = function.lower(*args)
         traced = time.perf_counter()

@@ -33,16 +33,12 @@ _STEPS = 1000
 
 @dataclass(frozen=True)
 class Workload:
-    """A thing to time: its name, its configuration, how many samples a call has and how many frames a sample.
-
-    `dense`: every row of a stage-2 batch has a slot for an image and for a text, used or not.
-    """
+    """A thing to time: its name, its configuration, how many samples a call has and how many frames a sample."""
 
     name: str
     config: Config
     samples: int
     frames: int
-    dense: bool = False
 
     @property
     def trains(self) -> bool:
@@ -51,7 +47,7 @@ class Workload:
 
     @cached_property
     def operations(self) -> float:
-        """Operations of the matrix products of a call in float32, without recomputation and without empty slots."""
+        """Operations of the matrix products of a call in float32, without recomputation."""
         return _useful(self)
 
     def resized(self, samples: int) -> Workload:
@@ -98,33 +94,13 @@ def make_batch(work: Workload, seed: int = 0) -> TouchBatch | Stage2Batch:
     image = rng.integers(0, 256, (len(image_row), side, side, 3), np.uint8)
     text, mask = _captions(rng, work.config.model, len(text_row))
     align = AlignBatch(*part, image, image_row, text, mask, text_row)
-    return Stage2Batch(_spread(align) if work.dense else align, None)
+    return Stage2Batch(align, None)
 
 
 def _rows(work: Workload, share: float, offset: int) -> np.ndarray:
     """Rows of the batch that have a modality, spread evenly."""
     count = _share(work.samples, share)
     return np.sort((np.arange(count) * work.samples // count + offset) % work.samples).astype(np.int32)
-
-
-def _spread(align: AlignBatch) -> AlignBatch:
-    """The same batch with a slot for every row; what is not there is zeros."""
-    rows = len(align.clip)
-
-    def full(values: np.ndarray, row: np.ndarray) -> np.ndarray:
-        spread = np.zeros((rows, *values.shape[1:]), values.dtype)
-        spread[row] = values
-        return spread
-
-    slots = np.arange(rows, dtype=np.int32)
-    there = [np.where(np.isin(slots, row), slots, rows).astype(np.int32) for row in (align.image_row, align.text_row)]
-    return align._replace(
-        image=full(align.image, align.image_row),
-        image_row=there[0],
-        text=full(align.text, align.text_row),
-        text_mask=full(align.text_mask, align.text_row),
-        text_row=there[1],
-    )
 
 
 def _captions(rng: np.random.Generator, model: ModelConfig, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -246,7 +222,7 @@ def _is_jaxpr(value: Any) -> bool:
 def _useful(work: Workload) -> float:
     model = replace(work.config.model, dtype="float32", attention="xla", remat=False)
     config = replace(work.config, model=model)
-    net, params, batch = build(model), build(model).abstract(), normalised(make_batch(replace(work, dense=False)))
+    net, params, batch = build(model), build(model).abstract(), normalised(make_batch(work))
     noise = np.zeros((work.samples, model.patches), np.float32)
     if not work.trains:
         run: Callable[..., Any] = lambda p: net.encode_touch(p, batch.clip, batch.sensor)  # noqa: E731

@@ -3,8 +3,8 @@
     python -m experiments.compare.run
     python -m experiments.compare.run --encoders a=FILE b=FILE --data manifest.parquet --label material
 
-Each figure is a line of `experiments/results/compare.jsonl`, and the page is made from that file alone (`--render`).
-Figures of your own encoders go to `runs/compare/compare.jsonl`, or to the file of `--out`.
+Each figure is a line of `experiments/results/compare.jsonl`, and the page of speed has a table of them. Figures of your
+own encoders go to `runs/compare/compare.jsonl`, or to the file of `--out`, with a page next to it.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from experiments.benchmarks import machine
 from experiments.benchmarks.workloads import products
 from experiments.command import run_script
 from experiments.compare.families import FORMS, OURS, untrained
-from experiments.compare.page import compare_encoders
-from experiments.pages import page
-from experiments.records import write_record
+from experiments.compare.table import families_table
+from experiments.pages.page import markdown
+from experiments.records import read_records, write_record
 
 PROTOCOLS = ("honest", "published")
 RESULTS, YOURS = Path("experiments/results/compare.jsonl"), Path("runs/compare/compare.jsonl")
@@ -48,7 +48,6 @@ class Options:
     only: tuple[str, ...] = ()  # Measure only these families (default: all, or none with --encoders).
     repeats: int = 5  # Timed calls of each family.
     out: Path | None = None  # The file of results. Your encoders have one of their own.
-    render: bool = False  # Make the page from the file of results, and nothing else.
 
 
 def costs(encoder: Encoder, repeats: int) -> dict[str, Any]:
@@ -101,9 +100,7 @@ def accuracy(name: str, file: str, data: tuple[Path, ...], label: str, protocol:
 def run(options: Options) -> int:
     """Measure, probe, and write the page."""
     wanted = options.only or (() if options.encoders else (*FORMS, *OURS))
-    if options.render:
-        wanted = ()
-    elif unknown := [name for name in wanted if name not in {*FORMS, *OURS}]:
+    if unknown := [name for name in wanted if name not in {*FORMS, *OURS}]:
         raise UserError(f"there is no family {unknown[0]!r}; choose from {', '.join((*FORMS, *OURS))}")
     if options.encoders and not options.data:
         raise UserError("ENCODERS needs the manifest to probe them on; add DATA=manifest.parquet")
@@ -111,7 +108,7 @@ def run(options: Options) -> int:
     for name in wanted:
         write_record(out, f"cost/{name}", costs(untrained(name), options.repeats))
         print(name, flush=True)
-    for pair in () if options.render else options.encoders:
+    for pair in options.encoders:
         name, equals, file = pair.partition("=")
         if not (equals and name and file):
             raise UserError(f"{pair!r} is no NAME=FILE; write --encoders mine=runs/stage2")
@@ -120,10 +117,10 @@ def run(options: Options) -> int:
         for protocol in PROTOCOLS:
             score = accuracy(name, file, options.data, options.label, protocol)
             write_record(out, f"accuracy/{name}/{options.label}/{protocol}", score)
-    made = compare_encoders(out.parent, out.name)
-    page.draw(made, out.parent / "figures" / f"{made.name}.png")
-    atomic_write(out.with_suffix(".md"), page.text(made))
-    print(out.with_suffix(".md"))
+    table = markdown(families_table(read_records(out)))
+    print(table)
+    if out != RESULTS:
+        atomic_write(out.with_suffix(".md"), f"# Your encoders\n\n{table}\n")
     return 0
 
 

@@ -14,82 +14,84 @@ from pathlib import Path
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-from anytouch_jax.weights.registry import DEFAULT
-from experiments.compare.page import NAME as COMPARED
-from experiments.compare.page import compare_encoders
-from experiments.pages import matrix, page, speed, studies, trust
+from experiments.pages import encoders, page, paper, speed
+from experiments.pages.page import Page, Table
+from experiments.records import read_records
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 README = RESULTS.parents[1] / "README.md"
-# The rows of a page that the README shows: what their first two cells are.
-SHOWN = {"real": ("object, other finger", "linear"), "teaching": ("convolutional patches", "fine texture")}
-STUDIES: Mapping[str, tuple[str, Callable[[Path], page.Page]]] = {
-    "real": ("real.jsonl", studies.real),
-    "trust": (trust.NAME, trust.trust),
-    "health": (trust.NAME, trust.health),
-    "backgrounds": ("backgrounds.jsonl", studies.backgrounds),
-    "untouched_gel": (studies.GELS, studies.untouched_gel),
-    "motion": ("motion.jsonl", studies.motion),
-    "lookalikes": ("lookalikes.jsonl", studies.lookalikes),
-    "teaching": ("teaching.jsonl", studies.teaching),
-    "left_out": ("named.jsonl", studies.left_out),
-    "named": ("named.jsonl", studies.named),
-    "long_clips": ("long_clips.jsonl", studies.long_clips),
-    "pouring": ("pouring.jsonl", studies.pouring),
-    "translation": ("translation.jsonl", studies.translation),
-    "variants": (speed.VARIANTS, speed.variants),
-    "versions": (speed.VERSIONS, speed.versions),
-    "optimiser": (speed.OPTIMISER, speed.optimiser),
-    "torch": (speed.TORCH, speed.torch),
-    "memory": (speed.MEMORY, speed.memory),
-    "search": (speed.SEARCH, speed.search),
-    "scene": (speed.SCENE, speed.scene),
-    "view": (speed.VIEW, speed.view),
-    "engines": (speed.ENGINES, speed.engines),
-    "by_contact": (studies.CONTACTS, studies.by_contact),
-    "photometry": (speed.SIMULATOR, speed.photometry),
-    "contact": (speed.SIMULATOR, speed.contact),
-    "compare": (COMPARED, compare_encoders),
+TRIED = "tried.jsonl"
+# A page is made for the file of its data and, in that of the matrix, for the runs of its question.
+PAGES: Mapping[str, tuple[str, Callable[[Path], Page]]] = {
+    "real": ("real.jsonl", encoders.real),
+    "lookalikes": ("lookalikes.jsonl", encoders.lookalikes),
+    "motion": ("motion.jsonl", encoders.motion),
+    "backgrounds": ("backgrounds.jsonl", encoders.backgrounds),
+    "trust": ("trust.jsonl", encoders.trust),
+    "sensors": ("matrix.jsonl/q1", paper.sensors),
+    "space": ("matrix.jsonl/q2", paper.space),
+    "ablations": ("matrix.jsonl/ablations", paper.ablations),
+    "pouring": ("pouring.jsonl", paper.pouring),
+    "translation": ("translation.jsonl", paper.translation),
+    "speed": ("variants.jsonl", speed.speed),
 }
 
 
-def pages(folder: Path) -> list[page.Page]:
+def pages(folder: Path) -> list[Page]:
     """Return the pages of a folder, for the data that are there. Raises UserError for data that make no page."""
-    made = matrix.pages(folder / matrix.NAME)
-    return made + [make(folder) for data, make in STUDIES.values() if (folder / data).exists()]
+    made = []
+    for data, make in PAGES.values():
+        name, _, question = data.partition("/")
+        records = read_records(folder / name)
+        if records and (not question or any(one.get("question") == question for one in records.values())):
+            made.append(make(folder))
+    return made
 
 
-def index(several: list[page.Page]) -> str:
-    """Return the page that lists the others."""
-    lines = "\n".join(f"* [{one.question}]({one.name}.md)" for one in several)
+def index(several: list[Page]) -> str:
+    """Return the front page: a row a page."""
+    rows = [(one.record["question"], *page.answer(one), f"[{one.name}]({one.name}.md)") for one in several]
+    table = page.markdown(Table("", ("question", "answer", "figure", "page"), rows)).replace("]\\(", "](")
     return (
-        "# Results\n\nEach page answers one question. It is made from its data alone, by `make results`.\n"
-        "A finding stands on one page. An interval is one of 95 %.\n\n"
-        f"{lines}\n"
+        "# Results\n\nEach page answers one question. It is made from its data alone, by `make results`. An interval "
+        f"is one of 95 %.\n\n{table}\n\n[What was tried](tried.md) lists studies that have left.\n"
     )
 
 
-def readme(text: str, several: list[page.Page]) -> str:
+def tried(folder: Path) -> str:
+    """Return the page of studies that have answered their question."""
+    rows = [(one["question"], one["answer"], one["figure"], f"`{one['commit']}`")
+            for one in read_records(folder / TRIED).values()]  # fmt: skip
+    table = page.markdown(Table("", ("question", "answer", "figure", "code at"), rows))
+    return (
+        "# What was tried\n\nThese studies have answered their question, and their code has left. It last ran at the "
+        f"commit in the last column. Differences are in points, with intervals of 95 %.\n\n{table}\n"
+    )
+
+
+def readme(text: str, several: list[Page]) -> str:
     """Return the README with the values of the pages that its table links to, written as `name` 1.2 %."""
     lines = text.splitlines(keepends=True)
     for one in several:
-        values = {row[2].removesuffix(f":{DEFAULT}"): row[3] for row in one.rows if row[:2] == SHOWN.get(one.name)}
-        for name, value in values.items():
+        for name, value in one.readme.items():
             pattern = re.compile(rf"(?<={re.escape(name)}`) [\d.]+ %")
             lines = [pattern.sub(f" {value.mean:.1f} %", line) if f"/{one.name}.md" in line else line for line in lines]
     return "".join(lines)
 
 
 def write(folder: Path) -> list[Path]:
-    """Write the pages, their figures and the index of a folder, and return the pages. Raises UserError."""
+    """Write the pages, their figures and the front page of a folder, and return the pages. Raises UserError."""
     several = pages(folder)
+    texts = {one.name: page.text(one) for one in several} | {"README": index(several)}
+    if (folder / TRIED).exists():
+        texts["tried"] = tried(folder)
     for one in several:
         page.draw(one, folder / "figures" / f"{one.name}.png")
-        atomic_write(folder / f"{one.name}.md", page.text(one))
-    atomic_write(folder / "README.md", index(several))
+    for name, text in texts.items():
+        atomic_write(folder / f"{name}.md", text)
     if folder == RESULTS:
         atomic_write(README, readme(README.read_text(encoding="utf-8"), several))
-    return [folder / f"{one.name}.md" for one in several]
+    return [folder / f"{name}.md" for name in texts]
 
 
 if __name__ == "__main__":

@@ -1,118 +1,145 @@
-"""Pages of results: a question, one table, one sentence a finding, one figure."""
+"""Pages of results: a record of `pages.toml`, with the rows and findings that are made from its data."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from anytouch_jax.evaluate.statistics import markdown_table
-from experiments.verdicts import CLAIM, seed_interval
+from experiments.values import Value
 
-Cell = Any  # a word of a text column, or a Value, number or None of a Measure
-
-
-class Value(NamedTuple):
-    """A mean, its 95 % interval (None where there is none), and the number of seeds behind it."""
-
-    mean: float
-    low: float | None = None
-    high: float | None = None
-    seeds: int = CLAIM
-
-    def times(self, factor: float) -> Value:
-        """Return the value in another unit."""
-        low, high = (None if side is None else factor * side for side in (self.low, self.high))
-        return Value(factor * self.mean, low, high, self.seeds)
+RECORDS = tomllib.loads(Path(__file__).with_name("pages.toml").read_text(encoding="utf-8"))
+MOST = 5  # findings of a page
+CAPTION = "The values of the first table with their intervals."
+Row = Sequence[Any]  # a word for a text column, or a Value, number or None for a Measure
 
 
 class Measure(NamedTuple):
-    """A column of values. `interval` adds the columns "from" and "to"; `form` is a format of Python."""
+    """A column of values. `form` is a format of Python."""
 
     title: str
     form: str = ".1f"
-    interval: bool = True
+
+
+class Table(NamedTuple):
+    """Rows under a head, which has a word for a text column and a Measure for a column of values."""
+
+    title: str
+    head: Sequence[str | Measure]
+    rows: Sequence[Row]
+
+
+class Finding(NamedTuple):
+    """A comparison: `change` is `first` minus `second` on `what`."""
+
+    first: str
+    second: str
+    change: Value | None
+    what: str = ""
+    unit: str = " points"
+    form: str = ".1f"
+
+    @property
+    def differs(self) -> bool:
+        """Whether a difference is shown."""
+        return self.change is not None and self.change.differs
+
+    @property
+    def words(self) -> str:
+        """What is found, without numbers."""
+        what = f"{self.what}: " if self.what else ""
+        if self.change is None or not self.differs:
+            return f"{what}no difference is shown between {self.first} and {self.second}"
+        return f"{what}{self.first} is {'above' if self.change.mean > 0 else 'below'} {self.second}"
+
+    @property
+    def figure(self) -> str:
+        """The difference with its interval."""
+        return "" if self.change is None else f"{self.change.shown(f'+{self.form}')}{self.unit}"
 
 
 @dataclass(frozen=True)
 class Page:
-    """The content of a page. `head` has a word for a text column and a Measure for a column of values.
+    """What a page has beyond its record: rows of its tables, and findings, of which the first answers the question.
 
-    `drawn` is the number of text columns that name a row in the figure. `figure` draws another picture than the rows:
-    it is given the path. None draws the rows.
+    A table is rows for the next table of the record, or a Table. Only findings that show a difference are printed.
+    `answer` is another answer with its figure. The picture has the first table, or is drawn by `figure`, which is given
+    the path. `readme` has the values by name that the README repeats, and `words` what the record leaves open.
     """
 
     name: str
-    question: str
-    about: str
-    head: Sequence[str | Measure]
-    rows: Sequence[Sequence[Cell]]
-    findings: Sequence[str]
-    data: Sequence[str]
-    command: str
-    caption: str = "The values of the table with their intervals."
-    figure: Any = None
+    tables: Sequence[Sequence[Row] | Table]
+    findings: Sequence[Finding | str]
+    answer: tuple[str, str] | None = None
+    figure: Callable[[Path], object] | None = None
+    readme: Mapping[str, Value] = field(default_factory=dict)
+    words: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """Its record."""
+        result: Mapping[str, Any] = RECORDS[self.name]
+        return result
+
+    @property
+    def whole(self) -> list[Table]:
+        """Its tables under their heads."""
+        known = iter(self.record["tables"])
+        return [one if isinstance(one, Table) else _headed(next(known), one) for one in self.tables]
 
 
-def over_seeds(values: Sequence[float]) -> Value:
-    """Return the mean over seeds with its interval (Student's t); of two seeds the interval is the two values."""
-    low, high = (min(values), max(values)) if len(values) == 2 else seed_interval(values)
-    return Value(float(np.mean(values)), low, high, len(values))
+def _headed(record: Mapping[str, Any], rows: Sequence[Row]) -> Table:
+    head = [column if isinstance(column, str) else Measure(*column) for column in record["head"]]
+    return Table(record["title"], head, rows)
 
 
-def compare(
-    first: str, second: str, change: Value | None, what: str = "", unit: str = " points", form: str = ".1f"
-) -> str:
-    """Return a sentence that says whether `first` is above `second` on `what`. `change` is the paired difference."""
-    what = f"{what}: " if what else ""
-    if change is None:
-        return f"{what}{first} was not compared with {second}."
-    if change.seeds < CLAIM or change.low is None or change.high is None:
-        return f"{what}there are too few seeds to compare {first} with {second}."
-    if change.low <= 0 <= change.high:
-        return f"{what}no difference is shown between {first} and {second}."
-    word = "above" if change.low > 0 else "below"
-    low, high = sorted((abs(change.low), abs(change.high)))
-    return f"{what}{first} is {abs(change.mean):{form}}{unit} {word} {second} ({low:{form}} to {high:{form}})."
+def sentences(page: Page) -> list[str]:
+    """Return at most MOST findings; the last one counts comparisons without a difference."""
+    compared = [one for one in page.findings if isinstance(one, Finding)]
+    shown = [one if isinstance(one, str) else f"{one.words}, {one.figure}." for one in page.findings
+             if isinstance(one, str) or one.differs]  # fmt: skip
+    if alike := sum(not one.differs for one in compared):
+        shown = [*shown[: MOST - 1], f"{alike} of {len(compared)} comparisons show no difference."]
+    return [one[0].upper() + one[1:] for one in shown[:MOST]]
+
+
+def answer(page: Page) -> tuple[str, str]:
+    """Return the answer of a page and its figure."""
+    first = page.findings[0]
+    words, figure = page.answer or ((first, "") if isinstance(first, str) else (f"{first.words}.", first.figure))
+    return words[0].upper() + words[1:], figure
 
 
 def text(page: Page) -> str:
     """Return a page as Markdown."""
-    head = [column.title if isinstance(column, Measure) else column for column in _columns(page.head)]
-    align = "".join("l" if isinstance(column, str) and column not in SIDES else "r" for column in _columns(page.head))
-    rows = [_cells(page.head, row) for row in page.rows]
-    files = ", ".join(f"[`{name}`]({name})" for name in page.data)
-    findings = "\n".join(f"* {one[0].upper()}{one[1:]}" for one in page.findings)
+    one = page.record
+    found = "\n".join(f"* {sentence}" for sentence in sentences(page))
+    tables = "\n".join(f"## {table.title}\n\n{markdown(table)}\n" for table in page.whole)
+    files = ", ".join(f"[`{name}`]({name})" for name in one["data"])
     return (
-        f"# {page.question}\n\n{page.about}\n\n## Findings\n\n{findings}\n\n## Values\n\n"
-        f"{markdown_table(head, rows, align)}\n\n![{page.caption}](figures/{page.name}.png)\n\n{page.caption}\n\n"
-        f"Data: {files}. Command: `{page.command}`.\n"
+        f"# {one['question']}\n\n{one['about'].format(**page.words)}\n\n## Findings\n\n{found}\n\n{tables}\n"
+        f"![{one.get('caption', CAPTION)}](figures/{page.name}.png)\n\nData: {files}. Command: `{one['command']}`.\n"
     )
 
 
-SIDES = ("from", "to")
+def markdown(table: Table) -> str:
+    """Return a table as Markdown. A cell has the mean and its interval."""
+    titles = [column.title if isinstance(column, Measure) else column for column in table.head]
+    align = "".join("r" if isinstance(column, Measure) else "l" for column in table.head)
+    rows = [[_cell(*one) for one in zip(table.head, row, strict=True)] for row in table.rows]
+    return markdown_table(titles, rows, align)
 
 
-def _columns(head: Sequence[str | Measure]) -> list[str | Measure]:
-    result: list[str | Measure] = []
-    for column in head:
-        result += [column, *(SIDES if isinstance(column, Measure) and column.interval else ())]
-    return result
-
-
-def _cells(head: Sequence[str | Measure], row: Sequence[Cell]) -> list[str]:
-    result = []
-    for column, cell in zip(head, row, strict=True):
-        if isinstance(column, str):
-            result.append(cell)
-            continue
-        value = cell if isinstance(cell, Value) else Value(*([cell] if cell is not None else [float("nan")]))
-        sides = (value.mean, value.low, value.high) if column.interval else (value.mean,)
-        result += ["-" if one is None or np.isnan(one) else f"{one:{column.form}}" for one in sides]
-    return result
+def _cell(column: str | Measure, cell: Any) -> str:
+    if isinstance(column, str):
+        return cell or ""
+    value = cell if isinstance(cell, Value) else Value(float("nan") if cell is None else float(cell))
+    return "-" if np.isnan(value.mean) else value.shown(column.form)
 
 
 def draw(page: Page, path: Path) -> None:
@@ -120,25 +147,22 @@ def draw(page: Page, path: Path) -> None:
     if page.figure is not None:
         page.figure(path)
         return
-    from matplotlib.figure import Figure
+    from anytouch_jax.evaluate.plots import panels, write_figure
 
-    from anytouch_jax.evaluate.plots import write_figure
-
-    texts = [i for i, column in enumerate(page.head) if isinstance(column, str)]
-    panels = [(i, column) for i, column in enumerate(page.head) if isinstance(column, Measure) and column.interval]
-    names = [", ".join(row[i] for i in texts if row[i]) for row in page.rows]
-    size = (3.2 + 0.05 * max(map(len, names)) + 2.4 * len(panels), 0.9 + 0.2 * len(names))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-    colours = {name: f"C{i % 10}" for i, name in enumerate(dict.fromkeys(row[texts[-1]] for row in page.rows))}
-    for axis, (column, measure) in zip(axes, panels, strict=True):
-        for place, row in enumerate(page.rows):
-            value = row[column]
-            if isinstance(value, Value):
-                colour = colours[row[texts[-1]]]
-                axis.scatter(value.mean, place, s=22, color=colour, zorder=3)
-                if value.low is not None and value.high is not None:
-                    axis.plot([value.low, value.high], [place, place], color=colour, linewidth=1.4, zorder=2)
+    _, head, rows = page.whole[0]
+    texts = [i for i, column in enumerate(head) if isinstance(column, str)]
+    shown = [(i, column) for i, column in enumerate(head)
+             if isinstance(column, Measure) and any(isinstance(row[i], Value) for row in rows)]  # fmt: skip
+    names = [", ".join(row[i] for i in texts if row[i]) for row in rows]
+    colours = {name: f"C{i % 10}" for i, name in enumerate(dict.fromkeys(row[texts[-1]] for row in rows))}
+    width = 2.4 + (3 + 0.05 * max(map(len, names))) / len(shown)
+    figure, (axes,) = panels(1, len(shown), width, 0.9 + 0.2 * len(names), sharey=True)
+    for axis, (column, measure) in zip(axes, shown, strict=True):
+        for place, row in enumerate(rows):
+            if isinstance(value := row[column], Value):
+                sides = [value.mean if side is None else side for side in (value.low, value.high)]
+                axis.plot(sides, [place, place], color=colours[row[texts[-1]]], linewidth=1.4)
+                axis.scatter(value.mean, place, s=22, color=colours[row[texts[-1]]], zorder=3)
         axis.set_title(measure.title, fontsize=9)
         axis.tick_params(axis="x", labelsize=8)
         axis.grid(alpha=0.25)

@@ -20,12 +20,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from anytouch_jax.config import preset
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import plots
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.image_tower import image_tower_encoder
 from experiments.pouring import bounds as pouring_bounds
@@ -152,29 +149,12 @@ def do_seed(seed: int) -> None:
             write(name, mode, trials, source, since, loss=round(policy.loss, 4))
 
 
-def draw_demonstration(figures: Path) -> None:
-    """Draw frames of the gel while the cylinder empties, and their change from the standing cylinder."""
-    one = pouring_policy.demonstrate(TASK, 0, 1, side=224, late=0)
-    last = int(one.steps[0]) - 1
-    moments = np.array([2, *np.linspace(5, last, 5).round().astype(int)])
-    assert one.frames is not None
-    change = [one.frames[m, 0].astype(np.float32) - one.frames[2, 0].astype(np.float32) for m in moments]
-    standing = ["standing", *(f"{one.mass[m, 0]:.0f} g left, {one.tilt[m, 0]:.0f} deg" for m in moments[1:])]
-    plots.sample_grid(
-        figures / "pouring_frames.png",
-        [[one.frames[m, 0] for m in moments], [np.clip(128 + 2 * c, 0, 255).astype(np.uint8) for c in change]],
-        ["frame", "change x 2"],
-        standing,
-    )
-
-
 def main() -> None:
     if unknown := set(RUNS) - set(table.PAPER):
         raise UserError(f"RUNS names {', '.join(table.PAPER)}, not {', '.join(sorted(unknown))}")
     enable_compilation_cache()
     for seed in SEEDS:
         do_seed(seed)
-    draw_demonstration(OUT / "figures")
 
 
 if __name__ == "__main__":

@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
+from experiments.pages.page import Finding
 from experiments.pouring.physics import Task
-from experiments.pouring.trials import Error, Trials, error
+from experiments.pouring.trials import Trials, error
 from experiments.records import read_records
-from experiments.verdicts import seed_interval
+from experiments.values import Value, over_seeds
 
 Array = npt.NDArray[Any]
 MODES = ("fine-tuned", "frozen")
@@ -35,17 +36,13 @@ DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the othe
 
 
 class Row(NamedTuple):
-    """One row and mode over all its seeds: `poured` g of each run, `runs` names them ("seed/number"), and `lost` runs
-    were never turned back."""
+    """One row and mode over all its seeds: `poured` g of each run, and `runs` names them ("seed/number")."""
 
     name: str
     mode: str
     poured: Array
     runs: tuple[str, ...]
     target: float
-    sources: tuple[str, ...]
-    settings: str
-    lost: int
 
     @property
     def wrong(self) -> Array:
@@ -53,13 +50,11 @@ class Row(NamedTuple):
         return np.abs(self.poured - self.target)
 
     @property
-    def error(self) -> Error:
+    def error(self) -> Value:
         """Its mean, with the 95 % interval over seeds (Student's t), whose runs share one policy; of one seed over
         its runs."""
         each = _by_seed(self.wrong, self.runs)
-        if len(each) < 2:
-            return error(self.poured, self.target)
-        return Error(float(self.wrong.mean()), *seed_interval(each))
+        return over_seeds(each) if len(each) > 1 else error(self.poured, self.target)
 
 
 def _by_seed(values: Array, runs: Sequence[str]) -> tuple[float, ...]:
@@ -124,26 +119,37 @@ def _row(name: str, mode: str, parts: Sequence[Mapping[str, Any]]) -> Row:
     parts = sorted(parts, key=lambda part: part["seed"])
     runs = tuple(f"{part['seed']}/{number}" for part in parts for number in range(len(part["poured"])))
     poured = np.concatenate([np.asarray(part["poured"], np.float64) for part in parts])
-    sources = tuple(dict.fromkeys(part["source"] for part in parts))
-    lost = sum(int(steps) >= part.get("limit", Task().limit) for part in parts for steps in part["steps"])
-    return Row(name, mode, poured, runs, float(parts[0]["target"]), sources, settings.pop(), lost)
+    return Row(name, mode, poured, runs, float(parts[0]["target"]))
 
 
-class Difference(NamedTuple):
-    """Mean of a paired difference of errors in g, the mean of every seed `each`, and the 95 % interval over seeds
-    (Student's t): the runs of a seed share one learned policy."""
+def difference(a: Row, b: Row) -> Value:
+    """Return the error of `a` minus that of `b` in g over the runs that both have, with its interval over seeds.
 
-    mean: float
-    low: float | None
-    high: float | None
-    each: tuple[float, ...]
-
-
-def difference(a: Row, b: Row) -> Difference:
-    """The error of `a` minus that of `b` over the runs that both have."""
+    The runs of a seed share one learned policy. Raises UserError without a run in common.
+    """
     shared = [run for run in a.runs if run in b.runs]
     if not shared:
         raise UserError(f"rows {a.name} and {b.name} have no run in common; run them with the same seeds")
     change = np.array([a.wrong[a.runs.index(run)] - b.wrong[b.runs.index(run)] for run in shared])
-    each = _by_seed(change, shared)
-    return Difference(float(change.mean()), *seed_interval(each), each)
+    return over_seeds(_by_seed(change, shared))
+
+
+def compared(path: Path, data: str) -> tuple[list[tuple[Any, ...]], list[Finding]]:
+    """Return the rows of a table of results, and AnyTouch compared with the others. `data` names the file."""
+    found = {(row.name, row.mode): row for row in read_rows(path)}
+
+    def change(first: tuple[str, str], other: str) -> Value | None:
+        a, b = found.get(first), found.get((other, "bound" if other == "blind" else first[1]))
+        return difference(a, b) if a and b else None
+
+    rows: list[tuple[Any, ...]] = []
+    for name, mode in ((name, mode) for name in TITLES for mode in (*MODES, "bound") if (name, mode) in found):
+        tried = name in PAPER
+        theirs = PAPER[name][MODES.index(mode)] if tried else None
+        against = change((name, mode), "blind") if tried else None
+        rows.append((data, TITLES[name], mode if tried else "", found[name, mode].error, against, theirs))
+    others = [(other, mode) for other in ("blind", "t3", "none", "static") for mode in MODES]
+    return rows, [
+        Finding("AnyTouch", TITLES[other], change(("anytouch", mode), other), f"error, {data}, {mode}", " g")
+        for other, mode in others
+    ]

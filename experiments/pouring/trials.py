@@ -17,6 +17,7 @@ from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.recorder import stack_trees
 from experiments.pouring import physics, render
 from experiments.pouring.physics import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
+from experiments.values import Value
 
 Array = npt.NDArray[Any]
 SENSOR = render.SENSOR.name
@@ -216,18 +217,10 @@ def run(
     return Trials(out, steps, choices, actions, mass, tilt, rate, np.stack(frames) if film else None)
 
 
-class Error(NamedTuple):
-    """Mean of |poured - target| in g over runs, with its 95 % interval (None for a single run)."""
-
-    mean: float
-    low: float | None
-    high: float | None
-
-
-def error(poured: Array, target: float) -> Error:
-    """The mean error of runs `poured` (n,) g with a bootstrap interval over the runs."""
+def error(poured: Array, target: float) -> Value:
+    """The mean of |poured - target| over runs `poured` (n,) g, with a bootstrap interval (None for a single run)."""
     wrong = np.abs(np.asarray(poured, np.float64) - target)
-    return Error(float(wrong.mean()), *mean_interval(wrong, np.arange(len(wrong))))
+    return Value(float(wrong.mean()), *mean_interval(wrong, np.arange(len(wrong))))
 
 
 def write_film(path: Path, trials: Trials, task: Task, *, every: int = 4) -> None:

@@ -12,18 +12,6 @@ TABLE1: dict[str, Row] = {
     "gelsight+gelslim+digit": (79.61, 79.10, 48.00, 75.57),
     "gelsight+gelslim+digit+gelsight_mini": (79.70, 79.40, 48.75, 75.66),
 }
-# Columns: TAG material, roughness, hardness, Feel grasp (Table 2), OF 1.0, OF 2.0 (Table 3).
-TABLES23: dict[str, Row] = {
-    "no_pretraining": (52.96, 84.09, 88.34, 72.37, 41.00, 73.16),
-    "unitouch": (None, None, None, None, 47.25, 75.29),  # UniTouch with a dagger: on what the data allow
-    "tlv_link": (74.12, 85.94, 94.18, 76.97, None, None),  # TLV-Link with a dagger
-    "anytouch": (80.82, 86.74, 94.68, 80.53, 49.62, 76.02),
-}
-# UniTouch and AnyTouch on the data of UniTouch; the same columns.
-RESTRICTED: dict[str, Row] = {
-    "unitouch": (61.3, None, None, 82.3, 41.3, 85.4),
-    "no_matching": (82.74, 86.01, 94.24, 87.17, 46.50, 85.87),
-}
 # Table 4, pouring: mean error with the encoder fine-tuned and frozen; less is better.
 TABLE4: dict[str, Row] = {
     "no_pretraining": (5.22, 49.1),
@@ -43,4 +31,3 @@ TABLE6: dict[str, Row] = {
     "no_dynamic": (77.93, 79.28, 48.62, 75.70),
     "no_universal": (80.79, 79.03, 48.40, 75.40),
 }
-FEEL_AFTER = (80.53, 99.0)  # AnyTouch with frames during the grasp, and after it (caption of Table 2)

@@ -7,7 +7,7 @@ Data: `own` is the data set of each sensor by itself (touches of no other sensor
 are its TacQuad (four sensors at one place, by one motion or by hand), `other` a data set never trained on, of other
 individuals (more than half of its kinds, primitive by texture by material, occur in `own` as well). Objects held out
 are held out in `own`, `fine` and `coarse` alike (`work.check_objects` refuses sizes at which they are not). `own` also
-has DuraGel, which only the runs `seen` train on: it is the unseen sensor, as Taxim and TACTO are in the paper.
+has DuraGel, which no run trains on: it is the unseen sensor, as Taxim and TACTO are in the paper.
 """
 
 from __future__ import annotations
@@ -24,12 +24,10 @@ from anytouch_jax.config import UNIVERSAL, Config, Stack, preset, presets
 SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")  # in the order in which Table 1 adds them
 UNSEEN = "duragel"
 ALIGNED = ("fine", "coarse")
-RESTRICTED = ("gelsight", "digit")  # of the control of Table 2
-REAL = "real"
 STACK, DECODER = Stack(128, 2, 4, 512), Stack(128, 2, 4, 512)
 LABELS = ("name", "seeds")  # fields of a size that no single run hangs on
 # Versions of how a question is scored, 1 where it is not named. 2: contact frames are those with force.
-SCORING = dict.fromkeys(("q1", "q3", "ablations", "restricted", "dynamics", "new_sensor"), 2)
+SCORING = dict.fromkeys(("q1", "q3", "ablations"), 2)
 
 
 @dataclass(frozen=True)
@@ -44,11 +42,10 @@ class Size:
     weights. So `match_head` is "cosine", each touch against all others of the batch, on a share `match_keep` of the
     patches and weighed by `match_weight`, all of a step's touches to be found by one sensor (`negatives`), so that the
     sensor is no clue; only frames in contact are drawn, those with a share `contact` of the
-    strongest of their recording (`anytouch contact`), as the paper's are contact frames (those of `real` are not
-    marked, and all drawn); a row of question q2 has the paper's head. The softmax starts mild (`temperature`): a sharp
-    one only punishes untrained towers. Touches are background-subtracted (except for `real`, where one in ten has
-    no background), and their colours are not jittered, since colours show slopes. `seeds` are those of questions
-    whose sign is claimed; the others take the first.
+    strongest of their recording (`anytouch data contact`), as the paper's are contact frames; a row of question q2 has
+    the paper's head. The softmax starts mild (`temperature`): a sharp one only punishes untrained towers. Touches are
+    background-subtracted, and their colours are not jittered, since colours show slopes. `seeds` are those of
+    questions whose sign is claimed; the others take the first.
     """
 
     name: str = "full"
@@ -194,20 +191,16 @@ def scenes(size: Size) -> tuple[Scenes, ...]:
 
 
 def training(
-    size: Size, recipe: str, seed: int, *, sensors: Sequence[str] = SENSORS, aligned: bool = True,
-    extra: Sequence[str] = (), data: dict[str, Any] | None = None,
+    size: Size, recipe: str, seed: int, *, sensors: Sequence[str] = SENSORS, aligned: bool = True
 ) -> Training:  # fmt: skip
     """Return the last stage of a recipe (`anytouch_jax.config.presets`) on the data of `sensors`.
 
     `aligned` adds the touches that several sensors share.
-
-    `extra` more manifests by name; `data` more settings of the data, for both stages.
     """
-    manifests = (*(f"own/{name}" for name in sensors), *(ALIGNED if aligned else ()), *extra)
+    manifests = (*(f"own/{name}" for name in sensors), *(ALIGNED if aligned else ()))
     last: Training | None = None
     for stage in presets.find_baseline(recipe).stages:
         config = _config(size, stage, seed, sensors, manifests)
-        config = replace(config, data=replace(config.data, **(data or {})))
         last = Training(presets.apply_baseline(recipe, config), last)
     if last is None:
         raise ValueError(f"{recipe} is not trained")
@@ -242,19 +235,13 @@ def _config(size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests
     )
 
 
-def leaves(size: Size, *, real: bool = True) -> list[Leaf]:
-    """Every run of the matrix, in order: all questions with one seed, then with the next; last `real` data."""
-    result: list[Leaf] = []
-    for number, seed in enumerate(size.seeds):
-        for question, name, model, tower in _of_seed(size, seed, first=number == 0):
-            result.append(Leaf(question, name, seed, model, size, tower))
-    if real:
-        # A sensor of the pack is in none of these tables, and one frame in ten has no picture of the untouched gel.
-        real_data = {"background": "keep", "on_bad_sample": "skip"}
-        for seed in size.seeds:
-            model = training(size, "anytouch", seed, extra=(REAL,), data=real_data)
-            result.append(Leaf("real", "anytouch", seed, model, size))
-    return result
+def leaves(size: Size) -> list[Leaf]:
+    """Every run of the matrix, in order: all questions with one seed, then with the next."""
+    return [
+        Leaf(question, name, seed, model, size, tower)
+        for number, seed in enumerate(size.seeds)
+        for question, name, model, tower in _of_seed(size, seed, first=number == 0)
+    ]
 
 
 def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, Training | None, bool]]:
@@ -281,15 +268,7 @@ def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, 
     for count in range(1, len(SENSORS) + 1):
         name = "+".join(SENSORS[:count])
         yield "q1", name, own("no_matching", sensors=SENSORS[:count], aligned=False), False
-    for name in ("static_only", "anytouch"):
-        yield "dynamics", name, own(name), False
-    yield "grasp", "anytouch", whole, False
     if first:
-        yield "new_sensor", "left_out", whole, False
-        yield "new_sensor", "seen", own("anytouch", sensors=(*SENSORS, UNSEEN)), False
-        for name in ("unitouch", "no_matching"):
-            yield "restricted", name, own(name, sensors=RESTRICTED, aligned=False), False
-        yield "dynamics", "no_flips", own("anytouch", data={"flip": 0.0}), False
         paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0, negatives="any")  # the paper's
         yield "q2", "matched_mlp", training(paired, "anytouch", seed), False
 

@@ -1,4 +1,4 @@
-"""Runs of the matrix as tables read them, and what paired seeds say of a sign."""
+"""Runs of the matrix as the pages read them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ import numpy as np
 from anytouch_jax.errors import UserError
 from experiments.records import read_records
 from experiments.tables.plan import LABELS
-from experiments.verdicts import CLAIM, verdict
-from experiments.verdicts import seed_interval as interval
+from experiments.values import Value, over_seeds, shared_difference
 
-NO_SIGN = "no sign in the paper"
+UNSEEDED = ("pixels", "contact")  # models that nothing is drawn for
 NOT_NOTED = "not noted"
 Seeds = dict[int, float]
 
@@ -40,35 +39,16 @@ class Run:
 
 
 class Column(NamedTuple):
-    """What a column of a table reads: `view`, `task` and `metric` of a row; `factor` brings it to what is printed.
+    """What a column of a table reads: `view`, `task` and `metric` of a row; `factor` brings it to what is printed."""
 
-    `better` is -1 where less is better.
-    """
-
-    title: str
     view: str
     task: str
     metric: str = "accuracy"
     factor: float = 100.0
-    better: int = 1
-    digits: int = 1
-
-
-class Change(NamedTuple):
-    """A difference over seeds: mean, 95 % interval (Student's t), and a word for its sign."""
-
-    word: str
-    mean: float | None = None
-    low: float | None = None
-    high: float | None = None
-    seeds: int = 0
 
 
 def read(path: Path) -> list[Run]:
-    """Return the runs of a file of results, in the order of their keys.
-
-    Raises UserError for a record that is no run of the matrix.
-    """
+    """Return the runs of a file of results, in the order of keys. Raises UserError for a record that is no run."""
     runs = []
     for key, about in read_records(path).items():
         try:
@@ -114,47 +94,30 @@ def differences(records: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(f"{name} {' and '.join(sorted(several))}" for name, several in result.items() if len(several) > 1)
 
 
-def values(runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest") -> Seeds:
-    """Return {seed: printed value} of a cell."""
-    return {
-        run.seed: column.factor * float(row["mean"])
-        for run in runs
-        if (run.question, run.name) == (question, name) and (row := run.row(column, protocol)) is not None
-    }
+class Matrix:
+    """The runs of one question. Raises UserError for runs that make no table together."""
 
+    def __init__(self, path: Path, question: str) -> None:
+        self.runs = [run for run in read(path) if run.question == question]
+        if wrong := differences([run.about for run in self.runs]):
+            raise UserError(f"{path}: runs of {question} differ ({wrong}). Make them again in one folder.")
 
-def over_seeds(several: list[float]) -> tuple[float | None, float | None]:
-    """The 95 % interval of Student's t; of two seeds, where it is as wide as the scale, the two themselves."""
-    return (min(several), max(several)) if len(several) == 2 else interval(several)
+    def seeds(self, name: str, columns: Sequence[Column]) -> Seeds:
+        """Return {seed: mean over columns of one unit}, for seeds that have all of them."""
+        found = {run.seed: [run.row(column) for column in columns] for run in self.runs if run.name == name}
+        return {
+            seed: columns[0].factor * float(np.mean([row["mean"] for row in rows if row is not None]))
+            for seed, rows in sorted(found.items())
+            if None not in rows
+        }
 
+    def value(self, name: str, columns: Sequence[Column]) -> Value | None:
+        """Return the score of a model; what is not trained has one value and no interval."""
+        several = [*self.seeds(name, columns).values()]
+        return (Value(several[0]) if name in UNSEEDED else over_seeds(several)) if several else None
 
-def spread(
-    runs: Sequence[Run], question: str, name: str, column: Column, protocol: str = "honest"
-) -> tuple[float, float | None, float | None] | None:
-    """Mean of a cell and its interval: over seeds, with one seed that of the run itself (over test objects)."""
-    result = values(runs, question, name, column, protocol)
-    if not result:
-        return None
-    mean, (low, high) = float(np.mean(list(result.values()))), over_seeds(list(result.values()))
-    if len(result) == 1:
-        run = next(one for one in runs if (one.question, one.name, one.seed) == (question, name, *result))
-        row = run.row(column, protocol) or {}
-        low, high = (None if row.get(side) is None else column.factor * row[side] for side in ("low", "high"))
-    return mean, low, high
-
-
-def change(first: Seeds, second: Seeds, expected: float | None, better: int = 1) -> Change:
-    """`first` minus `second`, seed by seed, against the sign `expected` (of what is better, None: none is known).
-
-    "agrees" and "disagrees" need an interval that leaves zero out, and CLAIM seeds; otherwise "undecided", "1 seed, no
-    claim", or "not run".
-    """
-    seeds = sorted(first.keys() & second.keys())
-    if not seeds:
-        return Change("not run")
-    several = [better * (first[seed] - second[seed]) for seed in seeds]
-    mean, (low, high) = float(np.mean(several)), over_seeds(several)
-    shown = [None if one is None else better * one for one in (mean, low, high)]
-    sides = shown if better > 0 else [shown[0], shown[2], shown[1]]
-    word = NO_SIGN if not expected and len(seeds) >= CLAIM else verdict(low, high, len(seeds), wanted=expected or 1.0)
-    return Change(word, *sides, len(seeds))  # type: ignore[arg-type]
+    def change(self, first: str, second: str, columns: Sequence[Column]) -> Value | None:
+        """Return the score of `first` minus that of `second`, seed by seed."""
+        a, b = self.seeds(first, columns), self.seeds(second, columns)
+        b = dict.fromkeys(a, next(iter(b.values()))) if second in UNSEEDED and b else b
+        return shared_difference(a, b) if first != second else None

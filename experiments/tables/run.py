@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import jax
 
 from anytouch_jax.errors import UserError
+from experiments.command import with_status
 from experiments.pages import __main__ as pages
 from experiments.tables import plan
 from experiments.tables.execute import check_results, execute, is_done
@@ -36,7 +37,6 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
     about = "folder of the pages and of matrix.jsonl (default: experiments/results; with --quick or --set in --work)"
     parser.add_argument("--out", type=Path, help=about)
-    parser.add_argument("--real", type=Path, help="manifest of real touch (default: ../shared/real_touch/manifest.csv)")
     return parser.parse_args(argv)
 
 
@@ -68,7 +68,8 @@ def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
 
 def main(argv: Sequence[str] | None = None) -> int:
     asked = options(argv)
-    try:
+
+    def run() -> int:
         chosen = choose(asked)
         if asked.plan:
             return _print(chosen)
@@ -76,21 +77,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _render(chosen)
         check_results(chosen.leaves, chosen.out / "matrix.jsonl")
         return _execute(chosen)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; the same command continues", file=sys.stderr)
-        return 130
+
+    return with_status(run)
 
 
 class Chosen(NamedTuple):
-    """The runs asked for, the folders of data and of results, and the manifest of real touch (it need not exist)."""
+    """The runs asked for, and the folders of data and of results."""
 
     leaves: Sequence[plan.Leaf]
     folder: Path
     out: Path
-    real: Path
 
 
 def choose(asked: argparse.Namespace) -> Chosen:
@@ -98,17 +94,13 @@ def choose(asked: argparse.Namespace) -> Chosen:
     size = size_of(asked.quick, asked.set)
     folder = asked.work or ROOT / "runs" / ("matrix-quick" if asked.quick else "matrix")
     out = asked.out or (folder / "results" if asked.quick or asked.set else ROOT / "experiments" / "results")
-    real = (asked.real or ROOT.parent / "shared" / "real_touch" / "manifest.csv").resolve()
-    leaves = plan.leaves(size, real=real.exists())
+    leaves = plan.leaves(size)
     if asked.only:
         known = list(dict.fromkeys(leaf.question for leaf in leaves))
-        wrong = sorted(set(asked.only) - set(known))
-        if wrong[:1] == [plan.REAL]:
-            raise UserError(f"the question real needs real touch, and there is no {real}; name its manifest, REAL=")
-        if wrong:
+        if wrong := sorted(set(asked.only) - set(known)):
             raise UserError(f"there is no question {wrong[0]!r}; choose among {', '.join(known)}")
         leaves = [leaf for leaf in leaves if leaf.question in asked.only]
-    return Chosen(leaves, folder, out, real)
+    return Chosen(leaves, folder, out)
 
 
 def _print(chosen: Chosen) -> int:
@@ -131,11 +123,7 @@ def _execute(chosen: Chosen) -> int:
     for leaf in chosen.leaves[:1]:  # all are of one size
         check_objects(leaf.size)
     enable_compilation_cache()
-    there = chosen.real.exists()
-    if not there:
-        print(f"there is no {chosen.real}: the question `real` is not run")
-    work = Work(chosen.folder, real=chosen.real if there else None)
-    result = execute(chosen.leaves, work, chosen.out / "matrix.jsonl")
+    result = execute(chosen.leaves, Work(chosen.folder), chosen.out / "matrix.jsonl")
     print(f"{len(result.made)} runs made, {len(result.kept)} were there, {len(result.failed)} failed")
     for name, error in result.failed.items():
         print(f"failed: {name}: {error}", file=sys.stderr)

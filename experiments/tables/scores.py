@@ -1,39 +1,32 @@
 """What is measured of a run's encoder, question by question: rows {view, task, protocol, metric, mean, low, high, ...}.
 
 A view says of which data and how: `seen` (the sensors trained on), `seen, other data` (a data set never trained on),
-`unseen` and `unseen, other data` (a sensor never trained on), `clips`, `stills`, and so on.
+`unseen` and `unseen, other data` (a sensor never trained on), `clips`.
 """
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import geometry, retrieval
 from anytouch_jax.evaluate.feature_cache import (
     FeatureSource,
     background_difference,
-    encoder_digest,
     encoder_features,
     pixel_features,
 )
 from anytouch_jax.evaluate.probing import probe_tasks
 from anytouch_jax.evaluate.retrieval import contact_vector
-from anytouch_jax.evaluate.tasks import Task
-from anytouch_jax.files import atomic_write
 from experiments.image_tower import image_tower_encoder
-from experiments.tables import cuts, plan, real
+from experiments.tables import cuts, plan
 from experiments.tables.plan import Leaf, Training
 
 Row = dict[str, Any]
@@ -81,18 +74,17 @@ def quiet(_: str) -> None:
 
 
 def _probes(
-    leaf: Leaf, work: Places, name: str, tasks: Sequence[str | Task], view: str, encoder: Encoder | None, **options: Any
+    leaf: Leaf, work: Places, name: str, tasks: Sequence[str], view: str, encoder: Encoder | None, **options: Any
 ) -> list[Row]:
     """Results of `probe_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
     table = manifests.read(work.folder / dataset / file)
     shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows} | options
-    encoding = {name: shared.pop(name) for name in ("pooling", "join", "universal") if name in shared}
-    encoding |= {"order": shared.get("order", "right"), "folder": work.folder / "cache"}
+    cache = work.folder / "cache"
     if encoder is None:
-        source = FeatureSource(PIXELS, pixel_features(table, **encoding), None, "common")
+        source = FeatureSource(PIXELS, pixel_features(table, folder=cache), None, "common")
     else:
-        source = FeatureSource("encoder", encoder_features(encoder, table, **encoding), encoder)
+        source = FeatureSource("encoder", encoder_features(encoder, table, folder=cache), encoder)
     results = probe_tasks([source], table, tasks, controls=False, log=quiet, **shared)["results"]
     return [{"view": view} | {key: value for key, value in one.items() if key != "features"} for one in results]
 
@@ -121,61 +113,19 @@ def _q1(leaf: Leaf, work: Places) -> dict[str, Any]:
 
 
 def _q3(leaf: Leaf, work: Places) -> dict[str, Any]:
-    rows = _four_columns(leaf, work, plan.SENSORS, STATIC) + _dynamic(leaf, work, ("clips",))
-    return {"rows": rows + (_read(leaf, work) if leaf.name in READ else []), "data": ["own", "other"]}
-
-
-READ = ("anytouch", "untrained")  # the models whose features are read in every way
-WAYS: Mapping[str, dict[str, Any]] = {
-    "kNN": {"heads": ("knn",)},
-    "gradient": {"heads": ("gradient",)},
-    "class token": {"pooling": "class"},
-    "mean of patches": {"pooling": "mean"},
-}
-
-
-def _read(leaf: Leaf, work: Places) -> list[Row]:
-    """The static tasks and the form by other heads and poolings than the tables': views `read: <way>`."""
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH}
-    encoder, labels = encoder_of(leaf, work), (*STATIC, FORM)
-    return [
-        row
-        for way, options in WAYS.items()
-        for row in _probes(leaf, work, f"own/{cuts.WHOLE}", labels, f"read: {way}", encoder, **sensors, **options)
-    ]
+    rows = _four_columns(leaf, work, plan.SENSORS, STATIC) + _dynamic(leaf, work)
+    return {"rows": rows, "data": ["own", "other"]}
 
 
 def _ablations(leaf: Leaf, work: Places) -> dict[str, Any]:
     return {"rows": _four_columns(leaf, work, plan.SENSORS), "data": ["own", "other"]}
 
 
-def _restricted(leaf: Leaf, work: Places) -> dict[str, Any]:
-    return {"rows": _four_columns(leaf, work, plan.RESTRICTED, STATIC), "data": ["own", "other"]}
-
-
-_VIEWS: Mapping[str, dict[str, Any]] = {
-    "clips": {"frames": 3},
-    "stills": {"frames": 1},
-    "shuffled": {"frames": 3, "order": "shuffled"},
-    "repeated": {"frames": 3, "order": "repeated"},
-}
-
-
-def _dynamic(leaf: Leaf, work: Places, views: Sequence[str]) -> list[Row]:
+def _dynamic(leaf: Leaf, work: Places) -> list[Row]:
+    """The dynamic tasks, from clips."""
     encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH}
-    return [
-        row
-        for view in views
-        for row in _probes(leaf, work, f"own/{cuts.WHOLE}", DYNAMIC, view, encoder, **_VIEWS[view], **sensors)
-    ]
-
-
-def _dynamics(leaf: Leaf, work: Places) -> dict[str, Any]:
-    """Dynamic tasks under every view, and what the same training makes of static ones."""
-    sensors = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH}
-    static = _probes(leaf, work, f"own/{cuts.WHOLE}", STATIC, "static", encoder_of(leaf, work), **sensors)
-    return {"rows": _dynamic(leaf, work, tuple(_VIEWS)) + static, "data": ["own"]}
+    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH, "frames": 3}
+    return _probes(leaf, work, f"own/{cuts.WHOLE}", DYNAMIC, "clips", encoder, **options)
 
 
 def _q2(leaf: Leaf, work: Places) -> dict[str, Any]:
@@ -190,9 +140,7 @@ def _q2(leaf: Leaf, work: Places) -> dict[str, Any]:
         found = {"class token": contact_vector(table, rows)}
     else:
         encoder = encoder_of(leaf, work)
-        both = embed_rows(encoder, table, rows, pooling="both", log=quiet)[1]
-        width = encoder.config.model.embed
-        found = {"class token": both[:, :width], "patches": both[:, width:]}
+        found = {"class token": embed_rows(encoder, table, rows, log=quiet)[1]}
     metric: retrieval.Metric = "euclidean" if leaf.name == CONTACT else "cosine"
     results = [row for view, values in found.items() for row in _space(table, rows, values, view, metric)]
     return {"rows": results, "points": _points(table, rows, found["class token"], leaf.seed), "data": ["own"]}
@@ -238,83 +186,6 @@ def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list
     ]
 
 
-def _grasp(leaf: Leaf, work: Places) -> dict[str, Any]:
-    """Held or slipped, from the frame in which the press is done and from the last frame."""
-    encoder, found = encoder_of(leaf, work), []
-    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "max_rows": None, "protocol": BOTH}
-    for view in ("during", "after"):
-        task = Task("grasp", "label.held", which="all", where=(("label.moment", view),))
-        found += _probes(leaf, work, f"own/{cuts.GRASP}", (task,), view, encoder, **options)
-    return {"rows": found, "data": ["own", "own/grasp"]}
-
-
-FRAMES = (4, 18, 100)  # labelled frames of the new sensor
-NEW_SENSOR = "label.material"  # the label that tokens are fitted to
-NOTHING = "universal, 0 unlabelled"  # the view without any frame of the new sensor
-
-
-def _new_sensor(leaf: Leaf, work: Places) -> dict[str, Any]:
-    """Probes of a sensor left out of training, with universal tokens and with tokens fitted to a few labelled frames.
-
-    The labelled frames also join the training rows of the probe. All views are tested on the same touches.
-    """
-    assert leaf.model is not None
-    run, own = work.run_of(leaf.model), work.folder / "own"
-    encoder, read = load_encoder(run), ["own/static", f"own/{plan.UNSEEN}"]
-    options = {"test_sensors": (plan.UNSEEN,), "max_rows": None, "protocol": BOTH}
-    if leaf.name == "seen":
-        rows = _probes(leaf, work, f"own/{cuts.STATIC}", STATIC, "seen", encoder, **options)
-        return {"rows": rows, "data": read}
-    rows = _probes(leaf, work, labelled(own, 0), STATIC, NOTHING, encoder, **options)
-    for count in FRAMES:
-        name = labelled(own, count)
-        fitted = load_encoder(adapted(work, run, work.folder / name, count))
-        for tokens, one in (("universal", encoder), ("fitted", fitted)):
-            rows += _probes(leaf, work, name, STATIC, f"{tokens}, {count} labelled", one, **options)
-    return {"rows": rows, "data": [*read, *(f"own/{Path(labelled(own, count)).stem}" for count in (0, *FRAMES))]}
-
-
-def adapted(work: Places, run: Path, data: Path, frames: int) -> Path:
-    """Return the run with tokens fitted to so many labelled frames of the new sensor (`anytouch adapt`).
-
-    It is stored with the trainings, and made again when the run's weights or the data change. Raises UserError when
-    `anytouch adapt` fails.
-    """
-    out = work.folder / "trained" / f"{run.name}-adapted{frames}"
-    note, of = out / "adapted.json", {"run": encoder_digest(load_encoder(run)), "data": cuts.content_hash(data)}
-    if not (note.exists() and json.loads(note.read_text(encoding="utf-8")) == of):
-        shutil.rmtree(out, ignore_errors=True)  # begun and not finished
-        table = manifests.read(data)
-        mine = (table.text_column("sensor") == plan.UNSEEN) & (table.text_column("split") == "train")
-        count = min(frames, int(mine.sum()))  # toy sizes have fewer
-        words = ["--model", run, "--data", data, "--sensor", plan.UNSEEN, "--frames", count, "--labels", NEW_SENSOR]
-        if main([str(word) for word in ("adapt", *words, "--out", out)]):
-            raise UserError(f"anytouch adapt failed with {count} frames of {plan.UNSEEN}. Its message is above.")
-        atomic_write(note, json.dumps(of) + "\n")
-    return out
-
-
-def labelled(folder: Path, frames: int) -> str:
-    """Return a manifest whose training rows are those of the other sensors and so many of the new one.
-
-    It is written into `folder` first; its name is relative to the folder's parent.
-    """
-    path = folder / f"new{frames}.parquet"
-    if not path.exists():
-        table = manifests.read(folder / cuts.STATIC)
-        new, split = table.text_column("sensor") == plan.UNSEEN, table.text_column("split")
-        mine = np.flatnonzero(new & (split == "train"))
-        keep = ~new | (split == "test")
-        keep[np.random.default_rng(0).permutation(mine)[:frames]] = True
-        cuts.cut(table, np.flatnonzero(keep), path)
-    return f"{folder.name}/{path.name}"
-
-
-def _real(leaf: Leaf, work: Places) -> dict[str, Any]:
-    return {"rows": real.rows(leaf, encoder_of(leaf, work), work.manifest(plan.REAL)), "data": [plan.REAL]}
-
-
 _OF: Mapping[str, Callable[[Leaf, Places], dict[str, Any]]] = {
-    "q1": _q1, "q2": _q2, "q3": _q3, "ablations": _ablations, "restricted": _restricted, "dynamics": _dynamics,
-    "grasp": _grasp, "new_sensor": _new_sensor, "real": _real,
+    "q1": _q1, "q2": _q2, "q3": _q3, "ablations": _ablations,
 }  # fmt: skip

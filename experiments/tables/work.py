@@ -40,10 +40,10 @@ DONE, BEGUN = "done.json", "begun.json"
 
 
 class Work:
-    """`execute.Work` in the folder `folder`; `real` is the manifest of real touch, or None without it."""
+    """`execute.Work` in the folder `folder`."""
 
-    def __init__(self, folder: Path, *, real: Path | None = None, log: Log = print) -> None:
-        self.folder, self.real, self.log = folder, real, log
+    def __init__(self, folder: Path, *, log: Log = print) -> None:
+        self.folder, self.log = folder, log
 
     def ready(self, leaf: Leaf) -> set[str]:
         sets = {one.name for one in plan.scenes(leaf.size) if self.made(one, leaf.size)}
@@ -54,11 +54,7 @@ class Work:
         return self.folder / "trained" / one.key
 
     def manifest(self, name: str) -> Path:
-        """The file of a manifest by its name in a plan: a data set, data set/sensor, or `real`."""
-        if name == plan.REAL:
-            if self.real is None:
-                raise UserError("there is no real data: name its manifest with REAL=")
-            return self.real
+        """The file of a manifest by its name in a plan: a data set, or data set/sensor."""
         dataset, _, part = name.partition("/")
         return self.folder / dataset / (f"{part}.parquet" if part else cuts.WHOLE)
 
@@ -83,7 +79,7 @@ class Work:
     def _trained(self, one: Training, sets: set[str]) -> bool:
         """Whether a training is finished, on the data that are there now."""
         of = noted(self.run_of(one) / DONE).get("of")
-        needed = {name.partition("/")[0] for name in one.manifests} - {plan.REAL}
+        needed = {name.partition("/")[0] for name in one.manifests}
         return of is not None and needed <= sets and of == self._contents(one)
 
     def _contents(self, one: Training) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Encoders of the translation study: trained without the objects of its pairs, and their cross-sensor retrieval.
+"""Encoders of the translation study: trained without the objects of its pairs.
 
 The paper takes the coarse data of the objects that a translation is tested on out of pre-training (App. "Cross-sensor
 generation"). Here every row of such an object is left out.
@@ -9,17 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
-from anytouch_jax.evaluate import retrieval
-from anytouch_jax.evaluate.retrieval import deepest_rows
-from anytouch_jax.train.progress import silent
 from anytouch_jax.weights.tree import interpolate
-from experiments.records import read_records, write_record
 from experiments.tables import cuts, plan
 from experiments.tables.plan import Size, Training
 from experiments.tables.work import Work
@@ -76,23 +69,3 @@ def encoders(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, En
     first, second = result["stage1"], result["anytouch"]
     params = interpolate(first.params, second.params, SHARE)
     return result | {"anytouch_between": replace(second, params=params, source=f"{second.source}-between")}
-
-
-RETRIEVAL = "found_"  # how keys of retrieval records begin
-
-
-def score_retrieval(results: Path, name: str, seed: int, encoder: Encoder, source: str, table: Manifest) -> None:
-    """Write how often an encoder ranks the same touch by another sensor first, and among the first five of 50.
-
-    Nothing is done when `results` has a record of this encoder, named by `source`.
-    """
-    key = f"{RETRIEVAL}{name}_{seed}"
-    if read_records(results).get(key, {}).get("encoder") == source:
-        return
-    rows = deepest_rows(table, table.rows_of("test"))
-    features = {name: embed_rows(encoder, table, rows, log=silent)[1]}
-    scored = retrieval.cross_sensor_retrieval(table, features, rows, centre=(True,))
-    pooled = next(one.per_query for one in scored if one.query_sensor == retrieval.ALL)
-    assert pooled is not None
-    shares = {part: float(np.mean(getattr(pooled, part))) for part in ("top1", "top5")}
-    write_record(results, key, {"encoder": source, "queries": len(pooled.top1)} | shares)

@@ -22,7 +22,6 @@ from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.command import run_script
 from experiments.translation import generator, pairs, training
-from experiments.translation.pictures import picture_grid
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,6 @@ def _fit(options: Translate) -> int:
         encoder, x, y, source=options.source, target=options.target, val=val, options=fit, log=_log
     )
     error, mean = training.errors(made, test_x, test_y).mean(), training.mean_errors(made, test_y).mean()
-    picture_grid(home / "pairs.png", made, test_x, test_y)
     report = {"error": error, "mean target": mean, "test pairs": len(test_x), "losses": losses}
     report["critic"] = made.design.has_critic
     atomic_write(home / "report.json", json.dumps(report, indent=2, allow_nan=False) + "\n")

@@ -16,12 +16,17 @@ TRANSLATIONS = {
     "digit-tac3d": "DIGIT to Tac3D",
 }
 PIXELS = "pixels"
+TRANSLATORS = {
+    "anytouch": "AnyTouch", "anytouch_between": "AnyTouch, half-way to stage 2", "stage1": "AnyTouch, stage 1",
+    "anytouch_layer_decay": "AnyTouch, layer decay", "t3": "T3-style", PIXELS: "pixels, no encoder",
+}  # fmt: skip
+TUNES = {"frozen": "frozen", "fine": "fine-tuned", "scratch": "from scratch"}
 OURS = ("anytouch", "stage1")  # its variants, and its stage 1
 
 
 def runs_of(results: Path) -> dict[str, Record]:
-    """Return the records of translations by key, without those of retrieval and of overlap."""
-    return {key: record for key, record in read_records(results).items() if "settings" in record}
+    """Return the records of translations by key."""
+    return read_records(results)
 
 
 def one_table(several: Sequence[dict[str, Any]], results: Path) -> None:

@@ -7,15 +7,13 @@ smallest. Each translation is compared with copying the mean target, and with a 
 
 `make translation` trains the encoders too, one of each a seed, on the scenes of `make experiments` without the objects
 of the pairs (`encoders.py`). In the environment: `RUNS="anytouch=runs/stage2 t3=a,b,c"` takes encoders of yours (a
-path, or one a seed). `REMAINING="coarse.parquet ..."` writes `coarse_remaining.parquet` next to each and stops: train
-encoders of yours on that. `STEPS1=3000` gives stage 1 so many steps, and its table a separate page. `STUDY=`, `WORK=`
+path, or one a seed). `STEPS1=3000` gives stage 1 so many steps, and its table a separate page. `STUDY=`, `WORK=`
 and `OUT=` are folders of the scenes, the pairs and the results. `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` change the
 size, and `QUICK=1` is a trial of minutes.
 """
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from dataclasses import asdict, replace
@@ -33,15 +31,13 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim.dataset import simulate, version
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
-from experiments.records import read_records, write_record
+from experiments.records import write_record
 from experiments.tables import env, plan
 from experiments.tables.work import Work
 from experiments.translation import encoders as own_encoders
 from experiments.translation import pairs, training
-from experiments.translation.encoders import score_retrieval
 from experiments.translation.generator import Fit
 from experiments.translation.networks import Translation
-from experiments.translation.pictures import picture_grid
 from experiments.translation.settings import PIXELS, TASKS, one_table, runs_of
 
 QUICK = env.switch("QUICK")
@@ -62,16 +58,6 @@ SCENES = Scenes(
     seed=7, grade="fine", units="one", frames=6, size=128, vision=0.0, text=0.0,
 )  # fmt: skip
 PAIRS = WORK / f"pairs-{TOUCHES}-{version(SCENES.sensors)}"
-
-
-def overlap(encoder: Encoder, table: manifests.Manifest) -> str:
-    """How many objects of the pairs the encoder was trained on in its last stage, if its manifests are still there."""
-    files = [Path(path) for path in encoder.config.data.manifests]
-    if not files or not all(file.is_file() for file in files):
-        return "unknown"
-    learned = manifests.read(files)
-    trained = {learned.value(int(row), "object") for row in learned.rows_of("train")}
-    return str(len(trained & set(table.column("object").to_pylist()) - {None}))
 
 
 def view_of(encoder: Encoder) -> tuple[int, bool]:
@@ -98,8 +84,8 @@ def settings(
 
 
 def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, key: str) -> None:
-    """Train, score on held-out objects and write the record of a run. The first seed also draws its pictures."""
-    (x, y), val, (test_x, test_y), shown = data
+    """Train, score on held-out objects and write the record of a run."""
+    (x, y), val, (test_x, test_y) = data
     begun = time.perf_counter()
     field = () if y.dtype == np.uint8 else y.shape[1:]
     shape = None if encoder else Translation(replace(preset("tiny").model, image_size=about["size"]), field=field)
@@ -120,8 +106,6 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, key: str)
         "seconds": round(seconds, 1),
         "critic": made.design.has_critic,
     }
-    if about["fit"]["seed"] == SEEDS[0]:
-        picture_grid(OUT / "figures" / f"{NAME}-{key}.png", made, test_x[shown], test_y[shown])
     write_record(RESULTS, key, record)
     print(f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
 
@@ -145,17 +129,8 @@ def make_all() -> None:
     """Make every missing run, task by task: frames are read once a task."""
     simulate(SCENES, PAIRS, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
     table = manifests.read(PAIRS / "manifest.parquet")
-    if os.environ.get("REMAINING"):
-        for word in os.environ["REMAINING"].split():
-            own_encoders.write_remaining(Path(word), table)
-        raise SystemExit(0)
     known = encoders(table)
     plain = view_of(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
-    if not (RUNS or QUICK):  # a trial has too few touches for galleries of 50
-        fine = manifests.read(Work(STUDY).manifest("fine"))
-        for name, seed in product(known, SEEDS):
-            one = known[name][seed]
-            score_retrieval(RESULTS, name, seed, one, source_of(one), fine)
     content = {task: of_sensors(table, task) for task in TASKS}
     wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in own_encoders.NOT_TUNED]
     plans = [*wanted, (PIXELS, "scratch")]
@@ -167,9 +142,6 @@ def make_all() -> None:
         every[stem] = (about, encoder)
     others = [record["settings"] for key, record in runs_of(RESULTS).items() if key not in every]
     one_table([*(about for about, _ in every.values()), *others], RESULTS)
-    before = read_records(RESULTS).get("overlap", {})  # of encoders that have rows already
-    shared = {name: sorted({overlap(one, table) for one in of_seed.values()}) for name, of_seed in known.items()}
-    write_record(RESULTS, "overlap", before | {name: " to ".join(several) for name, several in shared.items()})
     for source, target in TASKS:
         mine = [(*one, key) for key, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
         done = runs_of(RESULTS)
@@ -178,10 +150,8 @@ def make_all() -> None:
             continue
         split = pairs.find_pairs(table, source, target)
         data = [pairs.read_pairs(table, part, plain[0], subtract=plain[1]) for part in split]
-        force = [table.value(int(row), "label.force") for row in split.test.source]
-        shown = np.argsort(force)[-len(force) // 3 :: max(1, len(force) // 18)]  # firm presses, there is more to see
         for about, encoder, key in todo:
-            one_run(about, encoder, (*data, shown), key)
+            one_run(about, encoder, data, key)
 
 
 def main() -> None:

@@ -26,7 +26,13 @@ from anytouch_jax.nn.functional import build
 
 MAKEFILE = (ROOT / "Makefile").read_text()
 FILES = ["README.md", *(file.relative_to(ROOT).as_posix() for file in sorted((ROOT / "docs").rglob("*.md")))]
-MADE = ("docs/results/", "docs/reference/", "docs/contributing.md", "docs/changelog.md")  # by docs/generate.py
+MADE = (
+    "docs/results/",
+    "docs/tutorials/",
+    "docs/reference/",
+    "docs/contributing.md",
+    "docs/changelog.md",
+)  # by docs/generate.py
 PAGES = {name: (ROOT / name).read_text() for name in FILES if not name.startswith(MADE)}
 TEXT = "\n".join(PAGES.values())
 BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\n+^```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)

@@ -8,6 +8,7 @@ are not prose.
 from __future__ import annotations
 
 import ast
+import json
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -18,12 +19,13 @@ WORDS, NUMBERS, CELL, README_WORDS = 30, 3, 25, 700
 PAGES = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "experiments/**/*.md")
 MADE = (
     "docs/results/",
+    "docs/tutorials/",
     "docs/reference/",
     "docs/contributing.md",
     "docs/changelog.md",
 )  # copies, and help texts
 CODE = ("src/**/*.py",)
-NOTEBOOKS = ("experiments/notebooks/[0-9]*.py",)
+NOTEBOOKS = ("experiments/notebooks/*.ipynb",)
 PHRASES = (
     "told", "tells", "tell", "less the", "anew", "likewise", "of its own", "as it is", "as they are",
     "where there is none", "where there are none", "so far as", "by heart",
@@ -170,15 +172,11 @@ def message_faults(file: Path, text: str) -> Iterator[Fault]:
 
 
 def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
-    """Yield the faults of the text cells of a notebook in the percent form, whose lines begin with a hash."""
-    lines, inside = [], False
-    for line in text.splitlines():
-        if line.startswith("# %%"):
-            inside = line.startswith("# %% [markdown]")
-            lines.append("")
-        else:
-            lines.append(line[2:] if inside and line.startswith("# ") else "")
-    yield from page_faults(file, "\n".join(lines))
+    """Yield the faults of the text cells of a notebook. A line counts within the text of all of them."""
+    cells = [cell["source"] for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"]
+    yield from page_faults(
+        file, "\n\n".join(source if isinstance(source, str) else "".join(source) for source in cells)
+    )
 
 
 def faults(root: Path) -> list[Fault]:

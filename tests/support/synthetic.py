@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.pages.matrix import VIEWS
 from experiments.records import read_records, write_record
-from experiments.tables import plan, real, scores
-from experiments.tables.columns import FORM, FOUR, GRASP, SIX, SPACE, STATIC, dynamic
+from experiments.tables import plan
+from experiments.tables.columns import FORM, FOUR, MOVING, SIX
 from experiments.tables.results import Column
 
 Mean = Callable[[str, str, int, str, str], float]  # (question, name, seed, view, task) -> 0..1
@@ -37,7 +36,7 @@ def change(results: Path, key: str, **values: Any) -> None:
 
 
 def record_of(leaf: plan.Leaf, mean: Mean = level) -> dict[str, Any]:
-    rows = [row for view, task, metric in _columns(leaf) for row in _rows(leaf, view, task, metric, mean)]
+    rows = [row for one in COLUMNS[leaf.question] for row in _rows(leaf, one.view, one.task, one.metric, mean)]
     return {
         "question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity,
         "simulator": plan.simulator(), "settings": plan.settings(leaf.size), "scoring": plan.scoring(leaf.question),
@@ -47,34 +46,17 @@ def record_of(leaf: plan.Leaf, mean: Mean = level) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
-    columns: tuple[Column, ...] = {
-        "q1": (*FOUR, *FORM), "ablations": (*FOUR, *FORM), "q2": SPACE, "q3": (*SIX, *FORM, *dynamic("clips")),
-        "restricted": SIX, "grasp": GRASP,
-        "dynamics": (*(one for view in VIEWS for one in dynamic(view)), *STATIC),
-    }.get(leaf.question, ())  # fmt: skip
-    result = [(one.view, one.task, one.metric) for one in columns]
-    if leaf.question == "new_sensor":
-        views = ["seen"] if leaf.name == "seen" else [scores.NOTHING]
-        for count in scores.FRAMES if leaf.name != "seen" else ():
-            views += [f"universal, {count} labelled", f"fitted, {count} labelled"]
-        result = [(view, task, "accuracy") for view in views for task in scores.STATIC]
-    if leaf.question == "real":
-        views = [
-            real.OURS,
-            real.UNTRAINED,
-            real.PIXELS,
-            f"{real.OURS} - {real.PIXELS}",
-            f"{real.OURS} - {real.UNTRAINED}",
-        ]
-        result = [(view, task, "accuracy") for task in ("object", "slip, objects left out") for view in views]
-    return result
+SILHOUETTES = [f"silhouette by {one}" for one in ("sensor", "object")]
+COLUMNS = {
+    "q1": (*FOUR, *FORM), "ablations": (*FOUR, *FORM), "q3": (*SIX, *FORM, *MOVING),
+    "q2": (Column("class token", "top-1", "share"), *(Column("class token", one, one) for one in SILHOUETTES)),
+}  # fmt: skip
 
 
 def _rows(leaf: plan.Leaf, view: str, task: str, metric: str, mean: Mean) -> list[dict[str, Any]]:
     value = mean(leaf.question, leaf.name, leaf.seed, view, task)
     shared = {"view": view, "task": task, "metric": metric, "test": 100}
-    both = ("honest",) if leaf.question in ("q2", "real") else ("honest", "published")
+    both = ("honest",) if leaf.question == "q2" else ("honest", "published")
     return [shared | {"protocol": one, "mean": value, "low": value - 0.05, "high": value + 0.05} for one in both]
 
 

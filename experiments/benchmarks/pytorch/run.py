@@ -23,13 +23,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from anytouch_jax.evaluate import statistics
 from anytouch_jax.train.step import merge
 from anytouch_jax.weights import convert, load, safetensors
 from experiments.benchmarks import machine, speed, variants
-from experiments.benchmarks.pareto import pareto
 from experiments.benchmarks.pytorch.keys import renamed
+from experiments.benchmarks.run import table_of
 from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
+from experiments.records import write_record
 
 ROOT = Path(__file__).resolve().parents[3]
 WHAT = ("stage1", "stage2", "embed")
@@ -233,45 +233,6 @@ def timed(
     return rows
 
 
-def page_of(numbers: dict[str, Any]) -> str:
-    """Return the page of a comparison from its numbers alone."""
-    preset = numbers["preset"]
-    parts = [f"# Ours against PyTorch\n\n{machine.Machine(**numbers['machine']).sentence()}\n"]
-    for name, found in numbers["results"].items():
-        parts += [section_of(name, found, preset), f"![{name}, preset {preset}]({_figure(name, preset)})\n"]
-    return "\n".join(parts)
-
-
-def _figure(name: str, preset: str) -> str:
-    return f"figures/torch_{name.replace(' ', '_')}_{preset}.png"
-
-
-def section_of(name: str, found: dict[str, Any], preset: str) -> str:
-    """Return the table of a workload."""
-    heads = ("", "time / ours float32 (IQR)", "best / best", "ms", "samples/s", "GFLOP/s", "of float32 peak")
-    heads += ("error: output", "loss", "gradient", "p99 ms")
-    rows = [
-        [
-            row["name"],
-            f"{row['ratio']:.2f} ({row['ratio_iqr']:.2f})",
-            f"{row['best_ratio']:.2f}",
-            f"{1e3 * row['seconds']:.1f}",
-            f"{row['samples_per_second']:.4g}",
-            f"{row['gflops']:.1f}",
-            f"{100 * row['peak_share']:.0f} %",
-            *(speed.format_error(row.get(k)) for k in ("output", "loss", "gradient")),
-            f"{1e3 * row['p99']:.1f}",
-        ]
-        for row in found["rows"]
-    ]
-    failed = "".join(f"\nPyTorch, {rival}: {note}\n" for rival, note in found["failed"].items())
-    about, first = found["about"], found["rows"][0]
-    line = f"torch {about['torch']} ({about['threads']} threads), transformers {about['transformers']}"
-    title = f"## {name}, preset {preset}, batch {round(first['samples_per_second'] * first['seconds'])}"
-    table = statistics.markdown_table(heads, rows)
-    return f"{title}\n\n{table}\n{failed}\n{line}, {about['parameters'] / 1e6:.1f} M parameters.\n"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="*", default=WHAT, metavar="|".join(WHAT))
@@ -280,7 +241,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int)
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--rivals", nargs="*", default=list(RIVALS), choices=RIVALS)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser.add_argument("--out", type=Path, default=Path("runs/bench/torch.jsonl"), help="file of results")
     parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
     options = parser.parse_args()
     if unknown := set(options.what) - {*WHAT}:
@@ -290,23 +251,14 @@ def main() -> None:
     here = machine.describe()
     if here.load > 0.3 * here.cores:
         print(f"load {here.load:.1f}: PyTorch's threads suffer more than ours from other work; wait", file=sys.stderr)
-    numbers: dict[str, Any] = {"machine": dataclasses.asdict(here), "preset": options.preset, "rounds": options.rounds}
-    numbers["results"] = {}
+    about = {"machine": dataclasses.asdict(here), "preset": options.preset, "rounds": options.rounds}
+    key, results = f"{options.preset}, {here.vectors}", dict[str, Any]()
     for what in options.what:
         for work in workloads(what, options.preset, options.batch):
-            found = compare(work, options.torch, options.rounds, options.peak_size, tuple(options.rivals))
-            numbers["results"][work.name] = found
-            print(section_of(work.name, found, options.preset), flush=True)
-            wrong = {row["name"]: row.get("gradient", row["output"]) for row in found["rows"]}
-            points = {
-                row["name"]: (row["ratio"], wrong[row["name"]]) for row in found["rows"] if wrong[row["name"]] > 0
-            }
-            y = f"relative error of the {'gradient' if work.trains else 'output'}, against float64"
-            title = f"{work.name}, preset {options.preset}"
-            figure = options.out / _figure(work.name, options.preset)
-            pareto(figure, points, x="time / ours in float32", y=y, title=title)
-    path = speed.write_page(options.out, f"torch_{options.preset}", page_of(numbers), numbers)
-    print(path, file=sys.stderr)
+            results[work.name] = compare(work, options.torch, options.rounds, options.peak_size, tuple(options.rivals))
+            write_record(options.out, key, about | {"results": results})
+            print(f"### {work.name}\n\n{table_of(results[work.name]['rows'])}\n", flush=True)
+    print(f"{options.out}, {key}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Search by touch: the nearest of many stored features to a frame, a clip or a sentence.
 
 The index is a features file of `anytouch embed`. Search is exact, by numpy. With `approximate`, FAISS (an extra)
-compares a query with the features of the nearest cells alone. `experiments/benchmarks/search.py` measures both.
+compares a query with the features of the nearest cells alone.
 """
 
 from __future__ import annotations

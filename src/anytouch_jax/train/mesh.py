@@ -92,7 +92,7 @@ def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
 def donated() -> tuple[int, ...]:
     """Return the arguments of a step that are donated, for `jax.jit(donate_argnums=...)`: the state, on an accelerator.
 
-    On a CPU none is: XLA would copy every parameter and moment (`experiments.benchmarks.run stage1` measures it).
+    On a CPU none is: XLA would copy every parameter and moment (`experiments/results/tried.md`).
     """
     return () if jax.default_backend() == "cpu" else (0,)
 

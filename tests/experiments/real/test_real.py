@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from experiments.pages.studies import backgrounds, real
 
 from anytouch_jax.errors import UserError
-from experiments.pages.studies import backgrounds, real
 from experiments.real import features, run, scores, training
 from experiments.real.recordings import Recordings
 from experiments.records import write_record

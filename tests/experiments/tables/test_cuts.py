@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.data.manifest import manifest as manifests
-from experiments.tables import cuts, plan, scores
+from experiments.tables import cuts, plan
 
 SENSORS = ("digit", "gelsight", plan.UNSEEN)
 FRAMES = 11
@@ -15,7 +15,7 @@ SPLITS = ("train", "val", "test")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Nine touches by three sensors: hold, slide and twist take turns, every second one slips half-way."""
+    """Nine touches by three sensors."""
     root = tmp_path_factory.mktemp("own")
     rows: list[dict[str, object]] = []
     for touch in range(9):
@@ -25,9 +25,7 @@ def folder(tmp_path_factory):
                 rows.append(
                     {"path": f"{name}-{frame}.jpg", "sensor": sensor, "sequence": name, "frame_index": frame,
                      "split": SPLITS[touch // 3], "touch": str(touch), "unit": name, "object": f"o{touch}",
-                     "label.force": float(5 - abs(frame - 5)), "label.motion": ("hold", "slide", "twist")[touch % 3],
-                     "label.slip": 0.9 if frame > 8 or (touch % 2 and frame == 6) else 0.1,
-                     "label.material": "ab"[touch % 2]}
+                     "label.force": float(5 - abs(frame - 5))}
                 )  # fmt: skip
             rows.append(
                 rows[-1] | {"path": f"{name}.jpg", "sequence": f"{name}-b", "split": "background", "touch": None}
@@ -49,24 +47,3 @@ def test_static_is_the_deepest_frame_of_each_recording(folder):
     table = manifests.read(folder / cuts.STATIC)
     assert len(table) == 9 * len(SENSORS) and set(np.asarray(table.column("frame_index"))) == {5}
     assert table.present("touch").all()
-
-
-def test_a_grasp_is_held_or_slipped_and_seen_twice(folder):
-    table = manifests.read(folder / cuts.GRASP)
-    moment, frame = table.text_column("label.moment"), np.asarray(table.column("frame_index"))
-    assert set(table.text_column("label.motion")) == {"slide", "twist"}
-    assert len(table) == 2 * 6 * len(SENSORS)
-    assert set(frame[moment == "during"]) == {4} and set(frame[moment == "after"]) == {8}  # 3.5 rounds to even
-    slipped = np.array([int(touch) % 2 == 1 for touch in table.text_column("touch")])
-    assert np.array_equal(table.text_column("label.held") == "slipped", slipped)
-
-
-@pytest.mark.parametrize("frames", [0, 2])
-def test_labelled_frames_of_a_new_sensor_stand_in_train(folder, frames):
-    name = scores.labelled(folder, frames)
-    assert name == f"{folder.name}/new{frames}.parquet"
-    table = manifests.read(folder.parent / name)
-    sensor, split = table.text_column("sensor"), table.text_column("split")
-    assert np.sum((sensor == plan.UNSEEN) & (split == "train")) == frames
-    assert np.sum((sensor == plan.UNSEEN) & (split == "val")) == 0
-    assert np.sum((sensor == plan.UNSEEN) & (split == "test")) == 3 and np.sum(sensor == "digit") == 9

@@ -55,12 +55,12 @@ def test_mistakes_are_one_sentence(monkeypatch, name, word, sentence):
 
 
 def test_a_page_that_is_run_as_a_script_ends_with_the_sentence(monkeypatch):
-    monkeypatch.setenv("RUN", "nix")
+    monkeypatch.setenv("RUNS", "nix")
     result = subprocess.run(
-        [sys.executable, "-m", "experiments.tables.long_clips"], capture_output=True, text=True, check=False, cwd=ROOT
+        [sys.executable, "-m", "experiments.pouring.study"], capture_output=True, text=True, check=False, cwd=ROOT
     )
     lines = result.stderr.splitlines()
-    assert result.returncode == 1 and len(lines) == 1 and lines[0].startswith("long_clips.py: ") and "nix" in lines[0]
+    assert result.returncode == 1 and len(lines) == 1 and lines[0].startswith("study.py: ") and "nix" in lines[0]
 
 
 def test_a_page_that_is_interrupted_says_so():

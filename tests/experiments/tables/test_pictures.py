@@ -13,15 +13,6 @@ from experiments.tables.results import read
 LEAVES = plan.leaves(plan.FULL)
 
 
-@pytest.mark.slow
-def test_every_picture_is_drawn(tmp_path):
-    synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.seed < 2])
-    runs = read(tmp_path / "matrix.jsonl")
-    for draw in (pictures.q1, pictures.q2, pictures.q3, pictures.ablations, pictures.dynamics, pictures.new_sensor):
-        picture = cv2.imread(str(draw(runs, tmp_path / f"{draw.__name__}.png")))
-        assert picture.shape[1] > 500 and picture.std() > 20
-
-
 def test_the_four_spaces_have_a_mark_for_every_touch_and_sensor(tmp_path):
     synthetic.write(tmp_path / "matrix.jsonl", [leaf for leaf in LEAVES if leaf.question == "q2" and leaf.seed == 0])
     runs = read(tmp_path / "matrix.jsonl")

@@ -38,11 +38,11 @@ def test_recipes_train_the_stages_that_they_say():
             assert after.init is before and (before.config.stage, after.config.stage) == (1, 2)
 
 
-def test_the_unseen_sensor_is_in_no_training_but_one():
+def test_the_unseen_sensor_is_in_no_training():
     for leaf in LEAVES:
         for one in leaf.trainings:
             names = [*one.config.data.manifests, *one.config.model.sensors]
-            assert any(plan.UNSEEN in name for name in names) == (leaf.name == "seen"), leaf.key
+            assert not any(plan.UNSEEN in name for name in names), leaf.key
 
 
 def test_table_1_adds_sensors_without_touches_felt_twice():
@@ -51,8 +51,6 @@ def test_table_1_adds_sensors_without_touches_felt_twice():
         assert one.config.data.manifests == tuple(f"own/{sensor}" for sensor in name.split("+"))
         assert one.config.model.sensors == (*name.split("+"), "universal")
         assert not set(one.config.data.manifests) & set(plan.ALIGNED)
-    rivals = [BY_NAME["restricted", name, 0].model.config for name in ("unitouch", "no_matching")]
-    assert rivals[0].data.manifests == rivals[1].data.manifests and rivals[0].model.sensors == rivals[1].model.sensors
 
 
 def test_claims_have_three_seeds():
@@ -84,10 +82,3 @@ def test_a_result_hangs_on_how_its_question_is_scored(monkeypatch):
     monkeypatch.setitem(plan.SCORING, "q2", 7)
     for leaf in plan.leaves(plan.FULL):
         assert (leaf.identity == again[leaf.key]) == (leaf.question != "q2")
-
-
-def test_without_real_data_there_is_no_real_run():
-    assert {leaf.question for leaf in LEAVES} - {leaf.question for leaf in plan.leaves(plan.FULL, real=False)} == {
-        "real"
-    }
-    assert plan.REAL in BY_NAME["real", "anytouch", 0].model.config.data.manifests

@@ -16,9 +16,9 @@ from experiments.tables import run as matrix
 
 
 def test_the_plan_is_printed_with_what_is_done(tmp_path, capsys):
-    leaves = plan.leaves(plan.QUICK, real=False)
+    leaves = plan.leaves(plan.QUICK)
     synthetic.write(tmp_path / "matrix.jsonl", leaves[:2])
-    words = ["--plan", "--quick", "--out", str(tmp_path), "--real", str(tmp_path / "none.csv")]
+    words = ["--plan", "--quick", "--out", str(tmp_path)]
     assert matrix.main(words) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(leaves)
@@ -28,12 +28,12 @@ def test_the_plan_is_printed_with_what_is_done(tmp_path, capsys):
 
 
 def test_tables_are_rendered_from_the_files_alone(tmp_path, capsys):
-    leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "grasp"]
+    leaves = [leaf for leaf in plan.leaves(plan.FULL) if leaf.question == "q1"]
     synthetic.write(tmp_path / "matrix.jsonl", leaves)
     assert matrix.main(["--render", "--out", str(tmp_path), "--work", str(tmp_path / "never")]) == 0
-    text = (tmp_path / "grasp.md").read_text()
-    assert capsys.readouterr().out.strip() == str(tmp_path / "grasp.md") and not (tmp_path / "never").exists()
-    assert "| during the grasp | 50.0 | 50.0 | 50.0 | - | - | - | 80.53 |" in text
+    text = (tmp_path / "sensors.md").read_text()
+    assert str(tmp_path / "sensors.md") in capsys.readouterr().out and not (tmp_path / "never").exists()
+    assert "| material | gelsight | 50.0 [50.0, 50.0] | - | - |" in text
 
 
 def test_sizes_can_be_changed():
@@ -51,7 +51,6 @@ def test_sizes_can_be_changed():
         (["--set", "match_head=foo"], "--set match_head=foo: choose among mlp, cosine, none"),
         (["--set", "seeds=0,0,1"], "--set seeds=0,0,1: each seed once"),
         (["--only", "q9"], "there is no question 'q9'; choose among q2, q3"),
-        (["--only", "real", "--real", "no.csv"], "needs real touch, and there is no "),
     ],
 )
 def test_mistakes_are_one_sentence(words, sentence, capsys):
@@ -74,8 +73,8 @@ def test_objects_held_out_of_one_data_set_are_held_out_of_the_other(tmp_path, ca
 
 
 def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(tmp_path, capsys):
-    words = ["--quick", "--work", str(tmp_path / "work"), "--out", str(tmp_path), "--real", str(tmp_path / "no.csv")]
-    path, leaves = tmp_path / "matrix.jsonl", plan.leaves(plan.QUICK, real=False)
+    words = ["--quick", "--work", str(tmp_path / "work"), "--out", str(tmp_path)]
+    path, leaves = tmp_path / "matrix.jsonl", plan.leaves(plan.QUICK)
     settings = plan.settings(plan.QUICK)
     for change in ({"simulator": 1}, {"settings": settings | {"steps1": 999}}):
         synthetic.write(path, leaves[:2])
@@ -88,7 +87,7 @@ def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(t
 
 
 def test_results_of_a_question_that_is_not_run_may_be_of_another_simulator(tmp_path):
-    leaves, path = plan.leaves(plan.QUICK, real=False), tmp_path / "matrix.jsonl"
+    leaves, path = plan.leaves(plan.QUICK), tmp_path / "matrix.jsonl"
     synthetic.write(path, leaves[:1])
     synthetic.change(path, leaves[0].key, simulator=1)
     execute.check_results([leaf for leaf in leaves if leaf.question != leaves[0].question], path)
@@ -120,24 +119,20 @@ def test_changed_sizes_are_written_next_to_the_data():
 def test_the_whole_way_at_the_smallest_size(tmp_path, capsys):
     sizes = {"own": 24, "fine": 24, "coarse": 24, "other": 24, "objects": 24, "frames": 6, "steps1": 2, "steps2": 2}
     words = ["--quick", "--set", *(f"{name}={number}" for name, number in sizes.items())]
-    words += ["--only", "q2", "grasp", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
-    words += ["--real", str(tmp_path / "none.csv")]
+    words += ["--only", "q2", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
     assert matrix.main(words) == 0, capsys.readouterr().err
     records = read_records(tmp_path / "out" / "matrix.jsonl")
     ways = ("aligned", "contact", "masked", "matched", "matched_mlp", "pixels", "untrained")
-    assert [*records] == ["grasp-anytouch-0", *(f"q2-{way}-0" for way in ways)]
-    stored, grasp = records["q2-matched-0"], records["grasp-anytouch-0"]
+    assert [*records] == [f"q2-{way}-0" for way in ways]
+    stored = records["q2-matched-0"]
     assert [one["stage"] for one in stored["trained"]] == [1, 2] and stored["trained"][0]["config"]["run"]["steps"] == 2
     assert all(len(value) == 64 for value in stored["data"].values()) and stored["machine"] and stored["source"]
     assert {row["task"] for row in stored["rows"]} >= {"top-1", "silhouette by sensor"} and len(stored["points"]) > 4
-    assert [row["view"] for row in grasp["rows"]] == ["during"] * 2 + ["after"] * 2  # by both protocols
-    assert grasp["data"].keys() >= {"own/grasp"}
-    assert all(len(row["values"]) == plan.QUICK.refits and row["groups"] > 1 for row in grasp["rows"])
     assert records["q2-untrained-0"]["untrained"]["model"]["embed"] == 32
     assert records["q2-pixels-0"]["untrained"] is None
     trained = sorted((tmp_path / "work" / "trained").iterdir())
     assert len(trained) == 4  # one stage 1, three stages 2
     capsys.readouterr()
     assert matrix.main(words) == 0  # all is there
-    assert "0 runs made, 8 were there, 0 failed" in capsys.readouterr().out
-    assert (tmp_path / "out" / "space.md").exists() and (tmp_path / "out" / "figures" / "grasp.png").exists()
+    assert "0 runs made, 7 were there, 0 failed" in capsys.readouterr().out
+    assert (tmp_path / "out" / "space.md").exists() and (tmp_path / "out" / "figures" / "space.png").exists()

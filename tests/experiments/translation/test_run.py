@@ -43,7 +43,7 @@ def test_a_translation_is_trained_scored_and_kept(run, world_of_pairs):
     home = run / "generators" / "gelsight_mini-duragel"
     report = json.loads((home / "report.json").read_text())
     assert report["test pairs"] == 6 and report["error"] > 0 and report["mean target"] > 0
-    assert len(report["losses"]) == 2 and cv2.imread(str(home / "pairs.png")) is not None
+    assert len(report["losses"]) == 2
     design = load(home).design
     assert (design.source, design.target, design.pairs, design.fit.batch) == ("gelsight_mini", "duragel", 12, 4)
 

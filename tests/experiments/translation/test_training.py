@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +33,6 @@ from experiments.translation.generator import (
     save,
 )
 from experiments.translation.networks import STATES, Conv, Translation, UNet, doubled, halved, thumbnail_side
-from experiments.translation.pictures import picture_grid
 
 pytestmark = pytest.mark.slow
 
@@ -349,14 +347,6 @@ def test_what_is_no_generator_is_named(tmp_path):
     (tmp_path / GENERATOR).write_bytes(b"nothing")
     with pytest.raises(UserError, match="not a whole safetensors file"):
         load(tmp_path)
-
-
-def test_the_picture_grid_has_four_columns(made, regressed, tmp_path):
-    for one, targets in ((made, Y), (regressed, FIELDS)):
-        file = tmp_path / f"{one.design.target}.png"
-        picture_grid(file, one, X, targets, rows=3)
-        picture = cv2.imread(str(file))
-        assert picture.std() > 10 and 1.1 < picture.shape[1] / picture.shape[0] < 1.8
 
 
 # Networks -----------------------------------------------------------------------------------------------------------

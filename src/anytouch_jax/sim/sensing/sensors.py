@@ -1,8 +1,9 @@
 """Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`.
 
-`looks.npz` has the untouched gels of camera sensors and the colours of their dents. `experiments/benchmarks/looks.py`
-makes it. GelSight, GelSight Mini, DIGIT and 9DTact look like real units. GelSlim and DuraGel are a few lights each, set
-by eye. Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field and has no image.
+`looks.npz` has the untouched gels of camera sensors and the colours of their dents. The code that fitted it has left
+(`experiments/results/tried.md`). GelSight, GelSight Mini, DIGIT and 9DTact look like real units. GelSlim and DuraGel
+are a few lights each, set by eye. Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field
+and has no image.
 """
 
 from __future__ import annotations

@@ -1,0 +1,155 @@
+"""Rows and findings of the encoders in the package: real recordings, look-alikes, motion, backgrounds and trust."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.weights.registry import DEFAULT
+from experiments.pages.page import Finding, Page
+from experiments.real.scores import HEADS, TASKS, TRAINED, Score
+from experiments.records import Record, read_records
+from experiments.values import Value, percent
+
+UNTRAINED, FINGER = "untrained:", "object, other finger"
+
+
+def _score(one: Record, task: str) -> Score | None:
+    found = one["tasks"].get(task)
+    return found and Score(np.array(found["correct"], bool), np.array(found["groups"]), found["option"])
+
+
+def _minus(score: Score | None, other: Score | None) -> Value | None:
+    return None if score is None or other is None or score is other else percent(score.minus(other))
+
+
+def _share(score: Score | None) -> Value | None:
+    return None if score is None else percent((score.share, *score.interval()))
+
+
+def real(folder: Path) -> Page:
+    """Encoders on real recordings."""
+    path = folder / "real.jsonl"
+    records = read_records(path)
+    if len({record["data"] for record in records.values()}) > 1:
+        raise UserError(f"The records of {path} are of different data. Run all of them again.")
+    encoders = [name for name, one in records.items() if one.get("kind") == "encoder" and UNTRAINED not in name]
+    rows: list[Any] = []
+    findings: list[Finding] = []
+    readme: dict[str, Value] = {}
+    for task in (FINGER, *(task for task in TASKS if task != FINGER)):
+        scores = {name: [_score(one, f"{task}, {head}") for head in (*HEADS, TRAINED)] for name, one in records.items()}
+        found = []
+        for name, (linear, near, trained) in scores.items():
+            fresh = scores.get(f"{UNTRAINED}{name}", scores.get(f"{UNTRAINED}{DEFAULT}", [None]))[0]
+            changes = [
+                _minus(linear, other) if UNTRAINED not in name else None for other in (scores["pixels"][0], fresh)
+            ]
+            found.append((task, name, _share(linear or trained), _share(near), *changes))
+            names = ("pixels", "an untrained encoder") if name in encoders else ()
+            findings += [Finding(f"`{name}`", other, changes[i], task) for i, other in enumerate(names)]
+        rows += sorted((row for row in found if row[2] is not None), key=lambda row: -row[2].mean)
+        readme |= {row[1].removesuffix(f":{DEFAULT}"): row[2] for row in found if task == FINGER and row[2] is not None}
+    findings.sort(key=lambda one: one.first != f"`{DEFAULT}`")
+    curves = [(name, *(100 * one["label_curve"][count] for count in ("1", "2", "5")))
+              for name, one in records.items() if "label_curve" in one]  # fmt: skip
+    return Page("real", [rows, sorted(curves, key=lambda row: -row[1])], findings, readme=readme)
+
+
+BACKGROUNDS = {
+    "own": "the unit's own picture", "rule": "the rule (its own picture, else a median)",
+    "median": "the median of a hundred training frames", "all": "the median of all training frames",
+    "ten": "the median of 10 training frames", "half": "the median of the flattest half of a hundred",
+    "recordings": "the median of the medians of recordings", "estimated": "an estimate by `anytouch data contact`",
+    "first": "the first frame of the recording", "pixels": "raw pixels, minus the median of a hundred frames",
+}  # fmt: skip
+
+
+def backgrounds(folder: Path) -> Page:
+    """An encoder on real recordings, by what is subtracted."""
+    records, rows = read_records(folder / "backgrounds.jsonl"), []
+    findings: list[Finding | str] = []
+    for task in reversed(TASKS):
+        scores = {kind: [_score(records[kind], f"{task}, {head}") for head in HEADS] for kind in BACKGROUNDS
+                  if kind in records}  # fmt: skip
+        for kind, (linear, near) in scores.items():
+            change = _minus(linear, scores["own"][0])
+            rows.append((task, BACKGROUNDS[kind], _share(linear), _share(near), change))
+            if kind in ("rule", "median", "first"):
+                findings.append(Finding(BACKGROUNDS[kind], BACKGROUNDS["own"], change, task))
+        if "pixels" in scores and "median" in scores:
+            change = _minus(scores["median"][0], scores["pixels"][0])
+            findings.append(Finding("the encoder, minus the median of a hundred frames,", "raw pixels", change, task))
+    if alone := read_records(folder / "tried.jsonl").get("untouched_gel"):
+        findings.insert(0, f"Of simulated recordings without such a picture, {alone['figure']}.")
+    answer = Finding(BACKGROUNDS["rule"], BACKGROUNDS["own"], rows[1][-1], rows[1][0])
+    return Page(
+        "backgrounds", [rows], findings, (f"{answer.words}.", answer.figure),
+        words={"encoder": next(iter(records.values()))["encoder"]},
+    )  # fmt: skip
+
+
+def motion(folder: Path) -> Page:
+    """The sign of a turn and the direction of a slide, from frozen tokens."""
+    rows, findings = [], []
+    for name, record in read_records(folder / "motion.jsonl").items():
+        scores = record["scores"]
+        own = [(name, row, *(percent([found[k]["share"], *found[k]["interval"]]) for k in ("turn", "slide")))
+               for row, found in scores.items()]  # fmt: skip
+        findings.append(f"`{name}`: the head names {own[0][2].mean:.0f} % of turns of new objects. A linear probe on "
+                        f"the mean token names {100 * record['pooled']:.0f} %.")  # fmt: skip
+        rows += own
+    answer = "A small head on the patch tokens names this share of turns of new objects."
+    return Page("motion", [rows], findings, (answer, f"{rows[0][2].shown()} %"))
+
+
+def lookalikes(folder: Path) -> Page:
+    """The same touch by another sensor, among 50 that resemble it."""
+    rows, findings, readme = [], [], dict[str, Value]()
+    for key, record in sorted(
+        read_records(folder / "lookalikes.jsonl").items(), key=lambda item: "left_out" in item[1]
+    ):
+        sensor = record.get("left_out")
+        grade = key.partition(" ")[0] + " alignment" + (f", queries by {sensor}, left out of stage 2" if sensor else "")
+        scores = {name: percent([one["share"], *one["interval"]]) for name, one in record["scores"].items()}
+        scores = dict(sorted(scores.items(), key=lambda item: -item[1].mean))
+        rows += [(grade, name, value) for name, value in scores.items()]
+        parts = ", ".join(f"`{name}` finds {scores[name].mean:.0f} %" for name in scores if name in record["encoders"])
+        findings.append(f"{grade}: {parts}, and pixels {scores['pixels'].mean:.0f} %.")
+        readme = scores if key == "fine" else readme
+    if not readme:
+        return Page("lookalikes", [rows], findings)
+    best = next(iter(readme))
+    answer = f"`{best}` finds this share first of 50, and raw pixels {readme['pixels'].mean:.1f} %."
+    return Page("lookalikes", [rows], findings, (answer, f"{readme[best].shown()} %"), readme=readme)
+
+
+def trust(folder: Path) -> Page:
+    """Calibration, coverage and novelty of heads, and health of sensor units."""
+    by_kind: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for key, one in read_records(folder / "trust.jsonl").items():
+        by_kind.setdefault(key.partition("/")[0], {})[key.partition("/")[2]] = one
+    if lost := {"trust", "health"} - by_kind.keys():
+        raise UserError(f"{folder / 'trust.jsonl'} has no record of {min(lost)}. Run experiments.real.trust first.")
+    rows, findings, units = [], [], by_kind["health"]
+    for name, one in by_kind["trust"].items():
+        hardest = min((found["auroc"] for found in one["sensors"].values()), default=None)
+        both = (None if value is None else percent(value) for value in (one["never_met"].get("novelty"), hardest))
+        figures = (percent(one[key]) for key in ("accuracy", "ece", "coverage", "decided", "novel"))
+        rows.append((name, *figures, one["size"], *both))
+        findings.append(f"{name}: sets hold the class in {rows[-1][3].mean:.1f} %, and {one['asked']:.0%} was asked.")
+    counts = {fault: np.sum([one["faults"][fault] for one in units.values()], 0)
+              for fault in next(iter(units.values()))["faults"]}  # fmt: skip
+    faults = [(fault, f"{one[0]} of {one[1]}", f"{one[2]}") for fault, one in counts.items()]
+    reported, made = (sum(one[i] for one in counts.values()) for i in (0, 1))
+    alarmed = sum(len({alarm.partition(":")[0] for alarm in one["alarms"]}) for one in units.values())
+    findings.append(f"{reported} of {made} made faults of sensor units are reported.")
+    findings.append(f"{alarmed} of {sum(one['units'] for one in units.values())} good units raise an alarm.")
+    answer = f"Of sets that should hold the class in 90 %, this share does. {findings[-2]}"
+    return Page(
+        "trust", [rows, faults], findings, (answer, f"{rows[0][3].shown()} %"), words={"units": ", ".join(units)}
+    )

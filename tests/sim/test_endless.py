@@ -78,9 +78,7 @@ def test_touches_have_their_shapes_and_a_key_decides_them(world, touches):
     assert np.all(touches.labels["depth"].max(-1) > 0), "every still shows a touch"
     photographed = touches.photo >= 0
     place = touches.inputs[0].place[photographed]
-    np.testing.assert_array_equal(
-        place[:, 0], world.places[touches.object[photographed], touches.photo[photographed]]
-    )
+    np.testing.assert_array_equal(place[:, 0], world.places[touches.object[photographed], touches.photo[photographed]])
 
 
 def test_one_program_for_all_sensors_equals_the_program_of_a_sensor(touches):

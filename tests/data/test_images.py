@@ -65,12 +65,8 @@ def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
     np.testing.assert_array_equal(images.decode(tmp_path / "float.tiff"), RGB)
     big = (RGB.astype(np.uint16) * 257).astype(">u2")
     for name, array in (
-        ("b", big),
-        ("f", floats.astype(np.float64)),
-        ("u", RGB),
-        ("g", grey),
-        ("d", RGB.astype(np.uint16) * 257),
-    ):
+        ("b", big), ("f", floats.astype(np.float64)), ("u", RGB), ("g", grey), ("d", RGB.astype(np.uint16) * 257),
+    ):  # fmt: skip
         np.save(tmp_path / f"{name}.npy", array)
         np.testing.assert_array_equal(
             images.decode(tmp_path / f"{name}.npy"), RGB if name != "g" else np.stack([grey] * 3, -1)
@@ -86,15 +82,12 @@ def _nan():
 @pytest.mark.parametrize(
     ("array", "words"),
     [
-        (_nan(), "NaN"),
-        (np.full((4, 5, 3), 2.0, np.float32), r"0\.\.1"),
-        (np.full((4, 5, 3), -np.inf, np.float32), r"0\.\.1"),
-        (np.zeros((4, 5, 2), np.uint8), "shape"),
-        (np.zeros((0, 5, 3), np.uint8), "shape"),
-        (np.zeros((4, 5, 3), np.int64), "int64"),
+        (_nan(), "NaN"), (np.full((4, 5, 3), 2.0, np.float32), r"0\.\.1"),
+        (np.full((4, 5, 3), -np.inf, np.float32), r"0\.\.1"), (np.zeros((4, 5, 2), np.uint8), "shape"),
+        (np.zeros((0, 5, 3), np.uint8), "shape"), (np.zeros((4, 5, 3), np.int64), "int64"),
         (np.zeros((4, 5, 3), object), "cannot be read"),
     ],
-)
+)  # fmt: skip
 def test_bad_arrays_are_named(tmp_path, array, words):
     path = tmp_path / "bad.npy"
     np.save(path, array, allow_pickle=True)
@@ -347,12 +340,8 @@ def test_frames_are_numbered_by_what_counts_them():
     assert images.frame_numbers(["a.png", "b2.png"]) == [0, 1] and images.frame_numbers([]) == []
     assert images.frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
     for form in (
-        "{}_left.png",
-        "{:05d}_D20012.png",
-        "img_{:04d}_left_raw.png",
-        "frame{:04d}_cam0.png",
-        "{}_320x240.png",
-    ):
+        "{}_left.png", "{:05d}_D20012.png", "img_{:04d}_left_raw.png", "frame{:04d}_cam0.png", "{}_320x240.png",
+    ):  # fmt: skip
         assert images.frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
     stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
     assert images.frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))

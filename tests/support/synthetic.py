@@ -61,12 +61,8 @@ def _columns(leaf: plan.Leaf) -> list[tuple[str, str, str]]:
         result = [(view, task, "accuracy") for view in views for task in scores.STATIC]
     if leaf.question == "real":
         views = [
-            real.OURS,
-            real.UNTRAINED,
-            real.PIXELS,
-            f"{real.OURS} - {real.PIXELS}",
-            f"{real.OURS} - {real.UNTRAINED}",
-        ]
+            real.OURS, real.UNTRAINED, real.PIXELS, f"{real.OURS} - {real.PIXELS}", f"{real.OURS} - {real.UNTRAINED}",
+        ]  # fmt: skip
         result = [(view, task, "accuracy") for task in ("object", "slip, objects left out") for view in views]
     return result
 

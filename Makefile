@@ -111,11 +111,12 @@ test-all: $(STAMP) ## every test
 test-jax: $(NEWER)/.made ## tests of what is computed, under another jax in its own environment: [JAX=0.12.0.1 NEWPYTHON=python3.13]
 	$(NEWER)/bin/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" tests/ops tests/nn tests/train tests/parity tests/test_objectives.py
 
-lint: $(STAMP) ## ruff (rules and format), mypy and the rules of prose
+lint: $(STAMP) ## ruff (rules and format), mypy, the rules of prose and the table of imports
 	$(PY) -m ruff check $(CHECKED)
 	$(PY) -m ruff format --check $(CHECKED)
 	$(PY) -m mypy
 	$(PY) -m tests.prose.check
+	$(PY) -m pytest tests/laws/test_architecture.py
 
 format: $(STAMP) ## rewrite the sources in the project's format
 	$(PY) -m ruff check --fix $(CHECKED)

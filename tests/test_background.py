@@ -216,17 +216,12 @@ def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
     assert (
         main(
             [
-                "export",
-                "--to",
-                "safetensors",
-                "--model",
-                str(tmp_path / "w.safetensors"),
-                "--out",
+                "export", "--to", "safetensors", "--model", str(tmp_path / "w.safetensors"), "--out",
                 str(tmp_path / "o.safetensors"),
             ]
         )
         == 0
-    )
+    )  # fmt: skip
     run, *files = (load_encoder(tmp_path / name) for name in ("r", "w.safetensors", "o.safetensors"))
     clips = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
     for one in files:

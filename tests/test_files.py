@@ -126,12 +126,7 @@ def test_an_array_is_read_only_if_it_is_as_its_header_says():
     huge = io.BytesIO()
     np.lib.format.write_array_header_1_0(huge, {"descr": "<f4", "fortran_order": False, "shape": (1 << 30, 1 << 10)})
     for damaged in (
-        whole[:-1],
-        whole + b"x",
-        whole[:20] + b"\xff" * 9 + whole[29:],
-        b"",
-        huge.getvalue(),
-        npy(np.array([{}])),
-    ):
+        whole[:-1], whole + b"x", whole[:20] + b"\xff" * 9 + whole[29:], b"", huge.getvalue(), npy(np.array([{}])),
+    ):  # fmt: skip
         with pytest.raises(ValueError):
             files.read_array(damaged)

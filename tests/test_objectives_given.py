@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from tiny_models import tiny_config
+from tiny_models import compiled, tiny_config
 
 from anytouch_jax import objectives
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
@@ -26,7 +26,7 @@ def pixels(*shape):
 
 
 def floats(*shape):
-    return jnp.asarray(RNG.standard_normal((*shape, 28, 28, 3)), jnp.float32)
+    return RNG.standard_normal((*shape, 28, 28, 3)).astype("f4")
 
 
 def changed(config, model=None, **objective):
@@ -53,9 +53,9 @@ def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeyp
     match = MatchBatch(pixels(4, 1), SENSOR[:4], pixels(4, 1), SENSOR[:4])
     if head == "mlp":
         match = match._replace(negative=pixels(4, 1), negative_sensor=SENSOR[:4])
-    args = {}, Stage2Batch(align, match), jax.random.key(0), jnp.float32(0.5)
-    objectives.stage2_loss(*args, net=build(config.model), config=config)
-    ((shown, reported),) = received
+    net, args = build(config.model), (Stage2Batch(align, match), jax.random.key(0), np.float32(0.5))
+    run = lambda *args: (objectives.stage2_loss({}, *args, net=net, config=config), received)[1]  # noqa: E731
+    ((shown, reported),) = jax.device_get(jax.jit(run)(*args))
     pairs = [(shown.image, align.image, CLIP), (shown.clip, align.clip, IMAGENET)]
     pairs += [(reported[i], match[i], IMAGENET) for i in ((0, 2, 4) if head == "mlp" else (0, 2))]
     for result, given, (mean, std) in pairs:
@@ -100,10 +100,9 @@ def half(batch, i):
 @pytest.mark.parametrize("what", ["align", "match"])
 def test_groups_are_halves_that_do_not_know_of_each_other(what):
     config = changed(tiny_config(2), {"match_head": "cosine"}, center_embeddings=False)
-    net = build(config.model)
-    params = net.init(jax.random.key(1))
+    net, params = compiled(config.model).net, compiled(config.model).params
     if what == "align":
-        text = jnp.asarray(RNG.integers(1, 40, (6, 8)), jnp.int32)
+        text = RNG.integers(1, 40, (6, 8)).astype(np.int32)
         rows = np.asarray([1, 0, 2, 7, 4, 6]), np.asarray([3, 1, 2, 4, 7, 6])
         batch = AlignBatch(floats(8, 1), SENSOR, floats(6), rows[0], text, text > 0, rows[1])
     else:
@@ -127,14 +126,15 @@ def test_groups_are_halves_that_do_not_know_of_each_other(what):
 @pytest.mark.parametrize("head", ["mlp", "linear"])
 def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
     config = changed(tiny_config(2), {"match_head": head})
-    net = build(config.model)
-    params = net.init(jax.random.key(1))
+    net = compiled(config.model)
+    params = net.params
     touches = [(floats(5, 1), SENSOR[:5]) for _ in range(3)]  # an odd number: never half of them right
     z = [np.asarray(net.encode_touch(params, *touch)) for touch in touches]
     z = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in z]
     same, other = (np.asarray(net.match(params, z[0], x)) for x in z[1:])
     match = MatchBatch(*(array for touch in touches for array in touch))
-    _, metrics = objectives.stage2_terms(params, Stage2Batch(None, match), None, net=net, config=config)
+    terms = jax.jit(partial(objectives.stage2_terms, noise=None, net=net.net, config=config))
+    _, metrics = terms(params, Stage2Batch(None, match))
     right = np.count_nonzero(same > 0) + np.count_nonzero(other < 0)
     np.testing.assert_allclose(metrics["match_accuracy"], right / 10, rtol=1e-6)
 
@@ -146,10 +146,10 @@ def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
 @pytest.mark.parametrize("ratio", [0.0, 1.0])
 def test_all_shown_or_all_hidden_is_finite_even_of_one_row(ratio, frames):
     config = changed(tiny_config(1), mask_ratio=ratio)
-    net = build(config.model)
-    terms = jax.jit(jax.value_and_grad(partial(objectives.stage1_terms, net=net, config=config), has_aux=True))
-    noise = jnp.asarray(RNG.random((1, 16)), jnp.float32)
-    (loss, metrics), grads = terms(net.init(jax.random.key(0)), floats(1, frames), SENSOR[:1], noise)
+    net = compiled(config.model)
+    terms = jax.jit(jax.value_and_grad(partial(objectives.stage1_terms, net=net.net, config=config), has_aux=True))
+    noise = RNG.random((1, 16)).astype("f4")
+    (loss, metrics), grads = terms(net.params, floats(1, frames), SENSOR[:1], noise)
     assert np.isfinite(loss) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     assert (float(metrics["reconstruction"]) == 0) == (ratio == 0)
     assert (float(loss) > 0) == (ratio == 1 or frames == 4)
@@ -159,14 +159,14 @@ def test_all_shown_or_all_hidden_is_finite_even_of_one_row(ratio, frames):
 def test_accumulation_of_the_real_loss_equals_the_large_batch(frames):
     """The noise is a part of the batch here, so that a row has one mask however the batch is cut."""
     config = tiny_config(1)
-    net = build(config.model)
+    net, params = compiled(config.model).net, compiled(config.model).params
 
     def loss(params, batch, key, progress):
         return objectives.stage1_terms(params, *batch, net=net, config=config)
 
-    batch = floats(4, frames), jnp.asarray(SENSOR[:4]), jnp.asarray(RNG.random((4, 16)), jnp.float32)
+    batch = floats(4, frames), SENSOR[:4], RNG.random((4, 16)).astype("f4")
     tx = optax.sgd(0.1)  # Adam makes a whole step of the sign of a gradient that is only noise
-    state = init_state(net.init(jax.random.key(0)), config)._replace(opt_state=tx.init(None))
+    state = init_state(params, config)._replace(opt_state=tx.init(None))
     (whole, result), (parts, others) = (
         jax.jit(make_step(loss, tx, total_steps=8, accumulate=count))(state, batch, jax.random.key(0))
         for count in (1, 2)

@@ -38,12 +38,12 @@ def _arrays(batch: Batch) -> Batch:
 
 
 def normalise_touch(clip: Array) -> Array:
-    """Normalise uint8 RGB (..., 3) to float32 by ImageNet statistics (the release's choice for touch)."""
+    """Return uint8 RGB (..., 3) as float32, normalised by ImageNet's statistics (the release's choice for touch)."""
     return _normalise(clip, IMAGENET_MEAN, IMAGENET_STD)
 
 
 def normalise_image(image: Array) -> Array:
-    """Normalise uint8 RGB (..., 3) to float32 by CLIP statistics (for photographs)."""
+    """Return uint8 RGB (..., 3) as float32, normalised by CLIP's statistics (for photographs)."""
     return _normalise(image, CLIP_MEAN, CLIP_STD)
 
 
@@ -61,7 +61,7 @@ def stage1_terms(
 
     `clip` float (B, T, H, W, 3), normalised: T = 1 a still, 3 a clip, 4 a clip and its next frame. `sensor` i32 (B,)
     rows of the token table, already drawn. `noise` (B, N) decides the masks. `decoder_sensor` i32 (B,): rows of the
-    tokens that the decoder of the release gets.
+    tokens that the decoder of the release gets. Both results are float32 scalars.
     """
     clip, sensor, noise = _arrays((clip, sensor, noise))
     if not config.objective.next_frame:
@@ -94,7 +94,7 @@ def stage1_loss(
 ) -> tuple[Array, Metrics]:
     """Return `stage1_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`.
 
-    `progress` in [0, 1] drives p_u (Eq. 7).
+    The clips are u8 (B, T, H, W, 3). `progress` f32 () in [0, 1] drives p_u (Eq. 7).
     """
     batch, (key_noise, key_universal) = _arrays(batch), jax.random.split(key)
     noise = jax.random.uniform(key_noise, (len(batch.sensor), net.model.patches))
@@ -303,7 +303,10 @@ def stage2_terms(
 def stage2_loss(
     params: Params, batch: Stage2Batch, key: Array, progress: Array, *, net: Net, config: Config
 ) -> tuple[Array, Metrics]:
-    """Return `stage2_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`; `progress` drives p_u."""
+    """Return `stage2_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`.
+
+    `progress` f32 () in [0, 1] drives p_u (Eq. 7).
+    """
     key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
     (align, match, fields), patches = _arrays(batch), net.model.patches
     metrics, noise, own, match_noise = Metrics(), None, None, None

@@ -59,19 +59,14 @@ def test_check_writes_nothing_without_out(anytouch, pressed, tmp_path):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--out", "touch.parquet"], "touch.parquet"),
-        (["--out", "m.json"], "m.json"),
-        (["--out", "mine.csv"], "mine.csv"),
-        (["--threads", "0"], "--threads"),
+        (["--out", "touch.parquet"], "touch.parquet"), (["--out", "m.json"], "m.json"),
+        (["--out", "mine.csv"], "mine.csv"), (["--threads", "0"], "--threads"),
         (["--drop", "--threshold", "digit", "999"], "contact"),
-        (["--check", "--reference", "label.depth"], "label.depth"),
-        (["--reference", "label.force"], "--reference"),
-        (["--check", "--reference", "label.force", "--above", "nan"], "--above"),
-        (["--check", "--drop"], "--drop"),
-        (["--share", "60"], "--share"),
-        (["--threshold", "gelsigth", "5"], "gelsigth"),
+        (["--check", "--reference", "label.depth"], "label.depth"), (["--reference", "label.force"], "--reference"),
+        (["--check", "--reference", "label.force", "--above", "nan"], "--above"), (["--check", "--drop"], "--drop"),
+        (["--share", "60"], "--share"), (["--threshold", "gelsigth", "5"], "gelsigth"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, named):
     monkeypatch.chdir(pressed.parent)
     Path("mine.csv").write_text("place,contact\na,1\n")  # a table of the user's

@@ -177,19 +177,15 @@ def test_a_video_that_ends_early_is_reported(anytouch, tiny_run, tmp_path, comma
     [
         (["m.csv", "--sensor", "digit"], ["--sensor"]),
         (["m.csv", "--rotate", "90", "--flip", "across"], ["--rotate", "--flip"]),
-        (["m.parquet", "--background", "g.png"], ["--background"]),
-        (["m.csv", "frames"], ["--data"]),
-        (["m.csv", "--batch", "0"], ["--batch"]),
-        (["m.csv", "--out", "f.csv"], ["--out", ".npz"]),
-        (["m.csv", "--out", "afile/f.npz"], ["--out", "afile"]),
-        (["m.csv"], ["nowhere"]),
+        (["m.parquet", "--background", "g.png"], ["--background"]), (["m.csv", "frames"], ["--data"]),
+        (["m.csv", "--batch", "0"], ["--batch"]), (["m.csv", "--out", "f.csv"], ["--out", ".npz"]),
+        (["m.csv", "--out", "afile/f.npz"], ["--out", "afile"]), (["m.csv"], ["nowhere"]),
         (["m.csv", "--split", "test", "--frames", "3", "--batch", "8"], ["nowhere"]),
         (["frames", "--split", "test"], ["--split"]),
         (["frames", "--sensor", "digit", "--batch", "8", "--rotate", "270", "--flip", "down"], ["nowhere"]),
-        (["film.mp4", "--on-bad-sample", "skip"], ["--on-bad-sample"]),
-        (["gone"], ["gone"]),
+        (["film.mp4", "--on-bad-sample", "skip"], ["--on-bad-sample"]), (["gone"], ["gone"]),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_named_before_the_encoder_is_loaded(mistake, tmp_path, monkeypatch, words, named):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "frames").mkdir()

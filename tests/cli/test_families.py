@@ -13,7 +13,6 @@ from safetensors.numpy import save_file
 from touch_world import make_touches
 
 from anytouch_jax import load_encoder
-from anytouch_jax.encoder import export
 from tests.weights import test_families as forms
 from tests.weights.test_start import mae
 
@@ -99,20 +98,6 @@ def test_a_streamed_film_gives_the_features_of_embed(anytouch, family, files, tm
     with np.load(outs[0]) as a, np.load(outs[1]) as b:
         assert len(a["features"]) > 3
         np.testing.assert_allclose(a["features"], b["features"], atol=2e-5 * np.abs(b["features"]).max())
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_an_exported_family_gives_the_features_of_the_live_one(anytouch, family, files, tmp_path):
-    encoder, out = load_encoder(files[family]), tmp_path / "model.bin"
-    frames = encoder.form.model.frames
-    done = anytouch("export", "--model", files[family], "--out", out, "--frames", frames, "--platforms", "cpu")
-    assert done.status == 0, done.err
-    clip = np.random.default_rng(0).normal(size=(2, frames, *encoder.image_size, 3)).astype("f4")
-    sensor = "digit" if family in ("anytouch2", "t3") else "universal"
-    live = encoder.encode_touch(clip, sensor)
-    np.testing.assert_allclose(export.load(out)(clip, sensor), live, atol=1e-5 * np.abs(live).max())
-    said = json.loads((tmp_path / "model.bin.json").read_text())
-    assert "float32" in said["input"] and said["preparation"]["mean"]
 
 
 def test_a_family_without_sensors_ignores_the_sensor_and_says_so_once(files):

@@ -22,14 +22,8 @@ def test_a_run_a_manifest_and_features(anytouch, tiny_run, world, tmp_path):
     assert done.status == 0, done.err
     run, manifest, lines = done.out.strip().split("\n\n")
     for words in (
-        str(tiny_run),
-        "stage 1",
-        "step 2 of 4",
-        "checkpoints at 2",
-        "digit, gelsight_mini",
-        str(world),
-        "loss ",
-    ):
+        str(tiny_run), "stage 1", "step 2 of 4", "checkpoints at 2", "digit, gelsight_mini", str(world), "loss ",
+    ):  # fmt: skip
         assert words in run
     recordings = ("12 rows", "3 recordings", "4 clips", "test 2, train 8, val 2", "digit 8, gelsight_mini 4")
     for words in (str(world), *recordings, "image_path 1, text 4, touch 12, object 12", "labels: object"):

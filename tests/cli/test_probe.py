@@ -31,17 +31,13 @@ def test_a_label_is_reported_on_test_and_written_as_json(tmp_path, world, tiny_r
         ("label --leave-out object --model a --save h.npz", ["--save"]),
         ("label --save h.npz --model a b", ["--save", "--model"]),
         ("label --save h.json --model a", ["--save", ".npz"]),
-        ("label --model a --save h.npz --out h.npz", ["--save", "--out"]),
-        ("label --frames -1", ["--frames"]),
-        ("label --seeds -3", ["--seeds"]),
-        ("label --out nowhere.csv/deep/p.json", ["nowhere.csv"]),
-        ("tasks --tasks slip --join concat", ["--join"]),
-        ("tasks --frames 1 --order repeated", ["--order"]),
-        ("tasks --cache afile", ["--cache", "afile"]),
-        ("tasks --frames 0", ["--frames"]),
+        ("label --model a --save h.npz --out h.npz", ["--save", "--out"]), ("label --frames -1", ["--frames"]),
+        ("label --seeds -3", ["--seeds"]), ("label --out nowhere.csv/deep/p.json", ["nowhere.csv"]),
+        ("tasks --tasks slip --join concat", ["--join"]), ("tasks --frames 1 --order repeated", ["--order"]),
+        ("tasks --cache afile", ["--cache", "afile"]), ("tasks --frames 0", ["--frames"]),
         ("tasks --max-rows 0", ["--max-rows"]),
     ],
-)
+)  # fmt: skip
 def test_options_that_do_not_go_together_are_named(mistake, tmp_path, monkeypatch, typed, named):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "afile").write_text("")

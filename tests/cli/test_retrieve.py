@@ -44,14 +44,10 @@ def test_galleries_by_chance_are_easier_for_the_contact_alone(touches, capsys):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--split", "unused"], "unused"),
-        (["--model", "nowhere"], "nowhere"),
-        (["--gallery", "5000"], "5000"),
-        (["--gallery", "1"], "--gallery"),
-        (["--frames", "-1"], "--frames"),
-        (["--seeds", "2"], "--seeds"),
+        (["--split", "unused"], "unused"), (["--model", "nowhere"], "nowhere"), (["--gallery", "5000"], "5000"),
+        (["--gallery", "1"], "--gallery"), (["--frames", "-1"], "--frames"), (["--seeds", "2"], "--seeds"),
     ],
-)
+)  # fmt: skip
 def test_a_mistake_is_one_sentence(touches, capsys, monkeypatch, words, sentence):
     monkeypatch.setattr(embed, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
     assert main(["retrieve", "--data", str(touches), *words]) == 2

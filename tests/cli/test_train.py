@@ -83,22 +83,16 @@ def test_an_option_of_a_section_is_named_in_full(mistake):
 @pytest.mark.parametrize(
     ("words", "option"),
     [
-        (("--stage", "3"), "--stage"),
-        (("--steps", "many"), "--steps"),
-        (("--objective.mask-ratio",), "--objective.mask-ratio"),
-        (("--model.patch", 13), "patch"),
-        (("--model.patch", 0), "--model.patch"),
-        (("--model.decoder.heads", 0), "heads"),
+        (("--stage", "3"), "--stage"), (("--steps", "many"), "--steps"),
+        (("--objective.mask-ratio",), "--objective.mask-ratio"), (("--model.patch", 13), "patch"),
+        (("--model.patch", 0), "--model.patch"), (("--model.decoder.heads", 0), "heads"),
         (("--model.decoder.width", 18, "--model.decoder.heads", 2), "--model.decoder.width"),
-        (("--steps", 0), "--run.steps"),
-        (("--data.flip", 7), "--data.flip"),
-        (("--stop-after", -1), "--stop-after"),
+        (("--steps", 0), "--run.steps"), (("--data.flip", 7), "--data.flip"), (("--stop-after", -1), "--stop-after"),
         (("--stage", 2, "--towers", "pretrained"), "--clip-weights"),
         (("--stage", 1, "--towers", "pretrained"), "--clip-weights"),
-        (("--stage", 2, "--clip-weights", "c"), "--towers"),
-        (("--init", "gone"), "gone"),
+        (("--stage", 2, "--clip-weights", "c"), "--towers"), (("--init", "gone"), "gone"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_value_is_named_and_starts_no_run(words, option, anytouch, tmp_path, world):
     done = anytouch("train", "--data", world, "--run", tmp_path / "r", *words)
     assert done.status == 2 and option in " ".join(done.err.replace("│", " ").split())
@@ -174,19 +168,8 @@ def test_a_run_folder_that_is_taken_is_one_sentence(mistake, tiny_run, world, tm
 def test_a_run_continues_and_refuses_other_settings(anytouch, mistake, tmp_path, world, tiny_run):
     shutil.copytree(tiny_run, tmp_path / "r")
     words = [
-        "train",
-        "--data",
-        world,
-        "--run",
-        tmp_path / "r",
-        "--steps",
-        4,
-        "--save-every",
-        4,
-        "--batch",
-        8,
-        *TINY_RUN,
-    ]
+        "train", "--data", world, "--run", tmp_path / "r", "--steps", 4, "--save-every", 4, "--batch", 8, *TINY_RUN,
+    ]  # fmt: skip
     assert "run.steps" in mistake(*words, "--steps", 5)
     done = anytouch(*words, "--stop-after", 3)
     assert done.status == 0 and "step 2" in done.err and "3 of 4 steps" in done.err
@@ -279,12 +262,9 @@ def processes(world, run_dir, stage, *, devices=1, **more):
     script = PROCESS.format(run=str(run_dir), world=str(world), stage=stage, more=more)
     folders = [str(ROOT / "src"), str(SUPPORT), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     common = os.environ | {
-        "PYTHONPATH": os.pathsep.join(folders),
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
-        "JAX_NUM_CPU_DEVICES": str(devices),
-        "JAX_COORDINATOR_ADDRESS": free_address(),
-        "JAX_NUM_PROCESSES": "2",
-    }
+        "PYTHONPATH": os.pathsep.join(folders), "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
+        "JAX_NUM_CPU_DEVICES": str(devices), "JAX_COORDINATOR_ADDRESS": free_address(), "JAX_NUM_PROCESSES": "2",
+    }  # fmt: skip
     started = [
         subprocess.Popen(
             [sys.executable, "-c", script], env=common | {"JAX_PROCESS_ID": str(i)}, stdout=subprocess.PIPE,

@@ -67,12 +67,8 @@ def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
     np.testing.assert_array_equal(images.decode(tmp_path / "float.tiff"), RGB)
     big = (RGB.astype(np.uint16) * 257).astype(">u2")
     for name, array in (
-        ("b", big),
-        ("f", floats.astype(np.float64)),
-        ("u", RGB),
-        ("g", grey),
-        ("d", RGB.astype(np.uint16) * 257),
-    ):
+        ("b", big), ("f", floats.astype(np.float64)), ("u", RGB), ("g", grey), ("d", RGB.astype(np.uint16) * 257),
+    ):  # fmt: skip
         np.save(tmp_path / f"{name}.npy", array)
         np.testing.assert_array_equal(
             images.decode(tmp_path / f"{name}.npy"), RGB if name != "g" else np.stack([grey] * 3, -1)
@@ -88,15 +84,12 @@ def _nan():
 @pytest.mark.parametrize(
     ("array", "words"),
     [
-        (_nan(), "NaN"),
-        (np.full((4, 5, 3), 2.0, np.float32), r"0\.\.1"),
-        (np.full((4, 5, 3), -np.inf, np.float32), r"0\.\.1"),
-        (np.zeros((4, 5, 2), np.uint8), "shape"),
-        (np.zeros((0, 5, 3), np.uint8), "shape"),
-        (np.zeros((4, 5, 3), np.int64), "int64"),
+        (_nan(), "NaN"), (np.full((4, 5, 3), 2.0, np.float32), r"0\.\.1"),
+        (np.full((4, 5, 3), -np.inf, np.float32), r"0\.\.1"), (np.zeros((4, 5, 2), np.uint8), "shape"),
+        (np.zeros((0, 5, 3), np.uint8), "shape"), (np.zeros((4, 5, 3), np.int64), "int64"),
         (np.zeros((4, 5, 3), object), "cannot be read"),
     ],
-)
+)  # fmt: skip
 def test_bad_arrays_are_named(tmp_path, array, words):
     path = tmp_path / "bad.npy"
     np.save(path, array, allow_pickle=True)

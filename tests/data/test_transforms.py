@@ -230,12 +230,9 @@ def test_vision_flip_is_an_exact_mirror_and_rotation_turns():
 def test_a_frame_is_turned_clockwise_then_mirrored():
     frame = np.arange(6, dtype=np.uint8).reshape(2, 3, 1)  # 0 1 2 / 3 4 5
     wanted = {
-        (0, "none"): [[0, 1, 2], [3, 4, 5]],
-        (90, "none"): [[3, 0], [4, 1], [5, 2]],
-        (180, "none"): [[5, 4, 3], [2, 1, 0]],
-        (270, "none"): [[2, 5], [1, 4], [0, 3]],
-        (0, "across"): [[2, 1, 0], [5, 4, 3]],
-        (90, "down"): [[5, 2], [4, 1], [3, 0]],
-    }
+        (0, "none"): [[0, 1, 2], [3, 4, 5]], (90, "none"): [[3, 0], [4, 1], [5, 2]],
+        (180, "none"): [[5, 4, 3], [2, 1, 0]], (270, "none"): [[2, 5], [1, 4], [0, 3]],
+        (0, "across"): [[2, 1, 0], [5, 4, 3]], (90, "down"): [[5, 2], [4, 1], [3, 0]],
+    }  # fmt: skip
     for (rotate, flip), pixels in wanted.items():
         assert t.orient_frame(frame, rotate, flip)[..., 0].tolist() == pixels

@@ -176,16 +176,12 @@ def test_labels_draw_the_new_sensor_to_the_classes_of_the_known_ones(run, table)
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"labels": None}, "--labels"),
-        ({"labels": "colour"}, "no column 'colour' or 'label.colour' for --labels"),
-        ({"labels": "force"}, "a column of measurements"),
-        ({"labels": "split"}, "must name classes"),
-        ({"sensor": "digit"}, "was trained on digit"),
-        ({"sensor": "tac3d"}, "no images"),
-        ({"sensor": "universal"}, "serve all sensors"),
-        ({"sensor": "my_gel"}, "'train' has 0 usable frames of my_gel"),
+        ({"labels": None}, "--labels"), ({"labels": "colour"}, "no column 'colour' or 'label.colour' for --labels"),
+        ({"labels": "force"}, "a column of measurements"), ({"labels": "split"}, "must name classes"),
+        ({"sensor": "digit"}, "was trained on digit"), ({"sensor": "tac3d"}, "no images"),
+        ({"sensor": "universal"}, "serve all sensors"), ({"sensor": "my_gel"}, "'train' has 0 usable frames of my_gel"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_one_sentence(run, table, change, told):
     options = {"sensor": "gelslim", "frames": 4, "labels": "hardness"} | change
     with pytest.raises(UserError, match=told) as error:

@@ -10,8 +10,7 @@ from runs import run_config
 from tiny_models import touch_model
 from weights_world import write_heads
 
-from anytouch_jax.cli.app import main
-from anytouch_jax.config import Config, DataConfig, from_json, to_json
+from anytouch_jax.config import Config, DataConfig, to_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import touch_evaluation
@@ -20,7 +19,7 @@ from anytouch_jax.encoder.embed import Features, embed_rows, plain_column, save_
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import checkpoint, convert, load, safetensors
+from anytouch_jax.weights import checkpoint, convert, safetensors
 
 RNG = np.random.default_rng(0)
 CLIPS = RNG.integers(0, 256, (2, 7, 28, 28, 3), np.uint8)
@@ -42,23 +41,6 @@ def test_shapes_of_what_is_embedded(encoder):
     both = encoder.encode_touch(still, "digit", pooling="both")
     np.testing.assert_allclose(both, np.concatenate([z, mean], axis=1), atol=1e-6)
     assert encoder.encode_touch(still[:0], "digit").shape == (0, 12)
-
-
-def test_a_still_equals_the_clip_that_repeats_it(encoder):
-    still = CLIPS[:, :1]
-    clip = encoder.encode_touch(np.repeat(still, 3, axis=1), np.asarray([1, 1]))
-    np.testing.assert_allclose(clip, encoder.encode_touch(still, "digit"), atol=2e-5)
-
-
-@pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
-def test_long_clips_are_segments_of_three(encoder, join, width):
-    parts = [
-        encoder.encode_touch(CLIPS[:, s : s + 3], "digit") for s in (0, 3, 4)
-    ]  # the last one ends with the last frame
-    wanted = {"mean": np.mean(parts, 0), "sum": np.sum(parts, 0), "concat": np.concatenate(parts, 1)}[join]
-    z = encoder.encode_touch(CLIPS, "digit", join=join)
-    assert z.shape == (2, width)
-    np.testing.assert_allclose(z, wanted, atol=2e-5)
 
 
 def test_what_cannot_be_embedded_is_one_sentence(encoder):
@@ -151,35 +133,6 @@ def test_an_encoder_of_a_weights_file(tmp_path):
         np.testing.assert_allclose(result.encode_touch(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
 
 
-def test_sensors_that_the_authors_weights_were_not_trained_on_get_the_universal_tokens(tmp_path):
-    """The release trained rows 0 to 4 of its table and the universal one; 5 to 8 are as they were drawn."""
-    params = build(touch_model()).init(jax.random.key(1))
-    stored = np.asarray(params["touch"]["sensor_tokens"])
-    authors, ours = convert.to_release(params, touch_model()), {safetensors.MODEL_KEY: to_json(touch_model())}
-    safetensors.write_safetensors(tmp_path / "authors.safetensors", authors, {"format": "pt"})
-    write_heads(tmp_path, touch_model())
-    safetensors.write_safetensors(tmp_path / "untold.safetensors", authors, ours)  # of ours, which tells no sensors
-    encoder, untold = (load_encoder(tmp_path / f"{name}.safetensors") for name in ("authors", "untold"))
-    assert (
-        encoder.trained_sensors == ("gelsight", "digit", "gelslim", "gelsight_mini", "duragel")
-        and untold.trained_sensors is None
-    )
-    tokens = encoder.params["touch"]["sensor_tokens"]
-    for row in range(10):
-        np.testing.assert_array_equal(tokens[row], stored[row if row < 5 else 9])
-    np.testing.assert_array_equal(untold.params["touch"]["sensor_tokens"], stored)
-    lines: list[str] = []
-    assert encoder.sensor_row("9dtact", lines.append) == 5 and "was not in training" in lines[0]
-    # through `convert` the numbers of the file stay, and what they are of is reported
-    words = ["--model", str(tmp_path / "authors.safetensors"), "--out", str(tmp_path / "again.safetensors")]
-    assert main(["export", "--to", "release", *words]) == 0
-    again = load.read_weights(tmp_path / "again.safetensors")
-    np.testing.assert_array_equal(again["sensor_token"], stored)
-    result = load_encoder(tmp_path / "again.safetensors")
-    assert result.trained_sensors == encoder.trained_sensors
-    np.testing.assert_array_equal(result.params["touch"]["sensor_tokens"], tokens)
-
-
 def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
     with pytest.raises(UserError, match="no run folder or weights file"):
         load_encoder(tmp_path / "gone")
@@ -190,15 +143,6 @@ def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
     np.savez(tmp_path / "features.npz", values=np.zeros((2, 3), np.float32), path=np.array(["a.png", "b.png"]))
     with pytest.raises(UserError, match=r"features\.npz has no weights: path is <U5, not real numbers"):
         load_encoder(tmp_path / "features.npz")
-
-
-def test_weights_that_are_not_finite_embed_nothing(tmp_path, tiny_run):
-    params, text, _ = checkpoint.load_params(tiny_run)
-    params["touch"]["class_token"] = np.full_like(params["touch"]["class_token"], np.nan)
-    about = {safetensors.MODEL_KEY: to_json(from_json(text).model)}
-    safetensors.export_safetensors(tmp_path / "w.safetensors", params, about)
-    with pytest.raises(UserError, match=r"w\.safetensors: touch/class_token has values that are not finite"):
-        load_encoder(tmp_path / "w.safetensors")
 
 
 def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):

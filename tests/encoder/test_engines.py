@@ -24,7 +24,9 @@ def perturbed(encoder, seed=0):
     import jax
 
     rng = np.random.default_rng(seed)
-    moved = jax.tree.map(lambda x: x + 0.1 * rng.standard_normal(x.shape).astype(np.float32), encoder.params)
+    moved = jax.tree.map(
+        lambda x: np.asarray(x) + 0.1 * rng.standard_normal(x.shape).astype(np.float32), encoder.params
+    )
     return replace(encoder, params=moved)
 
 
@@ -51,14 +53,11 @@ def exported(tmp_path_factory, encoder, calibration):
 @pytest.mark.parametrize(
     ("changes", "frames", "pooling"),
     [
-        ({}, 1, "class"),
-        ({"dtype": "bfloat16"}, 3, "both"),
-        ({"patch_encoder": "convolutional"}, 1, "mean"),
+        ({}, 1, "class"), ({"dtype": "bfloat16"}, 3, "both"), ({"patch_encoder": "convolutional"}, 1, "mean"),
         ({"patch_encoder": "convolutional", "activation": "quick_gelu"}, 3, "class"),
-        ({"patch_encoder": "sensor", "pre_norm": False}, 1, "class"),
-        ({"patch_encoder": "sensor"}, 3, "both"),
+        ({"patch_encoder": "sensor", "pre_norm": False}, 1, "class"), ({"patch_encoder": "sensor"}, 3, "both"),
     ],
-)
+)  # fmt: skip
 def test_the_graph_gives_the_features_of_the_live_model(changes, frames, pooling):
     encoder = perturbed(random_encoder(Config(touch_model(**changes))).computed_in("float32"))
     data = engines.touch_graph(encoder.params, encoder.config.model, frames, pooling)

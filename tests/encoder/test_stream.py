@@ -533,10 +533,3 @@ def test_the_budget_names_each_part():
     assert lines["encoder"] == ["50.00", "99.00"] and lines["resize"] == ["2.00", "2.00"]
     assert lines["frame to features"] == ["50.00", "50.00"]
     assert budget(result)[-1] == "101 frames embedded, 100 dropped, 25.0 frames/s"
-
-
-def test_a_stream_does_not_depend_on_the_precision_of_jax(encoder, video):
-    plain = collect(stream(encoder, cv2.VideoCapture(str(video)), live=False, sensor=DIGIT)).values
-    with jax.enable_x64(True):
-        wide = collect(stream(encoder, cv2.VideoCapture(str(video)), live=False, sensor=DIGIT)).values
-    np.testing.assert_array_equal(wide, plain)

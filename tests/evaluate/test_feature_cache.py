@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import jax
 import numpy as np
 import pytest
 from task_world import painted, simulated
@@ -47,13 +46,9 @@ def world(folder: Path, gel: int) -> Manifest:
     """Three touches over a gel of grey `gel`; pictures without compression, so that all are of one size."""
     folder.mkdir()
     columns = {
-        "path": [f"{i}.bmp" for i in ROWS],
-        "sensor": ["digit"] * 3,
-        "sequence": ["a"] * 3,
-        "frame_index": ROWS.tolist(),
-        "split": ["test"] * 3,
-        "background_path": ["background.bmp"] * 3,
-    }
+        "path": [f"{i}.bmp" for i in ROWS], "sensor": ["digit"] * 3, "sequence": ["a"] * 3,
+        "frame_index": ROWS.tolist(), "split": ["test"] * 3, "background_path": ["background.bmp"] * 3,
+    }  # fmt: skip
     for i in ROWS:
         paint(folder / f"{i}.bmp", 100 + 20 * i)
     paint(folder / "background.bmp", gel)
@@ -176,13 +171,6 @@ def test_universal_tokens_for_sensors_that_the_model_knows(encoder, pictures):
     known, universal = (encoder_features(encoder, pictures, universal=one) for one in (False, True))
     rows = np.flatnonzero(np.array(pictures.column("sensor").to_pylist()) == "digit")[:3]
     assert np.abs(known.get(rows[:, None], 1) - universal.get(rows[:, None], 1)).max() > 1e-4
-
-
-def test_features_do_not_depend_on_the_precision_of_jax(encoder, pictures):
-    rows = np.arange(4)[:, None]
-    plain = encoder_features(encoder, pictures).get(rows, 1)
-    with jax.enable_x64(True):
-        np.testing.assert_array_equal(encoder_features(encoder, pictures).get(rows, 1), plain)
 
 
 # ---- raw pixels ---------------------------------------------------------------------------------------------

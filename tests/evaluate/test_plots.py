@@ -135,21 +135,6 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path) -> None:
         plots.tsne_panels(tmp_path / "c.png", {}, [], [])
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> None:
-    path = tmp_path / "a.png"
-    path.write_bytes(b"old")
-
-    def full(self: Path, data: bytes) -> None:
-        with open(self, "wb") as file:
-            file.write(data[:2])
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=r"No space left .*a\.png"):
-        plots.bars(path, {"x": {"a": ShareBar(0.2)}})
-    assert path.read_bytes() == b"old" and [one.name for one in tmp_path.iterdir()] == ["a.png"]
-
-
 def test_pyplot_is_never_loaded() -> None:
     import subprocess
     import sys

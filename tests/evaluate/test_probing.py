@@ -127,14 +127,6 @@ def test_a_number_that_is_not_there_has_no_r2():
     assert one["mean"] < 0.05 and one["mae"] == pytest.approx(one["chance_mae"], rel=0.1)
 
 
-def test_new_objects_are_distinguished_by_their_other_touches():
-    store = planted(labelled_features(MANY, "object", 0.01))
-    (one,) = score_tasks(store, MANY, ["object"], seeds=2)
-    assert one["test"] == 15 * 4 * 2 and one["groups"] == 60  # objects of the test split, both sensors; touches
-    assert len(one["classes"]) == 15
-    assert any("folds" in note for note in one["notes"])
-
-
 def test_a_split_that_shares_objects_is_not_honest():
     """Features that know the object, not its material: a split by picture rewards them, the honest one does not."""
     shared = simulated(objects=40, each=4, shared=True)
@@ -147,25 +139,12 @@ def test_a_split_that_shares_objects_is_not_honest():
     assert honest["test"] == 40 * 4 * 2 and published["test"] == 40 * 2
 
 
-def test_sensors_and_units_learned_from_and_tested(monkeypatch):
-    codes, labelled = MANY.codes("sensor"), labelled_features(MANY, "material", 0.02)
-    store = planted(lambda rows: np.concatenate([labelled(rows), codes[rows][:, None]], 1))
-    fits: list[tuple[Any, Any]] = []
-    plain = heads.fit_head
-
-    def watched(head, x, *rest, **options):
-        fitted = plain(head, x, *rest, **options)
-        return fitted._replace(predict=lambda rows: fits.append((x, rows)) or fitted.predict(rows))
-
-    monkeypatch.setattr(heads, "fit_head", watched)
+def test_sensors_and_units_learned_from_and_tested():
+    store = planted(labelled_features(MANY, "material", 0.02))
     (one,) = score_tasks(store, MANY, ["material"], seeds=1, train_sensors=["digit"], test_sensors=["duragel"])
-    (x, val), (_, test) = fits
-    assert len(set(x[:, -1])) == len(set(test[:, -1])) == 1
-    assert set(x[:, -1]) == set(val[:, -1]) != set(test[:, -1])
     assert one["test"] == 15 * 4
     (one,) = score_tasks(store, MANY, ["material"], seeds=1, train_units=["*_0"], test_units=["digit_1"])
-    assert one["test"] == 15 * 2
-    assert any("*_0" in note for note in one["notes"])
+    assert one["test"] == 15 * 2 and any("*_0" in note for note in one["notes"])
 
 
 def test_two_fingers_are_joined_row_by_row():
@@ -196,17 +175,14 @@ def test_max_rows_is_a_fixed_chance():
 def test_mistakes_are_refused():
     train = table([row(path=f"{i}.png", sequence=f"{i}", label__material="ab"[i % 2]) for i in range(4)])
     for word, world, task, options in (
-        ("seeds", WORLD, "material", {"seeds": 0}),
-        ("max_rows", WORLD, "material", {"max_rows": -3}),
-        ("frames", WORLD, "material", {"frames": -1}),
-        ("taste", WORLD, "taste", {}),
+        ("seeds", WORLD, "material", {"seeds": 0}), ("max_rows", WORLD, "material", {"max_rows": -3}),
+        ("frames", WORLD, "material", {"frames": -1}), ("taste", WORLD, "taste", {}),
         ("forest", WORLD, "material", {"head_names": ("forest",)}),
         ("lucky", WORLD, "material", {"protocols": ("lucky",)}),
-        ("'foam'", WORLD, Task("x", "label.material", classes=("foam",)), {}),
-        ("test", train, "material", {}),
+        ("'foam'", WORLD, Task("x", "label.material", classes=("foam",)), {}), ("test", train, "material", {}),
         ("gelsight", WORLD, "material", {"train_sensors": ["gelsight"]}),
         ("cam0_", WORLD, "material", {"test_units": ["cam0_*"]}),
-    ):
+    ):  # fmt: skip
         with pytest.raises(UserError) as error:
             score_tasks(planted(noise), world, [task], **{"seeds": 1} | options)
         assert word in str(error.value) and "\n" not in str(error.value)
@@ -403,12 +379,8 @@ def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
     assert " N" in probe_table(report["results"], report["paper"])
     for word, change in (("--order", {"order": "shuffled"}), ("--join", {"join": "sum"}), ("probe", {"models": []})):
         changed = {
-            "models": [tiny_run],
-            "data": [data],
-            "tasks": ["material"],
-            "controls": False,
-            "log": quiet,
-        } | change
+            "models": [tiny_run], "data": [data], "tasks": ["material"], "controls": False, "log": quiet,
+        } | change  # fmt: skip
         with pytest.raises(UserError, match=word):
             probe_tasks(**changed)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from tiny_models import tiny_config
+from tiny_models import compiled, tiny_config
 from touch_world import make_touches
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD
@@ -17,12 +17,14 @@ from anytouch_jax.evaluate.reconstruction import (
     plain_reconstruction,
     reconstruction_panels,
 )
-from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch, stage1_terms
 from anytouch_jax.ops.losses import normalise_patches, reconstruction_loss
 from anytouch_jax.ops.tokens import patchify, random_mask
 
 CLIP = np.random.default_rng(0).integers(0, 256, (2, 4, 28, 28, 3), np.uint8)
+
+
+mask = jax.jit(random_mask, static_argnums=1)
 
 
 def patches(clip):
@@ -58,16 +60,18 @@ def test_scores_are_means_over_clips(tmp_path, background):
     config = tiny_config(1)
     config = replace(config, data=replace(config.data, batch_size=2, background=background))
     ends = manifest.clips(4, "test")[:, -1]
-    net = build(config.model)
-    params = net.init(jax.random.key(0))
+    net, params = compiled(config.model).net, compiled(config.model).params
+    terms_of = jax.jit(
+        lambda clip, *rest: stage1_terms(params, normalise_touch(clip), *rest, net=net, config=config)[1]
+    )
+    score = jax.jit(reconstruction_loss, static_argnames="next_frame")
     result = pixel_scores(params, manifest, ends, net=net, config=config)
     sums = dict.fromkeys(result, 0.0)
     for start, (ids, batch) in zip((0, 2, 4), evaluation(manifest, ends, config, "clip", frames=4), strict=True):
-        noise = jax.random.uniform(jax.random.key(start), (2, config.model.patches))
+        noise = np.asarray(jax.random.uniform(jax.random.key(start), (2, config.model.patches)))
         for i in range(len(ids)):
             clip, one = batch.clip[i : i + 1], noise[i : i + 1]
-            terms = stage1_terms(params, normalise_touch(clip), batch.sensor[i : i + 1], one, net=net, config=config)[1]
-            hidden = np.asarray(random_mask(one, config.model.patches // 4)[2])
+            terms, hidden = terms_of(clip, batch.sensor[i : i + 1], one), np.asarray(mask(one, 4)[2])
             target = patches(clip)
             guesses = {
                 "plain ": plain_reconstruction(target, hidden, 3),
@@ -75,7 +79,7 @@ def test_scores_are_means_over_clips(tmp_path, background):
             }
             errors = {"": terms}
             for kind, guess in guesses.items():
-                errors[kind] = reconstruction_loss(guess, target, hidden, next_frame=True)[1]
+                errors[kind] = score(guess, target, hidden, next_frame=True)[1]
             for name in sums:
                 kind, _, term = name.rpartition(" ")
                 sums[name] += float(errors[f"{kind} " if kind else ""][term]) / 5
@@ -97,8 +101,7 @@ def test_what_cannot_be_scored_is_refused(tmp_path):
 # Pictures
 
 CONFIG = tiny_config(1)
-NET = build(CONFIG.model)
-PARAMS = NET.init(jax.random.key(0))
+NET, PARAMS = compiled(CONFIG.model).net, compiled(CONFIG.model).params
 SENSOR = np.asarray([0, 1], np.int32)
 EDGE, TITLE = 4, 16
 
@@ -115,7 +118,7 @@ def cells(image):
 def hidden_pixels(clip, seed=0):
     """Which pixels (B, 28, 28) the figure hides, by the same draw."""
     noise = jax.random.uniform(jax.random.key(seed), (len(clip), 16))
-    hidden = np.asarray(random_mask(noise, 4)[2]).reshape(-1, 4, 4)
+    hidden = np.asarray(mask(noise, 4)[2]).reshape(-1, 4, 4)
     return np.repeat(np.repeat(hidden, 7, axis=1), 7, axis=2)
 
 

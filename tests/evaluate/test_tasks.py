@@ -259,16 +259,11 @@ def manifest(tmp_path):
     described = np.isin(objects, ["object 0", "object 1"]) & (split == "train")
     described |= (objects == "object 2") & (split == "test")
     columns = {
-        "path": [f"{n}.png" for n in number],
-        "sensor": ["digit"] * COUNT,
-        "sequence": [f"s{n // 2}" for n in number],
-        "frame_index": (number % 2).tolist(),
-        "split": split.tolist(),
-        "object": objects.tolist(),
+        "path": [f"{n}.png" for n in number], "sensor": ["digit"] * COUNT, "sequence": [f"s{n // 2}" for n in number],
+        "frame_index": (number % 2).tolist(), "split": split.tolist(), "object": objects.tolist(),
         "text": ["rough" if one else None for one in described],
-        "label.slip": ["yes" if n % 4 == 1 else "no" for n in number],
-        "label.score": number.tolist(),
-    }
+        "label.slip": ["yes" if n % 4 == 1 else "no" for n in number], "label.score": number.tolist(),
+    }  # fmt: skip
     path = tmp_path / "manifest.csv"
     manifests.write(manifests.from_columns(columns, path), path)
     return path

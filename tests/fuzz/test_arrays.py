@@ -61,18 +61,12 @@ def other_type(rng, arrays: Arrays, needed):
     name = pick(rng, needed)
     array = np.asarray(arrays[name])
     kinds = {
-        "text": array.astype(str),
-        "complex": np.zeros(array.shape, complex),
-        "flags": np.zeros(array.shape, bool),
-        "times": np.zeros(array.shape, "M8[s]"),
-        "bytes": np.zeros(array.shape, "S3"),
-        "long": np.zeros(array.shape, np.int64),
-        "records": np.zeros(array.shape, [("a", "f4"), ("b", "i2")]),
-        "void": np.zeros(array.shape, "V7"),
-        "half": np.zeros(array.shape, np.float16),
-        "nothing": np.zeros(array.shape, "U0"),
-        "spans": np.zeros(array.shape, "m8[D]"),
-    }
+        "text": array.astype(str), "complex": np.zeros(array.shape, complex), "flags": np.zeros(array.shape, bool),
+        "times": np.zeros(array.shape, "M8[s]"), "bytes": np.zeros(array.shape, "S3"),
+        "long": np.zeros(array.shape, np.int64), "records": np.zeros(array.shape, [("a", "f4"), ("b", "i2")]),
+        "void": np.zeros(array.shape, "V7"), "half": np.zeros(array.shape, np.float16),
+        "nothing": np.zeros(array.shape, "U0"), "spans": np.zeros(array.shape, "m8[D]"),
+    }  # fmt: skip
     kind = pick(rng, kinds)
     like = {"f": "fiub", "i": "iufb", "u": "iuf", "U": "U"}[array.dtype.kind]
     wrong = kinds[kind].dtype.kind not in like or (array.dtype.kind == "U" and kind == "nothing")
@@ -87,14 +81,9 @@ def other_shape(rng, arrays: Arrays, needed):
     name = pick(rng, needed)
     array = np.asarray(arrays[name])
     shapes = [
-        np.zeros((0, *array.shape[1:]), array.dtype),
-        array[None],
-        np.repeat(array[None], 3, 0),
-        array.ravel()[:1],
-        np.zeros((*array.shape, 0), array.dtype),
-        np.zeros((1,) * 30, array.dtype),
-        array.ravel()[:0],
-    ]
+        np.zeros((0, *array.shape[1:]), array.dtype), array[None], np.repeat(array[None], 3, 0), array.ravel()[:1],
+        np.zeros((*array.shape, 0), array.dtype), np.zeros((1,) * 30, array.dtype), array.ravel()[:0],
+    ]  # fmt: skip
     if array.ndim:
         shapes += [array[:-1], np.concatenate([array, array]), array.reshape(-1)[0]]
     changed = pick(rng, [one for one in shapes if one.shape != array.shape])
@@ -150,15 +139,10 @@ def damaged(rng, arrays: Arrays, needed):
         data = data[: at + 8] + b"\1\0" + data[at + 10 :]
     else:
         data = {
-            "cut": cut(rng, data),
-            "flipped": flipped(rng, data, count=30),
-            "random": rng.bytes(1000),
-            "empty": b"",
-            "directory": flipped(rng, data, data.rfind(b"PK\1\2"), None, 5),
-            "html": b"<!doctype html><html></html>",
-            "npy": member(np.zeros(3)),
-            "text": packed({}) + b"x",
-        }[kind]
+            "cut": cut(rng, data), "flipped": flipped(rng, data, count=30), "random": rng.bytes(1000), "empty": b"",
+            "directory": flipped(rng, data, data.rfind(b"PK\1\2"), None, 5), "html": b"<!doctype html><html></html>",
+            "npy": member(np.zeros(3)), "text": packed({}) + b"x",
+        }[kind]  # fmt: skip
     return f"bytes {kind}", data, kind not in ("flipped", "directory")
 
 
@@ -188,20 +172,9 @@ def legal(rng, arrays: Arrays, needed):
 
 
 CHANGES = (
-    dropped,
-    other_type,
-    other_type,
-    other_shape,
-    other_shape,
-    not_finite,
-    huge,
-    huge,
-    objects,
-    damaged,
-    damaged,
-    more,
+    dropped, other_type, other_type, other_shape, other_shape, not_finite, huge, huge, objects, damaged, damaged, more,
     legal,
-)
+)  # fmt: skip
 
 
 def arrays_of(path: Path) -> Arrays:
@@ -213,12 +186,9 @@ def policy_arrays(things, folder: Path) -> tuple[Arrays, tuple[str, ...]]:
     """A policy as `make pouring` writes it, over the encoder in its folder."""
     shutil.copyfile(things.weights, folder / WEIGHTS)
     about = {
-        "stills": True,
-        "pooling": "class",
-        "sensor": "digit",
-        "votes": 1,
+        "stills": True, "pooling": "class", "sensor": "digit", "votes": 1,
         "encoder": arrays_of(things.features)["about/weights"].item(),
-    }
+    }  # fmt: skip
     arrays = {"mean": np.zeros(12), "basis": np.eye(12)[:, :6], "about": np.asarray(json.dumps(about))}
     for i, (wide, high) in enumerate(((6, 8), (8, 3))):
         arrays |= {f"w/{i}": np.ones((wide, high), np.float32), f"b/{i}": np.zeros(high, np.float32)}
@@ -266,22 +236,10 @@ def exported(rng, folder: Path) -> Case:
     file = folder / "e.bin"
     data = rng.bytes(500)
     about: dict[str, Any] = {
-        "format": export.FORMAT,
-        "file": "e.bin",
-        "bytes": len(data),
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "jax": "0.10",
-        "platforms": ["cpu"],
-        "frames": 1,
-        "image_size": 28,
-        "features": 12,
-        "background": "keep",
-        "pooling": "class",
-        "join": "mean",
-        "dtype": "float32",
-        "sensors": {"universal": 0},
-        "trained_sensors": None,
-    }
+        "format": export.FORMAT, "file": "e.bin", "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest(),
+        "jax": "0.10", "platforms": ["cpu"], "frames": 1, "image_size": 28, "features": 12, "background": "keep",
+        "pooling": "class", "join": "mean", "dtype": "float32", "sensors": {"universal": 0}, "trained_sensors": None,
+    }  # fmt: skip
     kind = pick(rng, "none, field, type, bytes, cut, text, json")
     fields = ("format", "bytes", "sha256", "jax", "platforms", "frames", "image_size", "features", "sensors")
     name = pick(rng, fields)
@@ -307,10 +265,6 @@ def exported(rng, folder: Path) -> Case:
     return Case(f"exported: {kind} {name}", (lambda: (export.load(file), 0)[1]) if loads else ("info", file), True)
 
 
-def test_hostile_arrays(survives):
-    survives(make, 40)
-
-
-@pytest.mark.slow
-def test_many_hostile_arrays(survives):
-    survives(make, 0.14)
+@pytest.mark.parametrize("count", [40, pytest.param(0.14, marks=pytest.mark.slow)])
+def test_hostile_arrays(survives, count):
+    survives(make, count)

@@ -13,39 +13,11 @@ from tests.fuzz.harness import Case, cut, flipped, pick
 from tests.fuzz.test_weights import safetensors
 
 VALUES = (
-    "NaN",
-    "Infinity",
-    "-Infinity",
-    "1e400",
-    "-1e999",
-    "9" * 5000,
-    "-" + "9" * 100_000,
-    "1" + "0" * 60,
-    '"\\ud800"',
-    '"\\udc00\\ud800"',
-    '"' + "x" * 1_000_000 + '"',
-    "[" * 100_000 + "]" * 100_000,
-    '{"a":' * 5000 + "1" + "}" * 5000,
-    "null",
-    "true",
-    "[]",
-    "{}",
-    "-0",
-    "1e-400",
-    '""',
-    "[1,]",
-    "01",
-    "+1",
-    ".5",
-    "'a'",
-    "0x10",
-    "// x\n1",
-    '"\x01"',
-    "1.5",
-    "-1",
-    '"\\u0000"',
-    "1" * 39,
-)
+    "NaN", "Infinity", "-Infinity", "1e400", "-1e999", "9" * 5000, "-" + "9" * 100_000, "1" + "0" * 60, '"\\ud800"',
+    '"\\udc00\\ud800"', '"' + "x" * 1_000_000 + '"', "[" * 100_000 + "]" * 100_000, '{"a":' * 5000 + "1" + "}" * 5000,
+    "null", "true", "[]", "{}", "-0", "1e-400", '""', "[1,]", "01", "+1", ".5", "'a'", "0x10", "// x\n1", '"\x01"',
+    "1.5", "-1", '"\\u0000"', "1" * 39,
+)  # fmt: skip
 BROKEN = {"[1,]", "01", "+1", ".5", "'a'", "0x10", "// x\n1", '"\x01"'}
 BAD = BROKEN | {
     value
@@ -94,16 +66,12 @@ def spoiled(rng, text: str) -> tuple[str, bytes, bool]:
     return (
         kind,
         {
-            "cut": cut(rng, text.rstrip().encode()),
-            "bytes": flipped(rng, text.encode(), count=3),
-            "list": f"[{text}]".encode(),
-            "mark": b"\xef\xbb\xbf" + text.encode(),
-            "wide": text.encode("utf-16"),
-            "empty": b"",
-            "after": text.encode() + b"}",
+            "cut": cut(rng, text.rstrip().encode()), "bytes": flipped(rng, text.encode(), count=3),
+            "list": f"[{text}]".encode(), "mark": b"\xef\xbb\xbf" + text.encode(), "wide": text.encode("utf-16"),
+            "empty": b"", "after": text.encode() + b"}",
         }[kind],
         kind in ("cut", "list", "wide", "empty", "after"),
-    )
+    )  # fmt: skip
 
 
 def make(rng, folder: Path, things) -> Case:
@@ -135,20 +103,11 @@ def make(rng, folder: Path, things) -> Case:
     elif kind == "exported":
         (folder / "e.bin").write_bytes(b"abc")
         about = {
-            "format": "anytouch_jax.export.1",
-            "bytes": 3,
-            "sha256": "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad",
-            "jax": "0",
-            "platforms": ["cpu"],
-            "frames": 1,
-            "image_size": 28,
-            "features": 12,
-            "background": "keep",
-            "pooling": "class",
-            "join": "mean",
-            "dtype": "float32",
-            "sensors": {"universal": 0},
-        }
+            "format": "anytouch_jax.export.1", "bytes": 3,
+            "sha256": "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad", "jax": "0",
+            "platforms": ["cpu"], "frames": 1, "image_size": 28, "features": 12, "background": "keep",
+            "pooling": "class", "join": "mean", "dtype": "float32", "sensors": {"universal": 0},
+        }  # fmt: skip
         name, data, bad = spoiled(rng, json.dumps(about))
         (folder / "e.bin.json").write_bytes(data)
         words = ("info", folder / "e.bin")
@@ -174,10 +133,6 @@ def make(rng, folder: Path, things) -> Case:
     return Case(f"{kind}: {name}", words, bad)
 
 
-def test_hostile_json(survives):
-    survives(make, 30)
-
-
-@pytest.mark.slow
-def test_much_hostile_json(survives):
-    survives(make, 0.06)
+@pytest.mark.parametrize("count", [30, pytest.param(0.06, marks=pytest.mark.slow)])
+def test_hostile_json(survives, count):
+    survives(make, count)

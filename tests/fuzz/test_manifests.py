@@ -18,21 +18,8 @@ REQUIRED = ("path", "sensor", "sequence", "frame_index", "split")
 HUGE = "9" * 40
 WRONG = {
     "path": (
-        "",
-        "../other.png",
-        "/etc/hostname",
-        "C:\\data\\a0.png",
-        "..\\a0.png",
-        "a\0b.png",
-        "missing.png",
-        ".",
-        "a" * 5000,
-        "\ud83d",
-        "a0.png\n",
-        "~/a0.png",
-        "http://a/b.png",
-        "a0.png/3",
-        "x.zip/0",
+        "", "../other.png", "/etc/hostname", "C:\\data\\a0.png", "..\\a0.png", "a\0b.png", "missing.png", ".",
+        "a" * 5000, "\ud83d", "a0.png\n", "~/a0.png", "http://a/b.png", "a0.png/3", "x.zip/0",
         "x.zip/99999999999999999999",
     ),
     "sensor": ("", " ", "Digit ", "universal", "x" * 1_000_000, "dígit"),
@@ -41,7 +28,7 @@ WRONG = {
     "split": ("", "training", "Train", "TEST", " val", "x" * 1_000_000, "train;test", "0"),
     "stride": ("0", "-1", "abc", "1.5", "nan", HUGE),
     "image_path": ("../x.png", "missing.png", "/dev/zero", "C:\\x.png"),
-}
+}  # fmt: skip
 # Values of these columns may be used by some commands, and refused by none.
 LENIENT = {"sensor": ("Digit ", "universal", "x" * 1_000_000, "dígit"), "frame_index": ("\u0661",), "split": (" val",)}
 FILES_ONLY = ("path", "image_path")  # commands that open no file need not look at these
@@ -192,13 +179,9 @@ def labels(rng, rows):
     """Numbers that are none, and classes written in two ways."""
     kind = pick(rng, "two spellings, number and word, infinite, huge, not a number, mixed")
     values = {
-        "two spellings": ["Ball", "ball"] * 6,
-        "number and word": ["1"] * 11 + ["O"],
-        "infinite": ["1", "inf"] * 6,
-        "huge": ["1e400", "2"] * 6,
-        "not a number": ["nan", "3"] * 6,
-        "mixed": ["1", "true", "x", "2.5"] * 3,
-    }[kind]
+        "two spellings": ["Ball", "ball"] * 6, "number and word": ["1"] * 11 + ["O"], "infinite": ["1", "inf"] * 6,
+        "huge": ["1e400", "2"] * 6, "not a number": ["nan", "3"] * 6, "mixed": ["1", "true", "x", "2.5"] * 3,
+    }[kind]  # fmt: skip
     for row, value in zip(rows, values, strict=True):
         row["label.object"] = value
     wrong = kind in ("two spellings", "number and word")
@@ -209,16 +192,11 @@ def bytes_of_another(rng, rows):
     data = pick(
         rng,
         (
-            b"PK\3\4" + rng.bytes(300),
-            b"<!doctype html><html></html>",
-            b"PAR1" + bytes(50) + b"PAR1",
-            b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 2\n",
-            rng.bytes(2000),
-            b"\xef\xbb\xbf",
-            b"{}",
-            b"PAR1",
+            b"PK\3\4" + rng.bytes(300), b"<!doctype html><html></html>", b"PAR1" + bytes(50) + b"PAR1",
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 2\n", rng.bytes(2000), b"\xef\xbb\xbf",
+            b"{}", b"PAR1",
         ),
-    )
+    )  # fmt: skip
     return f"bytes {data[:9]!r}", data, True, True
 
 
@@ -238,23 +216,16 @@ def typed(rng, arrays):
     """A column of another type."""
     count = len(arrays["path"])
     kinds = {
-        "bytes": pa.array([b"a\xff"] * count),
-        "lists": pa.array([["a"]] * count),
-        "records": pa.array([{"a": 1}] * count),
-        "floats": pa.array(np.linspace(0, 1, count)),
-        "NaN": pa.array([float("nan")] * count),
-        "nothing": pa.nulls(count),
-        "booleans": pa.array([True] * count),
-        "times": pa.array([0] * count, pa.timestamp("ns")),
-        "half": pa.array(np.zeros(count, np.float16)),
+        "bytes": pa.array([b"a\xff"] * count), "lists": pa.array([["a"]] * count),
+        "records": pa.array([{"a": 1}] * count), "floats": pa.array(np.linspace(0, 1, count)),
+        "NaN": pa.array([float("nan")] * count), "nothing": pa.nulls(count), "booleans": pa.array([True] * count),
+        "times": pa.array([0] * count, pa.timestamp("ns")), "half": pa.array(np.zeros(count, np.float16)),
         "unsigned": pa.array([(1 << 64) - 1] * count, pa.uint64()),
         "decimal": pa.array([1] * count, pa.int64()).cast(pa.decimal128(30, 2)),
-        "months": pa.array([1] * count, pa.date32()),
-        "durations": pa.array([1] * count, pa.duration("s")),
-        "infinite": pa.array([np.inf] * count),
-        "map": pa.array([[("a", 1)]] * count, pa.map_(pa.string(), pa.int64())),
+        "months": pa.array([1] * count, pa.date32()), "durations": pa.array([1] * count, pa.duration("s")),
+        "infinite": pa.array([np.inf] * count), "map": pa.array([[("a", 1)]] * count, pa.map_(pa.string(), pa.int64())),
         "fixed": pa.array([b"ab"] * count, pa.binary(2)),
-    }
+    }  # fmt: skip
     kind, name = (
         pick(rng, kinds),
         pick(rng, (*REQUIRED, "stride", "text", "touch", "object", "commercial", "label.object", "note")),
@@ -367,10 +338,6 @@ def make(rng, folder: Path, things) -> Case:
     return Case(f"{name}, {command}", commands[command], wrong or (wrong_files and opens and command != "embed"))
 
 
-def test_hostile_manifests(survives):
-    survives(make, 25)
-
-
-@pytest.mark.slow
-def test_many_hostile_manifests(survives):
-    survives(make, 0.2)
+@pytest.mark.parametrize("count", [25, pytest.param(0.2, marks=pytest.mark.slow)])
+def test_hostile_manifests(survives, count):
+    survives(make, count)

@@ -14,39 +14,13 @@ from anytouch_jax.cli.train import Sections
 from tests.fuzz.harness import Case, pick
 
 NEVER = (
-    "nan",
-    "NaN",
-    "inf",
-    "-inf",
-    "1e400",
-    "-1e400",
-    "abc",
-    "0x10",
-    "1,5",
-    "½",
-    "--",
-    "None5",
-    "1 2",
-    "[1]",
-    "9" * 5000,
+    "nan", "NaN", "inf", "-inf", "1e400", "-1e400", "abc", "0x10", "1,5", "½", "--", "None5", "1 2", "[1]", "9" * 5000,
     "٣.x",
-)
+)  # fmt: skip
 SELDOM = (
-    "",
-    "-1",
-    "0",
-    "-0",
-    "-1e30",
-    "1e30",
-    "1e-400",
-    "99999999999999999999",
-    "1_000",
-    "１",
-    "1.5",
-    "-9223372036854775809",
-    " 3",
-    "2147483648",
-)
+    "", "-1", "0", "-0", "-1e30", "1e30", "1e-400", "99999999999999999999", "1_000", "１", "1.5",
+    "-9223372036854775809", " 3", "2147483648",
+)  # fmt: skip
 HARMLESS = {"above"}  # any number is one of these
 
 
@@ -100,10 +74,6 @@ def make(rng, folder: Path, things) -> Case:
     return Case(f"{command} {option} {value[:20]!r}", (*command.split(), *given, *joined), value in NEVER)
 
 
-def test_hostile_numbers(survives):
-    survives(make, 60)
-
-
-@pytest.mark.slow
-def test_many_hostile_numbers(survives):
-    survives(make, 0.05)
+@pytest.mark.parametrize("count", [60, pytest.param(0.05, marks=pytest.mark.slow)])
+def test_hostile_numbers(survives, count):
+    survives(make, count)

@@ -66,64 +66,6 @@ def wrong_ending(rng):
     return f"{ending} as {other}", encoded(pixels, ending), other, True, pixels
 
 
-def odd_mode(rng):
-    pixels = picture(rng)
-    rgb, grey = Image.fromarray(pixels), np.repeat(pixels[..., :1], 3, 2)
-    opaque = np.dstack([pixels, np.full(pixels.shape[:2], 255, np.uint8)])
-    palette = rgb.quantize(64)
-    two = Image.fromarray(pixels[..., 0]).point(lambda value: 255 * (value > 127))
-    choices = {
-        "palette": (palette, "png", np.asarray(palette.convert("RGB"))),
-        "CMYK": (rgb.convert("CMYK"), "jpg", pixels),
-        "alpha": (Image.fromarray(opaque), "png", pixels),
-        "grey": (Image.fromarray(pixels[..., 0]), "jpg", grey),
-        "grey and alpha": (Image.fromarray(opaque).convert("LA"), "png", None),
-        "one bit": (two.convert("1"), "png", np.repeat(np.asarray(two)[..., None], 3, 2)),
-        "progressive": (rgb, "jpg", pixels),
-        "interlaced": (rgb, "png", pixels),
-    }
-    name = pick(rng, choices)
-    image, ending, expected = choices[name]
-    stream = io.BytesIO()
-    options = {"quality": 95, "progressive": name == "progressive"} if ending == "jpg" else {}
-    image.save(stream, {"jpg": "JPEG"}.get(ending, "PNG"), **options)
-    return name, stream.getvalue(), ending, True, expected
-
-
-def deep(rng):
-    """16 bits, floats and other types."""
-    pixels, kind = picture(rng), pick(rng, ("u2 png", "u2 tiff", "f4 tiff", "f4 npy", "f8 npy", "u2 npy", ">u2 npy"))
-    dtype, ending = kind.split()
-    scaled = pixels.astype(np.uint16) * 257 if "u2" in dtype else pixels / np.float32(255)
-    scaled = scaled.astype(dtype)
-    if ending == "npy":
-        return kind, encoded(scaled, "npy"), "npy", True, pixels
-    return kind, cv2.imencode(f".{ending}", scaled[..., ::-1])[1].tobytes(), ending, True, pixels
-
-
-def turned(rng):
-    pixels, value = picture(rng), int(rng.integers(0, 12))
-    exif = Image.Exif()
-    exif[274] = value
-    turn = {2: (0, 1), 3: (2, 0), 4: (2, 1), 5: (1, 1), 6: (-1, 0), 7: (-1, 1), 8: (1, 0)}.get(value, (0, 0))
-    upright = np.rot90(pixels, turn[0])
-    upright = upright[:, ::-1] if turn[1] else upright
-    if value == 5:
-        upright = pixels.swapaxes(0, 1)
-    elif value == 7:
-        upright = pixels[::-1, ::-1].swapaxes(0, 1)
-    ending = pick(rng, ("jpg", "png", "webp"))
-    return f"orientation {value} in {ending}", encoded(pixels, ending, exif=exif), ending, True, upright
-
-
-def animated(rng):
-    frames = [Image.fromarray(np.roll(picture(np.random.default_rng(1)), 5 * i, 1)) for i in range(3)]
-    ending = pick(rng, ("png", "webp", "tiff", "gif"))
-    stream = io.BytesIO()
-    frames[0].save(stream, ending.upper(), save_all=True, append_images=frames[1:])
-    return f"animated {ending}", stream.getvalue(), "png" if ending == "gif" else ending, ending != "gif", None
-
-
 def padded(rng):
     pixels, ending = picture(rng), pick(rng, FORMATS[:5])
     tail = pick(rng, (b"\0", b"\xff", b"\xff\xd9", b"IEND", b"\x89PNG\r\n")) * int(rng.integers(1, 200_000))
@@ -153,12 +95,9 @@ def scans(rng):
     at = data.rfind(b"\xff\xda")
     count = int(rng.integers(2, 3000))
     return (
-        f"progressive jpg of {size} pixels, {count} scans",
-        data[:at] + data[at:-2] * count + b"\xff\xd9",
-        "jpg",
-        True,
+        f"progressive jpg of {size} pixels, {count} scans", data[:at] + data[at:-2] * count + b"\xff\xd9", "jpg", True,
         None,
-    )
+    )  # fmt: skip
 
 
 def shortened(rng):
@@ -196,21 +135,11 @@ def nothing(rng):
     content = pick(
         rng,
         (
-            b"",
-            b"\0",
-            bytes(5000),
-            b"\xff" * 300,
-            b"<!doctype html><html>404</html>",
-            b"not a picture",
-            b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n",
-            b"BM",
-            b"II*\0",
-            b"RIFF",
-            b"\x89PNG\r\n\x1a\n",
-            b"\xff\xd8\xff\xd9",
-            rng.bytes(3000),
+            b"", b"\0", bytes(5000), b"\xff" * 300, b"<!doctype html><html>404</html>", b"not a picture",
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", b"BM", b"II*\0", b"RIFF",
+            b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xd9", rng.bytes(3000),
         ),
-    )
+    )  # fmt: skip
     return f"{ending} of {content[:12]!r}", content, ending, False, None
 
 
@@ -250,14 +179,11 @@ def chunks(rng):
     bomb = zlib.compress(bytes(int(rng.integers(10, 200)) << 20), 9)
     kind = pick(rng, "text, empty, zTXt, iCCP, iTXt, length, data")
     more = {
-        "text": chunk(b"tEXt", b"a\0b") * count,
-        "empty": chunk(b"IDAT", b"") * count,
-        "zTXt": chunk(b"zTXt", b"a\0\0" + bomb),
-        "iCCP": chunk(b"iCCP", b"a\0\0" + bomb),
-        "iTXt": chunk(b"iTXt", b"a\0\1\0\0\0" + bomb),
-        "length": chunk(b"tEXt", b"a\0b", (1 << 31) - 1),
+        "text": chunk(b"tEXt", b"a\0b") * count, "empty": chunk(b"IDAT", b"") * count,
+        "zTXt": chunk(b"zTXt", b"a\0\0" + bomb), "iCCP": chunk(b"iCCP", b"a\0\0" + bomb),
+        "iTXt": chunk(b"iTXt", b"a\0\1\0\0\0" + bomb), "length": chunk(b"tEXt", b"a\0b", (1 << 31) - 1),
         "data": chunk(b"IDAT", bomb),
-    }[kind]
+    }[kind]  # fmt: skip
     return f"png with a chunk bomb: {kind}", png(width, height, strip(pixels), more), "png", kind != "length", None
 
 
@@ -285,23 +211,13 @@ def broken_png(rng):
 def odd_array(rng):
     pixels = picture(rng)
     wrong = {
-        "NaN": np.full((30, 30, 3), np.nan, np.float32),
-        "above 1": pixels.astype(np.float32),
-        "below 0": pixels / -255.0 - 0.1,
-        "infinite": np.full((30, 30), np.inf),
-        "signed": pixels.astype(np.int8),
-        "long": pixels.astype(np.int64),
-        "complex": pixels.astype(complex),
-        "text": np.array([["a", "b"]]),
-        "zero": np.zeros((0, 30, 3), np.uint8),
-        "four axes": pixels[None],
-        "one axis": pixels.ravel(),
-        "two channels": pixels[..., :2],
-        "scalar": np.uint8(3),
-        "strip": np.zeros((1, 5000, 3), np.uint8),
-        "times": np.array([["2020-01-01"]], "M8[D]"),
-        "records": np.zeros((30, 30), [("a", "u1"), ("b", "f4")]),
-    }
+        "NaN": np.full((30, 30, 3), np.nan, np.float32), "above 1": pixels.astype(np.float32),
+        "below 0": pixels / -255.0 - 0.1, "infinite": np.full((30, 30), np.inf), "signed": pixels.astype(np.int8),
+        "long": pixels.astype(np.int64), "complex": pixels.astype(complex), "text": np.array([["a", "b"]]),
+        "zero": np.zeros((0, 30, 3), np.uint8), "four axes": pixels[None], "one axis": pixels.ravel(),
+        "two channels": pixels[..., :2], "scalar": np.uint8(3), "strip": np.zeros((1, 5000, 3), np.uint8),
+        "times": np.array([["2020-01-01"]], "M8[D]"), "records": np.zeros((30, 30), [("a", "u1"), ("b", "f4")]),
+    }  # fmt: skip
     name = pick(rng, wrong)
     return f"array: {name}", encoded(wrong[name], "npy"), "npy", False, None
 
@@ -313,28 +229,9 @@ def objects(rng):
 
 
 KINDS = (
-    whole,
-    wrong_ending,
-    odd_mode,
-    deep,
-    turned,
-    animated,
-    padded,
-    stuffed,
-    scans,
-    shortened,
-    shortened,
-    bytes_lost,
-    scrambled,
-    header,
-    nothing,
-    giant,
-    giant,
-    chunks,
-    broken_png,
-    odd_array,
-    objects,
-)
+    whole, wrong_ending, padded, stuffed, scans, shortened, shortened, bytes_lost,
+    scrambled, header, nothing, giant, giant, chunks, broken_png, odd_array, objects,
+)  # fmt: skip
 
 
 def make(rng, folder: Path, things) -> Case:
@@ -403,10 +300,6 @@ def film(rng, folder: Path, things) -> Case:
     )
 
 
-def test_hostile_pictures(survives):
-    survives(make, 25)
-
-
-@pytest.mark.slow
-def test_many_hostile_pictures(survives):
-    survives(make, 0.24)
+@pytest.mark.parametrize("count", [25, pytest.param(0.24, marks=pytest.mark.slow)])
+def test_hostile_pictures(survives, count):
+    survives(make, count)

@@ -14,26 +14,9 @@ from anytouch_jax.evaluate.plots import loss_curves
 from tests.fuzz.harness import Case, cut, flipped, pick
 
 ODD: tuple[Any, ...] = (
-    None,
-    True,
-    -1,
-    0,
-    1.5,
-    10**10,
-    1 << 60,
-    10**30,
-    "",
-    "x",
-    "y" * 100_000,
-    [],
-    {},
-    [1],
-    [[]],
-    {"a": 1},
-    [None] * 3,
-    [[[]]],
-    ["a", 3],
-)
+    None, True, -1, 0, 1.5, 10**10, 1 << 60, 10**30, "", "x", "y" * 100_000, [], {}, [1], [[]], {"a": 1}, [None] * 3,
+    [[[]]], ["a", 3],
+)  # fmt: skip
 
 
 def rewritten(folder: Path, record: Any, *, text: str | None = None) -> None:
@@ -70,17 +53,9 @@ def shape(rng, folder, record):
             ] = form
     else:
         changed = {
-            "huge": [10**10],
-            "many": [1 << 20] * 3,
-            "negative": [-1],
-            "zero": [0, *form[0]],
-            "more": [*form[0], 2],
-            "float": [1.5],
-            "none": None,
-            "type": form[0],
-            "dtype": form[0],
-            "text": "12",
-        }[kind]
+            "huge": [10**10], "many": [1 << 20] * 3, "negative": [-1], "zero": [0, *form[0]], "more": [*form[0], 2],
+            "float": [1.5], "none": None, "type": form[0], "dtype": form[0], "text": "12",
+        }[kind]  # fmt: skip
         dtype = {
             "type": pick(rng, ODD),
             "dtype": pick(rng, ("int8", "object", "U3", "float32 ", "bool", "complex64", "V8", "M8[s]")),
@@ -178,22 +153,11 @@ def texts(rng, folder, record):
     text = pick(
         rng,
         (
-            "",
-            "[]",
-            "null",
-            "{}",
-            '{"checksum": 1, "record": {}}',
-            "[" * 200_000,
-            good[:-3],
-            "5" * 5000,
-            good.replace(":", ""),
-            '{"checksum": NaN, "record": null}',
-            '{"checksum": 1e400, "record": 3}',
-            "\ufeff" + good,
-            good.replace('"step": 1', '"step": 1e999'),
-            '{"checksum": "x", "record": "\\ud800"}',
+            "", "[]", "null", "{}", '{"checksum": 1, "record": {}}', "[" * 200_000, good[:-3], "5" * 5000,
+            good.replace(":", ""), '{"checksum": NaN, "record": null}', '{"checksum": 1e400, "record": 3}',
+            "\ufeff" + good, good.replace('"step": 1', '"step": 1e999'), '{"checksum": "x", "record": "\\ud800"}',
         ),
-    )
+    )  # fmt: skip
     rewritten(folder, record, text=text)
     return f"record {text[:30]!r}", True, True
 
@@ -213,18 +177,9 @@ def make(rng, folder: Path, things) -> Case:
     export = ("export", "--to", "safetensors", "--model", place, "--out", folder / "out.safetensors")
     embed = ("embed", "--model", place, "--data", things.frames, "--out", folder / "f.npz")
     adapt = (
-        "adapt",
-        "--model",
-        place,
-        "--data",
-        things.manifest,
-        "--sensor",
-        "gelslim",
-        "--frames",
-        "0",
-        "--out",
+        "adapt", "--model", place, "--data", things.manifest, "--sensor", "gelslim", "--frames", "0", "--out",
         folder / "new",
-    )
+    )  # fmt: skip
     words = pick(rng, (("info", place), ("info", place), export, export, export, embed if used else export, adapt))
     return Case(f"{name}, {words[0]}", words, described if words[0] == "info" else used)
 
@@ -236,27 +191,12 @@ def metrics(rng, folder: Path) -> Case:
     bad = pick(
         rng,
         (
-            "",
-            "{",
-            "[]",
-            "null",
-            '{"step": 3}',
-            '{"loss": 1}',
-            '{"step": "x", "loss": 1}',
-            '{"step": 1, "loss": "y"}',
-            "NaN",
-            '{"step": 1, "loss": NaN}',
-            '{"step": 1, "loss": [1]}',
-            "[" * 100_000,
-            '{"step": 1, "loss": ' + "9" * 5000 + "}",
-            '{"step": 1e400, "loss": 1}',
-            '{"step": -1, "loss": -1}',
-            "\0" * 500,
-            "3",
-            '"text"',
-            '{"step": true, "loss": {}}',
+            "", "{", "[]", "null", '{"step": 3}', '{"loss": 1}', '{"step": "x", "loss": 1}', '{"step": 1, "loss": "y"}',
+            "NaN", '{"step": 1, "loss": NaN}', '{"step": 1, "loss": [1]}', "[" * 100_000,
+            '{"step": 1, "loss": ' + "9" * 5000 + "}", '{"step": 1e400, "loss": 1}', '{"step": -1, "loss": -1}',
+            "\0" * 500, "3", '"text"', '{"step": true, "loss": {}}',
         ),
-    )
+    )  # fmt: skip
     lines[at] = bad
     data = ("\n".join(lines) + "\n").encode()
     if rng.random() < 0.3:
@@ -273,10 +213,6 @@ def metrics(rng, folder: Path) -> Case:
     return Case(f"metrics: {bad[:30]!r}", lambda: (loss_curves(folder / "f.png", {"run": folder}), 0)[1])
 
 
-def test_hostile_runs(survives):
-    survives(make, 25)
-
-
-@pytest.mark.slow
-def test_many_hostile_runs(survives):
-    survives(make, 0.1)
+@pytest.mark.parametrize("count", [25, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_hostile_runs(survives, count):
+    survives(make, count)

@@ -14,26 +14,9 @@ from anytouch_jax.data.manifest import manifest as manifests
 from tests.fuzz.harness import Case, pick
 
 ODD = (
-    None,
-    True,
-    -1,
-    0,
-    1.5,
-    "x",
-    "",
-    [],
-    {},
-    10**400,
-    "9" * 5000,
-    float("nan"),
-    float("inf"),
-    [1],
-    {"a": 1},
-    "\ud800",
-    1e308,
-    "12",
-    -(10**30),
-)
+    None, True, -1, 0, 1.5, "x", "", [], {}, 10**400, "9" * 5000, float("nan"), float("inf"), [1], {"a": 1}, "\ud800",
+    1e308, "12", -(10**30),
+)  # fmt: skip
 
 
 def odd_usage(rng):
@@ -48,17 +31,11 @@ def odd_caption(rng):
     caption = pick(
         rng,
         (
-            *ODD,
-            "Soft \ud800 and fuzzy all over it.",
-            "Soft and\0fuzzy all over it.",
-            "a " * 5000,
-            "é" * 100_000,
-            "\u202eSoft and fuzzy all over",
-            "I am sorry, I cannot help with that.",
-            "\x1b[2JSoft and fuzzy all over",
+            *ODD, "Soft \ud800 and fuzzy all over it.", "Soft and\0fuzzy all over it.", "a " * 5000, "é" * 100_000,
+            "\u202eSoft and fuzzy all over", "I am sorry, I cannot help with that.", "\x1b[2JSoft and fuzzy all over",
             "Soft\ud83d\ude00 and fuzzy all over it",
         ),
-    )
+    )  # fmt: skip
     answer = pick(
         rng,
         (
@@ -74,17 +51,10 @@ def odd_content(rng):
     content = pick(
         rng,
         (
-            "",
-            "[" * 100_000,
-            "5" * 5000,
-            "```json\n{}\n```",
-            '{"caption": NaN}',
-            "null",
-            "\ud800",
-            '{"caption": "a", "caption": 3}',
-            "x" * 3_000_000,
+            "", "[" * 100_000, "5" * 5000, "```json\n{}\n```", '{"caption": NaN}', "null", "\ud800",
+            '{"caption": "a", "caption": 3}', "x" * 3_000_000,
         ),
-    )
+    )  # fmt: skip
     return f"content {content[:12]!r}", (200, {}, chat(content))
 
 
@@ -111,50 +81,18 @@ def odd_status(rng):
         pick(
             rng,
             (
-                100,
-                102,
-                199,
-                201,
-                204,
-                206,
-                301,
-                302,
-                307,
-                400,
-                401,
-                403,
-                404,
-                408,
-                409,
-                413,
-                418,
-                422,
-                429,
-                500,
-                502,
-                503,
-                504,
-                529,
-                599,
-                600,
-                999,
+                100, 102, 199, 201, 204, 206, 301, 302, 307, 400, 401, 403, 404, 408, 409, 413, 418, 422, 429, 500, 502,
+                503, 504, 529, 599, 600, 999,
             ),
         )
-    )
+    )  # fmt: skip
     body = pick(
         rng,
         (
-            {"error": {"message": "no"}},
-            {"error": "x" * 100_000},
-            {"error": {"message": "\ud800 \x1b[31m"}},
-            {"error": 3},
-            {},
-            "[" * 100_000,
-            "<html>" * 1000,
-            {"error": {"message": {"a": "b" * 5000}}},
-            None,
+            {"error": {"message": "no"}}, {"error": "x" * 100_000}, {"error": {"message": "\ud800 \x1b[31m"}},
+            {"error": 3}, {}, "[" * 100_000, "<html>" * 1000, {"error": {"message": {"a": "b" * 5000}}}, None,
         ),
-    )
+    )  # fmt: skip
     data = body.encode() if isinstance(body, str) else json.dumps(body).encode()
     return f"status {status}", (status, {"Location": pick(rng, ("/", "http://127.0.0.1:1/", "ftp://x", ""))}, data)
 
@@ -163,20 +101,10 @@ def odd_wait(rng):
     value = pick(
         rng,
         (
-            "1e9",
-            "1000000000",
-            "-5",
-            "nan",
-            "inf",
-            "Wed, 21 Oct 2099 07:28:00 GMT",
-            "x",
-            "",
-            "1e400",
-            "0",
-            "9" * 400,
+            "1e9", "1000000000", "-5", "nan", "inf", "Wed, 21 Oct 2099 07:28:00 GMT", "x", "", "1e400", "0", "9" * 400,
             "Wed, 99 Foo 2099",
         ),
-    )
+    )  # fmt: skip
     status = int(pick(rng, (429, 503, 408)))
     name = pick(rng, ("Retry-After", "Retry-After-Ms"))
     headers = {name: value} if name == "Retry-After-Ms" else {"Retry-After-Ms": "", name: value}
@@ -203,15 +131,10 @@ def odd_bytes(rng):
         }
     else:
         body = {
-            "empty": b"",
-            "null": b"null",
-            "invalid": b"\xff\xfe" + good,
-            "utf-16": good.decode().encode("utf-16"),
-            "html": b"<html></html>",
-            "nested": b"[" * 200_000,
-            "NaN": b'{"choices": NaN}',
+            "empty": b"", "null": b"null", "invalid": b"\xff\xfe" + good, "utf-16": good.decode().encode("utf-16"),
+            "html": b"<html></html>", "nested": b"[" * 200_000, "NaN": b'{"choices": NaN}',
             "digits": b'{"choices": ' + b"9" * 10_000 + b"}",
-        }[kind]
+        }[kind]  # fmt: skip
     return f"bytes: {kind}", (200, headers, body)
 
 
@@ -225,21 +148,9 @@ def make(rng, folder: Path, things) -> Case:
     file = folder / "m.csv"
     file.write_text("path,sensor,sequence,frame_index,split,dataset,image_path\nt.npy,digit,s,0,train,x,p.npy\n")
     words = [
-        "data",
-        "annotate",
-        str(file),
-        "--yes",
-        "--family",
-        "x",
-        "photograph",
-        "--tries",
-        "2",
-        "--timeout",
-        "5",
-        "--sheet",
-        str(folder / "s.html"),
-        "--url",
-    ]
+        "data", "annotate", str(file), "--yes", "--family", "x", "photograph", "--tries", "2", "--timeout", "5",
+        "--sheet", str(folder / "s.html"), "--url",
+    ]  # fmt: skip
 
     def ask() -> int:
         from anytouch_jax.cli.app import main
@@ -254,10 +165,6 @@ def make(rng, folder: Path, things) -> Case:
     return Case(name, ask, False, check)
 
 
-def test_odd_answers(survives):
-    survives(make, 8)
-
-
-@pytest.mark.slow
-def test_many_odd_answers(survives):
-    survives(make, 0.03)
+@pytest.mark.parametrize("count", [8, pytest.param(0.03, marks=pytest.mark.slow)])
+def test_odd_answers(survives, count):
+    survives(make, count)

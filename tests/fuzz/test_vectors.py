@@ -115,10 +115,6 @@ def scaled(rng) -> Case:
     return Case(f"{head.name} of {classes} classes, times 2**{power}", compute, False, check)
 
 
-def test_hostile_vectors(survives):
-    survives(make, 60)
-
-
-@pytest.mark.slow
-def test_many_hostile_vectors(survives):
-    survives(make, 0.04)
+@pytest.mark.parametrize("count", [60, pytest.param(0.04, marks=pytest.mark.slow)])
+def test_hostile_vectors(survives, count):
+    survives(make, count)

@@ -101,13 +101,9 @@ def own_metadata(rng, arrays, metadata):
     text = json.dumps(model)
     kind = pick(rng, ("field",) * 4 + ("gone", "cut", "deep", "digits", "NaN", "empty", "seen", "background"))
     edit = {
-        "gone": None,
-        "cut": text[: len(text) // 2],
-        "deep": "[" * 100_000,
-        "digits": "5" * 5000,
-        "NaN": '{"patch": NaN}',
-        "empty": "",
-    }.get(kind, text)
+        "gone": None, "cut": text[: len(text) // 2], "deep": "[" * 100_000, "digits": "5" * 5000,
+        "NaN": '{"patch": NaN}', "empty": "",
+    }.get(kind, text)  # fmt: skip
     changed = {name: value for name, value in metadata.items() if name != key or edit is not None}
     if kind == "seen":
         changed |= {"anytouch_jax.seen": pick(rng, ("", "nothing", ",,,", "a" * 100_000, "digit,digit"))}
@@ -120,12 +116,9 @@ def own_metadata(rng, arrays, metadata):
     )
     # None may be the default of a field.
     return (
-        f"metadata: {kind} {field}={str(value)[:12]}",
-        safetensors(arrays, changed),
-        "safetensors",
-        False,
+        f"metadata: {kind} {field}={str(value)[:12]}", safetensors(arrays, changed), "safetensors", False,
         kind not in (*fine, "field"),
-    )
+    )  # fmt: skip
 
 
 def not_finite(rng, arrays, metadata):
@@ -149,18 +142,14 @@ def other_arrays(rng, arrays, metadata):
     )
     rest = {key: one for key, one in arrays.items() if key != name}
     changed = {
-        "missing": rest,
-        "more": arrays | {"x" * 300: np.zeros(2, np.float32)},
-        "shape": rest | {name: np.zeros((3, 5, 7))},
-        "zero": rest | {name: np.zeros((0, *array.shape))},
+        "missing": rest, "more": arrays | {"x" * 300: np.zeros(2, np.float32)},
+        "shape": rest | {name: np.zeros((3, 5, 7))}, "zero": rest | {name: np.zeros((0, *array.shape))},
         "transposed": rest | {name: np.concatenate([array, array])},
-        "prefix": {f"module.{key}": one for key, one in arrays.items()},
-        "scalar": rest | {name: np.float32(1)},
+        "prefix": {f"module.{key}": one for key, one in arrays.items()}, "scalar": rest | {name: np.float32(1)},
         "two prefixes": {("module." if i % 2 else "model.") + key: one for i, (key, one) in enumerate(arrays.items())},
-        "none": {"a": np.zeros(3)},
-        "type": rest | {name: array.astype(np.int64)},
+        "none": {"a": np.zeros(3)}, "type": rest | {name: array.astype(np.int64)},
         "many": {f"k{i}": np.zeros(1) for i in range(20_000)},
-    }[kind]
+    }[kind]  # fmt: skip
     # The authors' files do not name their sensors, so that a longer table of tokens is another whole file.
     wrong = kind not in ("prefix", "type") and not (
         kind == "transposed" and (array.ndim == 0 or name == "sensor_token")
@@ -168,12 +157,9 @@ def other_arrays(rng, arrays, metadata):
     name = f"arrays: {kind} {name}"
     if rng.random() < 0.5 or kind == "type":
         return (
-            name,
-            zip_bytes({key: tensor(np.asarray(one)) for key, one in changed.items()}),
-            "pth",
-            False,
+            name, zip_bytes({key: tensor(np.asarray(one)) for key, one in changed.items()}), "pth", False,
             wrong and kind != "more",
-        )
+        )  # fmt: skip
     return name, safetensors({k: np.asarray(one) for k, one in changed.items()}, metadata), "safetensors", False, wrong
 
 
@@ -187,14 +173,10 @@ def bytes_damaged(rng, arrays, metadata):
     )
     kind = pick(rng, "cut, cut, header, random, empty, html, lfs, zeros")
     data = {
-        "cut": cut(rng, data),
-        "header": flipped(rng, data, 0, 60, 4),
-        "random": rng.bytes(3000),
-        "empty": b"",
-        "html": b"\n <!DOCTYPE html><html>sign in</html>",
-        "zeros": bytes(len(data)),
+        "cut": cut(rng, data), "header": flipped(rng, data, 0, 60, 4), "random": rng.bytes(3000), "empty": b"",
+        "html": b"\n <!DOCTYPE html><html>sign in</html>", "zeros": bytes(len(data)),
         "lfs": b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 12\n",
-    }[kind]
+    }[kind]  # fmt: skip
     ending = pick(rng, ("pth", "pt", "ckpt", "bin")) if ending in ("pth", "legacy") else ending
     wrong = kind != "header"
     return f"{ending} {kind}", data, ending, wrong, wrong
@@ -239,21 +221,16 @@ def raw_pickle(rng, arrays, metadata):
     codes = [op.code.encode("latin1") for op in pickletools.opcodes]
     programs = {
         "deep list": b"\x80\x02" + b"](" * 200_000 + b"e" * 200_000 + b".",
-        "deep tuple": b"\x80\x02)" + b"\x85" * 200_000 + b".",
-        "deep key": b"\x80\x02})" + b"\x85" * 200_000 + b"K\1s.",
+        "deep tuple": b"\x80\x02)" + b"\x85" * 200_000 + b".", "deep key": b"\x80\x02})" + b"\x85" * 200_000 + b"K\1s.",
         "long number": b"\x80\x02\x8b" + struct.pack("<i", 1 << 20) + b"\xff" * (1 << 20) + b".",
-        "digits": b"I" + b"9" * 200_000 + b"\n.",
-        "memo": b"\x80\x02Nr\xff\xff\xff\x7f.",
+        "digits": b"I" + b"9" * 200_000 + b"\n.", "memo": b"\x80\x02Nr\xff\xff\xff\x7f.",
         "bytearray": b"\x96" + struct.pack("<Q", 1 << 40) + b".",
-        "frame": b"\x80\x04\x95" + struct.pack("<Q", 1 << 60) + b".",
-        "get": b"\x80\x02h\x05.",
+        "frame": b"\x80\x04\x95" + struct.pack("<Q", 1 << 60) + b".", "get": b"\x80\x02h\x05.",
         "random": b"\x80\x02" + b"".join(pick(rng, codes) for _ in range(60)),
-        "plain": pickle.dumps({"a": np.zeros(3)}),
-        "stop": b".",
-        "dup": b"\x80\x02]" + b"2" * 500_000 + b".",
+        "plain": pickle.dumps({"a": np.zeros(3)}), "stop": b".", "dup": b"\x80\x02]" + b"2" * 500_000 + b".",
         "doubling": b"\x80\x02](K\1e" + b"2\x86" * 200 + b".",
         "doubled key": b"\x80\x02}(K\1" + b"2\x86" * 60 + b"K\1u.",
-    }
+    }  # fmt: skip
     kind = pick(rng, programs)
     data = programs[kind]
     if rng.random() < 0.5:
@@ -265,17 +242,9 @@ def raw_pickle(rng, arrays, metadata):
 
 
 KINDS = (
-    header,
-    header,
-    own_metadata,
-    own_metadata,
-    not_finite,
-    other_arrays,
-    other_arrays,
-    bytes_damaged,
-    hostile_pickle,
+    header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, hostile_pickle,
     raw_pickle,
-)
+)  # fmt: skip
 
 
 def make(rng, folder: Path, things) -> Case:
@@ -349,10 +318,6 @@ def shards(rng, folder: Path, things) -> Case:
     return Case(*command(rng, f"shards: {kind}", place, folder, things, wrong, wrong))
 
 
-def test_hostile_weights(survives):
-    survives(make, 25)
-
-
-@pytest.mark.slow
-def test_many_hostile_weights(survives):
-    survives(make, 0.14)
+@pytest.mark.parametrize("count", [25, pytest.param(0.14, marks=pytest.mark.slow)])
+def test_hostile_weights(survives, count):
+    survives(make, count)

@@ -19,22 +19,9 @@ from anytouch_jax.cli.app import COMMANDS, GROUPS
 from tests.laws.test_readme import TEXT
 
 NAMES = (
-    "DATA",
-    "SCENES",
-    "DEMO",
-    "DEMO_STEPS",
-    "DEMO_STEPS1",
-    "RUN",
-    "INIT",
-    "PRESET",
-    "STEPS",
-    "STOP_AFTER",
-    "SAVE",
-    "LABEL",
-    "GOLDEN",
-    "PYTHON",
-    "MAKEFLAGS",
-)
+    "DATA", "SCENES", "DEMO", "DEMO_STEPS", "DEMO_STEPS1", "RUN", "INIT", "PRESET", "STEPS", "STOP_AFTER", "SAVE",
+    "LABEL", "GOLDEN", "PYTHON", "MAKEFLAGS",
+)  # fmt: skip
 TARGETS = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
 
 

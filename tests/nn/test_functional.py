@@ -1,10 +1,9 @@
 """Building networks: shapes without memory, reproducible first values, parts that do not exist."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_models import full_model, touch_model
+from tiny_models import compiled, full_model, touch_model
 
 from anytouch_jax.config import preset
 from anytouch_jax.nn.functional import build
@@ -44,13 +43,10 @@ def test_first_values():
 def test_parts_left_out_do_not_exist():
     assert set(build(touch_model()).abstract()) == {"touch", "decoder"}
     with pytest.raises(AttributeError):
-        net = build(touch_model())
-        net.encode_image(net.init(jax.random.key(0)), jnp.zeros((1, 28, 28, 3)))
+        compiled(touch_model()).encode_image(compiled(touch_model()).params, np.zeros((1, 28, 28, 3)))
 
 
 def test_a_part_of_the_parameters_serves_the_methods_that_read_it():
-    net = build(full_model())
-    params = net.init(jax.random.key(0))
-    clip = jnp.ones((1, 1, 28, 28, 3))
-    lock = net.encode_touch({"touch": params["touch"]}, clip, jnp.asarray([0]))
-    np.testing.assert_array_equal(lock, net.encode_touch(params, clip, jnp.asarray([0])))
+    net, clip, row = compiled(full_model()), np.ones((1, 1, 28, 28, 3), "f4"), np.zeros(1, np.int32)
+    part = net.encode_touch({"touch": net.params["touch"]}, clip, row)
+    np.testing.assert_array_equal(part, net.encode_touch(net.params, clip, row))

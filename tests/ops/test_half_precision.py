@@ -62,12 +62,13 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_bfloat16_is_widened_before_it_is_computed_with(name):
     function, inputs = CASES[name]
-    halves = [jnp.asarray(x, jnp.bfloat16) for x in inputs]
+    halves = [x.astype(jnp.bfloat16) for x in inputs]
 
     def weighed(*inputs):
         out = function(*inputs)
         return jnp.sum(out * np.cos(np.arange(out.size)).reshape(out.shape)), out
 
+    @jax.jit
     def run(*inputs):
         return jax.value_and_grad(weighed, argnums=tuple(range(len(inputs))), has_aux=True)(*inputs)
 
@@ -79,4 +80,4 @@ def test_bfloat16_is_widened_before_it_is_computed_with(name):
     for grad, right in zip(grads, wanted, strict=True):
         assert grad.dtype == jnp.bfloat16 and np.isfinite(np.asarray(grad, np.float32)).all()
         # Rounded to 8 bits where a use of the input ends, and nowhere before.
-        np.testing.assert_allclose(grad.astype(jnp.float32), right, rtol=2**-7, atol=2**-8 * np.abs(right).max())
+        np.testing.assert_allclose(np.asarray(grad, np.float32), right, rtol=2**-7, atol=2**-8 * np.abs(right).max())

@@ -86,12 +86,12 @@ def _probe(case: Case) -> None:
         assert file is not None
         info = {**case.info, "params_file": file.group()}
         net, _, params = setup(Case(case.name, case.folder, info), stage)
-        sensor = jnp.asarray(table_rows(case.inputs(f"{name}/sensor_type_used"), net))
+        sensor = np.asarray(table_rows(case.inputs(f"{name}/sensor_type_used"), net))
         feel = sub["dataset"] == "feel"
         images = case.inputs("feel_images" if feel else "images")
         case.seen |= {"in/sensors", "in/feel_sensors"}
-        flat = jnp.asarray(channel_last(images.reshape(-1, *images.shape[-3:])))
-        sensor = jnp.tile(sensor, len(flat) // len(sensor))  # the reference tiles ids batch-major (golden Q13)
+        flat = np.asarray(channel_last(images.reshape(-1, *images.shape[-3:])))
+        sensor = np.tile(sensor, len(flat) // len(sensor))  # the reference tiles ids batch-major (golden Q13)
         if sub["pooling"] == "cls":
             out = encode(params, flat, sensor, net=net)
             case.compare(f"out/{name}/projected", out)
@@ -110,17 +110,17 @@ def _probe(case: Case) -> None:
 
 def _probe_head(case: Case, name: str, head_input: jax.Array) -> None:
     """Logits, loss and gradients of the authors' linear head on recorded weights."""
-    head = {key: jnp.asarray(case.inputs(f"{name}/head_{key}")) for key in ("weight", "bias")}
-    labels = jnp.asarray(case.inputs(f"{name}/labels"))
+    head = {key: np.asarray(case.inputs(f"{name}/head_{key}")) for key in ("weight", "bias")}
+    labels = np.asarray(case.inputs(f"{name}/labels"))
 
-    def loss(head: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def loss(head: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         logits = head_input @ head["weight"].T + head["bias"][None]
         if logits.shape[1] == 1:
             flat = labels.reshape(-1).astype(jnp.float32)
             return jnp.mean(optax.sigmoid_binary_cross_entropy(logits[:, 0], flat)), logits
         return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, labels)), logits
 
-    (value, logits), grads = jax.value_and_grad(loss, has_aux=True)(head)
+    (value, logits), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(head)
     case.compare(f"out/{name}/logits", logits)
     case.compare(f"out/{name}/loss", value)
     for key in head:
@@ -153,7 +153,7 @@ def _optimizer(case: Case) -> None:
     step = jax.jit(make_step(loss, optimizer(config), total_steps=config.run.steps, trained=trained))
     state, values, rates = init_state(params, config), [], []
     for i, epoch in enumerate(epochs):
-        state = state._replace(step=jnp.asarray(round(epoch * per_epoch), jnp.int32))
+        state = state._replace(step=jax.device_put(np.int32(round(epoch * per_epoch))))
         state, metrics = step(state, _optimizer_batch(case, net, i), jax.random.key(0))
         values.append(float(metrics["loss"]))
         rates.append(float(metrics["learning_rate"]))
@@ -166,25 +166,19 @@ def _optimizer(case: Case) -> None:
 
 def _compare_schedule(case: Case) -> None:
     s = case.info["schedule"]
-    ours = learning_rate(
-        jnp.asarray(s["epoch"]),
-        peak=s["lr"],
-        floor=s["min_lr"],
-        warmup=s["warmup_epochs"],
-        total=s["epochs"],
-        decay="cosine",
-    )
+    ends = {"peak": s["lr"], "floor": s["min_lr"], "warmup": s["warmup_epochs"], "total": s["epochs"]}
+    ours = jax.jit(partial(learning_rate, **ends, decay="cosine"))(np.asarray(s["epoch"]))
     case.seen |= {"schedule/epoch"}
     case.compare("schedule/lr", ours)
 
 
-def _optimizer_batch(case: Case, net: Net, i: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _optimizer_batch(case: Case, net: Net, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Batch of step i: the still batch of case A or the clip batch of case B, with this case's noise."""
     kinds = case.info.get("data_type", 0)
     source = "A_stage1_image" if (kinds[i] if isinstance(kinds, list) else kinds) == 0 else "B_stage1_video"
     arrays = read_arrays(case.folder / f"{source}.npz")
     clip, sensor = channel_last(arrays["in/pixels"]), table_rows(arrays["in/sensor_type"], net)
-    return jnp.asarray(clip), jnp.asarray(sensor), jnp.asarray(case.inputs(f"noise_{i}"))
+    return clip, sensor, case.inputs(f"noise_{i}")
 
 
 def _compare_final(case: Case, params: Params, state: TrainState, config: Config) -> None:
@@ -239,11 +233,11 @@ def _text(module: Any, *text: Any) -> jax.Array:
 
 
 def _clip(case: Case) -> None:
-    pixels = jnp.asarray(channel_last(case.inputs("pixel_values"), clip=False))
+    pixels = np.asarray(channel_last(case.inputs("pixel_values"), clip=False))
     masks = {
-        name: jnp.asarray(case.inputs(name).astype(bool)) for name in ("attention_mask", "attention_mask_with_hole")
+        name: np.asarray(case.inputs(name).astype(bool)) for name in ("attention_mask", "attention_mask_with_hole")
     }
-    ids = {name: jnp.asarray(case.inputs(f"input_ids_{name}")) for name in ("pad_eot", "pad_zero")}
+    ids = {name: np.asarray(case.inputs(f"input_ids_{name}")) for name in ("pad_eot", "pad_zero")}
     texts = {
         "pad_eot": (ids["pad_eot"], masks["attention_mask"]),
         "pad_zero": (ids["pad_zero"], masks["attention_mask"]),
@@ -279,18 +273,8 @@ def _clip(case: Case) -> None:
 
 
 _RUNNERS: dict[str, Callable[[Case], None]] = {
-    r"[ABC]_": stage1,
-    r"D_": align,
-    r"E_": align_edge,
-    r"F_": match,
-    r"G_": _probe,
-    r"H_": _optimizer,
-    r"I_": _positions,
-    r"J_clip_params": weights.parameters,
-    r"J_": _clip,
-    r"K_weight_loading_map": weights.loading_map,
-    r"K_manifest": weights.manifest,
-    r"stage[12]_params": weights.parameters,
-    r"preprocess_full_size": families.preprocess,
-    r"manifest_full_size": families.full_size,
-}
+    r"[ABC]_": stage1, r"D_": align, r"E_": align_edge, r"F_": match, r"G_": _probe, r"H_": _optimizer,
+    r"I_": _positions, r"J_clip_params": weights.parameters, r"J_": _clip, r"K_weight_loading_map": weights.loading_map,
+    r"K_manifest": weights.manifest, r"stage[12]_params": weights.parameters,
+    r"preprocess_full_size": families.preprocess, r"manifest_full_size": families.full_size,
+}  # fmt: skip

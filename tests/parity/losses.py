@@ -125,17 +125,12 @@ def _stage1_outputs(params: Params, inputs: Any, *, net: Net, config: Config) ->
     pred, _ = objectives.reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)
     loss, metrics = objectives.stage1_terms(params, *inputs[:3], net=net, config=config, decoder_sensor=target)
     return {
-        "ids_restore": restore_ids,
-        "mask": hidden,
-        "embeddings": net.bind(params).touch.tokens(seen, sensor, keep_ids),
+        "ids_restore": restore_ids, "mask": hidden, "embeddings": net.bind(params).touch.tokens(seen, sensor, keep_ids),
         "last_hidden_state": net.bind(params).touch.hidden(seen, sensor, keep_ids),
         "latent": net.encode_tokens(params, seen, sensor, keep_ids),
-        "features_unmasked": net.encode_touch(params, seen, sensor),
-        "pred": pred,
-        "loss": loss,
-        "loss_recon": metrics["reconstruction"],
-        "loss_pred": metrics.get("next_frame"),
-    }
+        "features_unmasked": net.encode_touch(params, seen, sensor), "pred": pred, "loss": loss,
+        "loss_recon": metrics["reconstruction"], "loss_pred": metrics.get("next_frame"),
+    }  # fmt: skip
 
 
 def _stage1_value(params: Params, inputs: Any, *, net: Net, config: Config) -> jax.Array:
@@ -148,11 +143,8 @@ def stage1(case: Case) -> None:
     net, config, params = setup(case, 1)
     target = table_rows(case.inputs("target_sensor_type"), net) if "in/target_sensor_type" in case.arrays else None
     inputs = (
-        channel_last(case.inputs("pixels")),
-        table_rows(case.inputs("sensor_type"), net),
-        case.inputs("noise"),
-        target,
-    )
+        channel_last(case.inputs("pixels")), table_rows(case.inputs("sensor_type"), net), case.inputs("noise"), target,
+    )  # fmt: skip
     ours = _stage1_outputs(params, inputs, net=net, config=config)
     ours["pred_first2"] = ours["pred"][:2]
     for name, value in ours.items():
@@ -294,6 +286,6 @@ def match(case: Case) -> None:
     for name, embedding in zip(("touch", "positive", "negative"), z, strict=True):
         case.compare(f"out/{name}_embeds", embedding)
     for name, other in zip(("positive", "negative"), z[1:], strict=True):
-        case.compare(f"out/{name}_sim", net.match(params, z[0], other))
+        case.compare(f"out/{name}_sim", jax.jit(net.match)(params, z[0], other))
     case.compare("out/loss", jax.jit(partial(_match_value, net=net, config=config))(params, batch))
     _compare_gradients(case, _match_value, params, batch, batch, net, config)

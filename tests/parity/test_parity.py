@@ -56,6 +56,7 @@ def test_a_case_is_within_tolerance(name):
     assert len(rows) >= COMPARISONS[name]
 
 
+@pytest.mark.slow
 def test_the_program_that_users_run_is_within_tolerance(tmp_path):
     """On one device and with all of XLA's optimisations, unlike this process: attention takes its other form there.
 

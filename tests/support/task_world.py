@@ -38,22 +38,15 @@ def simulated(
                 for frame in range(frames):
                     rows.append(
                         {
-                            "path": f"{touch}-{sensor}-{frame}.png",
-                            "sensor": sensor,
-                            "unit": f"{sensor}_{touch % 2}",
-                            "sequence": f"{touch:04d}-{sensor}",
-                            "frame_index": frame,
-                            "split": split,
-                            "touch": f"{touch:04d}",
-                            "object": f"thing {thing}",
-                            "label.object": f"thing {thing}",
+                            "path": f"{touch}-{sensor}-{frame}.png", "sensor": sensor, "unit": f"{sensor}_{touch % 2}",
+                            "sequence": f"{touch:04d}-{sensor}", "frame_index": frame, "split": split,
+                            "touch": f"{touch:04d}", "object": f"thing {thing}", "label.object": f"thing {thing}",
                             "label.material": MATERIALS[(thing // 4) % len(MATERIALS)],
                             "label.force": push * (0.01, 0.5, 1.0, 0.9, 0.5)[frame % 5],
                             "label.slip": (0.0, 0.1, 0.2, 0.9, 0.6)[frame % 5] * (touch % 3 > 0),
-                            "label.twist": TWISTS[touch % 3],
-                            "label.slide": SLIDES[touch % 5],
+                            "label.twist": TWISTS[touch % 3], "label.slide": SLIDES[touch % 5],
                         }
-                    )
+                    )  # fmt: skip
     return table(rows)
 
 

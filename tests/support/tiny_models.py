@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import jax
 
 from anytouch_jax.config import Config, ModelConfig, Stack, TextTower, preset
+from anytouch_jax.nn.functional import Net, build
 
 STACK = Stack(16, 2, 2, 32)
 TEXT = TextTower(Stack(16, 2, 2, 32), vocab=50, length=8)
@@ -28,3 +33,22 @@ def tiny_config(stage: int = 1, recipe: str = "paper", towers: str = "scratch", 
     head = {"match_head": "linear" if recipe == "release" else "mlp"}
     rank = {"lora_rank": 2} if towers == "pretrained" else {}
     return replace(config, model=full_model(**(head | rank | model)))
+
+
+class Compiled:
+    """The methods of a network, each under one `jax.jit`: outside of it every operation is a program for itself."""
+
+    def __init__(self, net: Net) -> None:
+        self.net, self.bind, self.abstract = net, net.bind, net.abstract
+        self.params = net.init(jax.random.key(0))
+
+    @cache  # noqa: B019  of the few networks of a module
+    def __getattr__(self, name: str) -> Any:
+        static = {"encode_touch": "join", "encode_poolings": "join", "reconstruct": "frames"}.get(name)
+        return jax.jit(getattr(self.net, name), static_argnames=static)
+
+
+@cache
+def compiled(model: ModelConfig) -> Compiled:
+    """The network of a model, made once in a process, and its first parameters."""
+    return Compiled(build(model))

@@ -16,18 +16,9 @@ from jax.extend.core import Literal
 Tree = Any
 # Primitives whose inputs and outputs are, one by one, those of the program inside.
 _CALLS = {
-    "jit",
-    "pjit",
-    "closed_call",
-    "core_call",
-    "checkpoint",
-    "remat",
-    "remat2",
-    "custom_jvp_call",
-    "custom_vjp_call",
-    "custom_vjp_call_jaxpr",
-    "shard_map",
-}
+    "jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2", "custom_jvp_call", "custom_vjp_call",
+    "custom_vjp_call_jaxpr", "shard_map",
+}  # fmt: skip
 
 
 def used_parameters(loss_fn: Callable[..., Any], params: Tree, *args: Any) -> Tree:

@@ -82,10 +82,7 @@ def openclip_of(params, model: ModelConfig) -> dict[str, np.ndarray]:
     weights = {"logit_scale": params["logit_scale"], "attn_mask": np.zeros((7, 7), "f4")}
     towers = {
         "visual.": (
-            "image",
-            model.image,
-            {"class_embedding": "class_token", "positional_embedding": "position"},
-            "visual.proj",
+            "image", model.image, {"class_embedding": "class_token", "positional_embedding": "position"}, "visual.proj",
         ),
         "": (
             "text",
@@ -93,7 +90,7 @@ def openclip_of(params, model: ModelConfig) -> dict[str, np.ndarray]:
             {"token_embedding.weight": "token", "positional_embedding": "position"},
             "text_projection",
         ),
-    }
+    }  # fmt: skip
     for prefix, (part, stack, tables, projection) in towers.items():
         tower = params[part]
         weights |= {prefix + key: tower[name] for key, name in tables.items()}

@@ -37,17 +37,11 @@ def initialized(monkeypatch):
 @pytest.mark.parametrize(
     ("environ", "count"),
     [
-        ({}, 1),
-        ({"JAX_NUM_PROCESSES": "1"}, 1),
-        ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, 1),
-        (ALLOCATION, 1),
-        (SLURM | {"SLURM_STEP_NUM_TASKS": "1"}, 1),
-        (BY_HAND, 4),
-        (BY_HAND | {"JAX_NUM_PROCESSES": "2"} | SLURM, 2),
-        (SLURM, 4),
-        (OMPI, 4),
+        ({}, 1), ({"JAX_NUM_PROCESSES": "1"}, 1), ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, 1), (ALLOCATION, 1),
+        (SLURM | {"SLURM_STEP_NUM_TASKS": "1"}, 1), (BY_HAND, 4), (BY_HAND | {"JAX_NUM_PROCESSES": "2"} | SLURM, 2),
+        (SLURM, 4), (OMPI, 4),
     ],
-)
+)  # fmt: skip
 def test_processes_of_the_environment(environ, count, initialized):
     assert process_count(environ) == count
     with joined(environ) as process:

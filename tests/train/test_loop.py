@@ -426,13 +426,6 @@ def test_the_source_of_batches_is_closed(tmp_path):
     assert closed == [threading.get_ident()]
 
 
-def test_a_line_now_and_then_is_said(tmp_path):
-    said = []
-    run(tmp_path, stop_after=4, said=said)
-    assert [line.split("  ")[0] for line in said] == ["step 1/4", "step 2/4", "step 3/4", "step 4/4"]
-    assert "loss" in said[0] and "samples/s" in said[0]
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_finishes_the_step_saves_and_restores_the_handlers(undisturbed, tmp_path, number):
     before = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)]
@@ -490,13 +483,6 @@ def test_a_killed_run_goes_on_and_ends_as_if_undisturbed(undisturbed, tmp_path):
     assert result.resumed in (0, 3)
     assert_same(result.state, undisturbed[1].state)
     assert rows(tmp_path) == rows(undisturbed[0])
-
-
-def test_exit_code_of_a_terminated_process(tmp_path):
-    ended = child(tmp_path, 2, signal.SIGTERM)
-    assert ended.returncode == 0, ended.stderr
-    assert "stopped by SIGTERM after step 3 and saved" in ended.stderr
-    assert [row["step"] for row in rows(tmp_path)] == [0, 1, 2]
 
 
 def test_a_failed_save_is_one_sentence_and_leaves_the_checkpoint_before(tmp_path, monkeypatch):

@@ -28,15 +28,11 @@ def test_lines_are_json_and_what_is_not_finite_is_null(tmp_path):
     record.close()
     assert lines(tmp_path) == [
         {
-            "step": 0,
-            "loss": float(np.float32(0.1)),
-            "grad_norm": None,
-            "skipped": 0.0,
-            "images": 3,
+            "step": 0, "loss": float(np.float32(0.1)), "grad_norm": None, "skipped": 0.0, "images": 3,
             "skipped_batches": 0,
         },
         {"step": 1, "loss": None, "skipped": 1.0, "skipped_batches": 1},
-    ]
+    ]  # fmt: skip
     assert row == lines(tmp_path)[0]
     assert (record.skipped, record.in_a_row) == (1, 1)
 

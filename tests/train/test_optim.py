@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -8,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adam_moments import moments
-from tiny_models import tiny_config
+from tiny_models import compiled, tiny_config
 from train_toy import toy_config, toy_params
 
 from anytouch_jax.config import preset
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.nn.functional import build
 from anytouch_jax.train.optim import depth_rate, learning_rate, match_rules, optimizer, schedule
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.tree import flatten
@@ -95,14 +95,24 @@ def random_grads(params, steps):
     ]
 
 
-def run_updates(config, params, grads, uses=None, **more):
-    tx = optimizer(config)
-    state, update = tx.init(params), tx.update
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def update(config, grads, state, params, used=None, **more):
+    """`used`: its leaves, as a key of the cache."""
+    used = None if used is None else jax.tree.unflatten(jax.tree.structure(params), used)
+    updates, state = optimizer(config).update(grads, state, params, used=used, **more)
+    return jax.tree.map(jnp.add, params, updates), state
+
+
+def first_state(config, params):
+    return jax.jit(optimizer(config).init)(params)
+
+
+def run_updates(config, params, grads, uses=None):
+    state = first_state(config, params)
     for step, grad in enumerate(grads):
-        used = None if uses is None else uses[step]
-        updates, state = update(grad, state, params, used=used, step=step, **more)
-        params = jax.tree.map(jnp.add, params, updates)
-    return params, state
+        used = None if uses is None else tuple(jax.tree.leaves(uses[step]))
+        params, state = update(config, grad, state, params, used, step=step)
+    return jax.device_get((params, state))
 
 
 def test_adamw_with_skipped_parameters_equals_plain_numpy():
@@ -141,10 +151,11 @@ def test_adamw_with_skipped_parameters_equals_plain_numpy():
 
 def test_a_zero_gradient_still_decays_but_an_unused_parameter_does_not():
     config = toy_config(optim={"warmup": 0, "learning_rate": 0.5, "weight_decay": 0.1})
-    params = {"a": {"kernel": jnp.ones(3)}, "b": {"kernel": jnp.ones(3)}, "c": {"bias": jnp.ones(3)}}
-    zeros = jax.tree.map(jnp.zeros_like, params)
+    ones, zeros = (
+        {"a": {"kernel": x}, "b": {"kernel": x}, "c": {"bias": x}} for x in np.array([[1.0] * 3, [0.0] * 3], "f4")
+    )
     used = {"a": {"kernel": True}, "b": {"kernel": False}, "c": {"bias": True}}
-    got, _ = run_updates(config, params, [zeros], [used])
+    got, _ = run_updates(config, ones, [zeros], [used])
     np.testing.assert_allclose(got["a"]["kernel"], 0.95, rtol=1e-6)
     np.testing.assert_array_equal(got["b"]["kernel"], 1.0)
     np.testing.assert_array_equal(got["c"]["bias"], 1.0)
@@ -152,41 +163,38 @@ def test_a_zero_gradient_still_decays_but_an_unused_parameter_does_not():
 
 def test_eps_is_outside_the_root():
     config = toy_config(optim={"warmup": 0, "learning_rate": 1.0, "weight_decay": 0.0, "eps": 1e-3})
-    got, _ = run_updates(config, {"w": jnp.zeros(1)}, [{"w": jnp.full(1, 1e-3)}])
+    got, _ = run_updates(config, {"w": np.zeros(1, "f4")}, [{"w": np.full(1, 1e-3, "f4")}])
     np.testing.assert_allclose(got["w"], -0.5, rtol=1e-5)  # sqrt(g^2 + eps) would give -0.03
 
 
 def test_clipping_counts_the_used_parameters_only():
     config = toy_config(optim={"grad_clip": 1.0, "beta1": 0.0, "weight_decay": 0.0})
-    params = {"a": jnp.zeros(2), "b": jnp.zeros(2)}
-    grads = {"a": jnp.asarray([3.0, 4.0]), "b": jnp.full(2, 1e6)}
-    tx = optimizer(config)
-    _, state = tx.update(grads, tx.init(params), params, used={"a": True, "b": False}, step=1)
+    params = {"a": np.zeros(2, "f4"), "b": np.zeros(2, "f4")}
+    large, small = ({"a": np.asarray(a, "f4"), "b": np.full(2, b, "f4")} for a, b in (([3, 4], 1e6), ([0.3, 0.4], 0)))
+    _, state = update(config, large, first_state(config, params), params, (True, False), step=1)
     held = moments(state, params)
     np.testing.assert_allclose(held["a"].mu, [0.6, 0.8], rtol=1e-6)
     np.testing.assert_array_equal(held["b"].mu, 0.0)
-    small = {"a": jnp.asarray([0.3, 0.4]), "b": jnp.zeros(2)}
-    _, state = tx.update(small, tx.init(params), params, step=1)
+    _, state = update(config, small, first_state(config, params), params, step=1)
     np.testing.assert_array_equal(moments(state, params)["a"].mu, small["a"])
 
 
 def test_the_rate_is_given_or_follows_the_step_never_a_counter():
-    config, params = toy_config(steps=10), {"w": jnp.ones(2)}
-    tx = optimizer(config)
-    grads = {"w": jnp.ones(2)}
-    _, state = tx.update(grads, tx.init(params), params, step=7)
+    config, params = toy_config(steps=10), {"w": np.ones(2, "f4")}
+    start = first_state(config, params)
+    _, state = update(config, params, start, params, step=7)
     assert state.learning_rate == schedule(config)(7)
-    updates, state = tx.update(grads, tx.init(params), params, learning_rate=0.25)
+    new, state = update(config, params, start, params, learning_rate=0.25)
     assert state.learning_rate == 0.25
-    np.testing.assert_allclose(updates["w"], -0.25 * (1 + 0.1), rtol=1e-5)
+    np.testing.assert_allclose(new["w"], 1 - 0.25 * (1 + 0.1), rtol=1e-5)
     with pytest.raises(TypeError, match="step or learning_rate"):
-        tx.update(grads, tx.init(params), params)
+        update(config, params, start, params)
 
 
 def test_rules_come_from_the_config():
-    config = dataclasses.replace(toy_config(optim={"weight_decay": 0.0}))
-    params = {"w": jnp.ones(2)}
-    got, _ = run_updates(config, params, [{"w": jnp.zeros(2)}] * 5)
+    got, _ = run_updates(
+        toy_config(optim={"weight_decay": 0.0}), {"w": np.ones(2, "f4")}, [{"w": np.zeros(2, "f4")}] * 5
+    )
     np.testing.assert_array_equal(got["w"], 1.0)
 
 
@@ -215,14 +223,16 @@ def test_each_block_learns_so_much_slower_than_the_next():
 
 def test_a_layer_decay_scales_the_step_and_none_is_no_change():
     def updates(config):
-        params = build(config.model).init(jax.random.key(0))
-        grads = jax.tree.map(lambda x: jnp.sin(jnp.arange(x.size, dtype=jnp.float32)).reshape(x.shape) + 2, params)
+        params = compiled(config.model).params
+        grads = jax.tree.map(lambda x: np.sin(np.arange(x.size, dtype="f4")).reshape(x.shape) + 2, params)
         one = optimizer(config)
-        return flatten(jax.jit(one.update)(grads, one.init(params), params, learning_rate=1e-3)[0])
+        return jax.device_get(
+            flatten(jax.jit(lambda g, p: one.update(g, one.init(p), p, learning_rate=1e-3)[0])(grads, params))
+        )
 
     plain, slow, still = (updates(decayed(decay)) for decay in (1.0, 0.1, 0.0))
     for name, change in plain.items():
-        rate = depth_rate(name, change.shape, decayed(0.1))
+        rate = np.asarray(depth_rate(name, change.shape, decayed(0.1)))
         np.testing.assert_allclose(slow[name], change * rate, rtol=1e-5, err_msg=name)
     assert not np.any(still["touch/patch/kernel"]) and not np.any(still["touch/blocks/mlp/up/kernel"][:2])
     np.testing.assert_array_equal(still["touch/blocks/mlp/up/kernel"][2], plain["touch/blocks/mlp/up/kernel"][2])

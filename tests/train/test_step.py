@@ -28,7 +28,7 @@ def quiet_loss(params, batch, key, progress):
 
 def build(config=None, loss=toy_loss, **more):
     config = config or toy_config()
-    return init_state(toy_params(), config), jax.jit(
+    return jax.jit(init_state, static_argnums=1)(toy_params(), config), jax.jit(
         make_step(loss, optimizer(config), total_steps=config.run.steps, trained=toy_trained, **more)
     )
 
@@ -68,22 +68,23 @@ def test_towers_freeze_as_the_recipe_says():
 def test_a_step_is_the_gradient_of_the_loss_through_adamw():
     config = toy_config()
     state, step = build(config)
-    state = state._replace(step=jnp.asarray(3, jnp.int32))
+    state = state._replace(step=np.int32(3))
     new, metrics = step(state, toy_batch(3), KEY)
     key = jax.random.fold_in(KEY, 3)
 
     def loss(trainable):
         return toy_loss(merge(trainable, state.frozen), toy_batch(3), key, 3 / config.run.steps)[0]
 
-    value, grads = jax.value_and_grad(loss)(state.trainable)
+    value, grads = jax.device_get(jax.jit(jax.value_and_grad(loss))(state.trainable))
     rate = float(schedule(config)(3))
     assert metrics["loss"] == pytest.approx(float(value), rel=1e-6)
     assert metrics["p_u"] == pytest.approx(0.75 * 3 / config.run.steps)
     assert metrics["learning_rate"] == pytest.approx(rate)
-    assert metrics["grad_norm"] == pytest.approx(float(optax.tree.norm(grads)), rel=1e-5)
-    assert metrics["param_norm"] == pytest.approx(float(optax.tree.norm(state.trainable)), rel=1e-6)
-    change = jax.tree.map(lambda a, b: a - b, new.trainable, state.trainable)
-    assert metrics["update_norm"] == pytest.approx(float(optax.tree.norm(change)), rel=1e-4)
+    change = jax.tree.map(lambda a, b: np.asarray(a) - np.asarray(b), new.trainable, state.trainable)
+    norm = lambda tree: np.sqrt(sum(np.sum(np.square(x, dtype=np.float64)) for x in jax.tree.leaves(tree)))  # noqa: E731
+    assert metrics["grad_norm"] == pytest.approx(norm(grads), rel=1e-5)
+    assert metrics["param_norm"] == pytest.approx(norm(state.trainable), rel=1e-6)
+    assert metrics["update_norm"] == pytest.approx(norm(change), rel=1e-4)
     # The first step of Adam is the sign of the gradient; biases do not decay.
     bias = grads["trunk"]["bias"]
     np.testing.assert_allclose(change["trunk"]["bias"], -rate * np.sign(bias), rtol=1e-3)
@@ -111,24 +112,14 @@ def test_a_kind_of_batch_leaves_the_head_it_does_not_use():
     assert_same(state.frozen, {"decoder": {"position": toy_params()["decoder"]["position"]}})
 
 
-def test_jit_equals_no_jit():
-    state, step = build()
-    plain = make_step(toy_loss, optimizer(toy_config()), total_steps=8, trained=toy_trained)
-    for index in range(2):
-        slow, slow_metrics = plain(state, toy_batch(index), KEY)
-        state, metrics = step(state, toy_batch(index), KEY)
-        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), slow, state)
-        for name in metrics:
-            np.testing.assert_allclose(metrics[name], slow_metrics[name], rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize(("index", "accumulate"), [(2, 2), (3, 8)])
 def test_accumulation_equals_the_large_batch(index, accumulate):
     # Without Adam, which turns the sign of a gradient near zero into a whole step.
     state = init_state(toy_params(), toy_config())._replace(opt_state=optax.sgd(0.1).init(None))
-    whole, metrics = make_step(quiet_loss, optax.sgd(0.1), total_steps=8)(state, toy_batch(index), KEY)
-    step = jax.jit(make_step(quiet_loss, optax.sgd(0.1), total_steps=8, accumulate=accumulate))
-    parts, part_metrics = step(state, toy_batch(index), KEY)
+    (whole, metrics), (parts, part_metrics) = (
+        jax.jit(make_step(quiet_loss, optax.sgd(0.1), total_steps=8, accumulate=count))(state, toy_batch(index), KEY)
+        for count in (1, accumulate)
+    )
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), whole.trainable, parts.trainable)
     for name in ("loss", "reconstruction", "grad_norm", "update_norm", "p_u"):
         assert part_metrics[name] == pytest.approx(float(metrics[name]), rel=1e-5)
@@ -216,15 +207,6 @@ def test_the_step_takes_any_optax_transformation():
     state = state._replace(opt_state=tx.init(state.trainable))
     state, metrics = jax.jit(make_step(toy_loss, tx, total_steps=8))(state, toy_batch(0), KEY)
     assert np.isnan(metrics["learning_rate"]) and metrics["update_norm"] > 0 and state.step == 1
-
-
-def test_the_loss_falls():
-    state, step = build()
-    losses = []
-    for _ in range(8):
-        state, metrics = step(state, toy_batch(0), KEY)
-        losses.append(float(metrics["loss"]))
-    assert losses[-1] < 0.7 * losses[0]
 
 
 def test_frozen_parameters_are_not_differentiated():

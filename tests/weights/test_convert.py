@@ -21,6 +21,7 @@ from weights_world import (
 
 from anytouch_jax.config import SENSORS, UNIVERSAL, Stack, preset
 from anytouch_jax.errors import UserError
+from anytouch_jax.weights import keymaps
 from anytouch_jax.weights.compatible import match_sensors
 from anytouch_jax.weights.convert import (
     detect_layout,
@@ -312,3 +313,12 @@ def test_own_names_are_read_too(model):
     del flat["touch/class_token"]
     with pytest.raises(UserError, match=r"missing keys.*touch/class_token"):
         to_params(flat, model)
+
+
+def test_the_frames_of_a_kernel_keep_their_order():
+    """(D, frame * colour, row, col) of other families, as (frames, row * col * colour, D)."""
+    weight = np.random.default_rng(0).standard_normal((5, 6, 4, 4))
+    read, write = keymaps._KINDS["frames"][0][2:4]
+    for frame, kernel in enumerate(read(weight)):
+        np.testing.assert_array_equal(kernel, weight[:, 3 * frame :][:, :3].transpose(2, 3, 1, 0).reshape(-1, 5))
+    np.testing.assert_array_equal(write(read(weight)), weight)

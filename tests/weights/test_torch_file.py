@@ -21,16 +21,11 @@ RNG = np.random.default_rng(0)
 @pytest.mark.parametrize("legacy", [False, True])
 def test_reads_every_plain_type(torch_files, legacy):
     arrays = {
-        "f8": RNG.normal(size=(2, 3)),
-        "f4": RNG.normal(size=(4,)).astype("f4"),
-        "f2": RNG.normal(size=(2, 2)).astype("f2"),
-        "i8": np.arange(-3, 3),
-        "i4": np.arange(3, dtype="i4"),
-        "u1": np.arange(3, dtype="u1"),
-        "bool": np.array([True, False]),
-        "scalar": np.float32(2.5),
+        "f8": RNG.normal(size=(2, 3)), "f4": RNG.normal(size=(4,)).astype("f4"),
+        "f2": RNG.normal(size=(2, 2)).astype("f2"), "i8": np.arange(-3, 3), "i4": np.arange(3, dtype="i4"),
+        "u1": np.arange(3, dtype="u1"), "bool": np.array([True, False]), "scalar": np.float32(2.5),
         "empty": np.zeros((0, 4), "f4"),
-    }
+    }  # fmt: skip
     content = {name: torch_files.tensor(array) for name, array in arrays.items()}
     read = read_torch(torch_files.write(content, legacy=legacy))
     assert read.keys() == arrays.keys()
@@ -84,17 +79,10 @@ def test_a_parameter_is_its_tensor(torch_files):
 
 
 WICKED = {
-    "os.system": "touch {0}",
-    "posix.system": "touch {0}",
-    "builtins.eval": "open('{0}', 'w')",
-    "builtins.open": "{0}",
-    "__builtin__.getattr": "{0}",
-    "pathlib.Path": "{0}",
-    "numpy.load": "{0}",
-    "torch._utils.os": "{0}",
-    "torch.load": "{0}",
-    "torch.storage._load_from_bytes": "{0}",
-}
+    "os.system": "touch {0}", "posix.system": "touch {0}", "builtins.eval": "open('{0}', 'w')", "builtins.open": "{0}",
+    "__builtin__.getattr": "{0}", "pathlib.Path": "{0}", "numpy.load": "{0}", "torch._utils.os": "{0}",
+    "torch.load": "{0}", "torch.storage._load_from_bytes": "{0}",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("which", WICKED)
@@ -164,20 +152,11 @@ def test_a_deep_tuple_is_no_key(tmp_path):
 @pytest.mark.parametrize(
     "change",
     [
-        {"shape": (5,)},
-        {"offset": 1},
-        {"stride": (2,)},
-        {"stride": (-1,)},
-        {"shape": (-1,)},
-        {"offset": -1},
-        {"stride": (1, 1)},
-        {"shape": (1 << 40,), "stride": (0,)},
-        {"length": 1 << 40},
-        {"length": 3},
-        {"kind": "QUInt8"},
-        {"kind": "Double"},
+        {"shape": (5,)}, {"offset": 1}, {"stride": (2,)}, {"stride": (-1,)}, {"shape": (-1,)}, {"offset": -1},
+        {"stride": (1, 1)}, {"shape": (1 << 40,), "stride": (0,)}, {"length": 1 << 40}, {"length": 3},
+        {"kind": "QUInt8"}, {"kind": "Double"},
     ],
-)
+)  # fmt: skip
 def test_views_beyond_their_storage_are_errors(torch_files, change):
     view = {"data": np.arange(4, dtype="f4"), "shape": (4,), "stride": (1,), "kind": "Float"} | change
     with pytest.raises(UserError, match=r"weights\.pth"):

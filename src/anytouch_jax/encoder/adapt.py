@@ -22,9 +22,9 @@ from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, check_spelling
 from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.arrays import unit_rows
+from anytouch_jax.encoder.arrays import Log, unit_rows
 from anytouch_jax.encoder.base import precision
-from anytouch_jax.encoder.embed import Log, embed_rows
+from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import find_tokenizer, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder, atomic_write

@@ -1,15 +1,51 @@
-"""Unit rows, rows of sensors, and the spread of features. All in numpy, for `info` and an exported encoder."""
+"""Equal batches, unit rows, rows of sensors, spread of features. All in numpy, for `info` and exported encoders."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import warnings
+from collections.abc import Callable, Iterable
+from itertools import islice
+from typing import Any, Literal
 
 import numpy as np
 
 from anytouch_jax.errors import UserError
 
+Pooling = Literal["class", "mean", "both"]
+Join = Literal["mean", "sum", "concat"]
+Log = Callable[[str], None]
+BATCH = 64
 SPREAD_ROWS, SPREAD_LEAST = 2000, 0.99  # rows that are compared, and the mean cosine of nearly constant features
+
+
+def warn(sentence: str) -> None:
+    """Show a sentence as a Python warning."""
+    warnings.warn(sentence, stacklevel=4)
+
+
+def check_features(values: np.ndarray) -> np.ndarray:
+    """Return what an encoder computed. Raises UserError if it is not finite, since finite weights may overflow."""
+    if not np.isfinite(values).all():
+        raise UserError(
+            "the features are not finite (NaN or infinite): the weights are damaged or much too large. Load them again "
+            "from their source, or take an earlier checkpoint."
+        )
+    return values
+
+
+def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: int = BATCH) -> np.ndarray:
+    """Return the results (n, ...) of `function` over n items, in batches of `size`.
+
+    Items are arrays, which are stacked, or tuples of arrays, which are stacked one by one. The last batch is filled up
+    with its last item, so that `function` is compiled for one shape. Fewer items than `size` are one batch of their
+    number. Without items the result is empty, of shape (0,). Raises UserError for results that are not finite.
+    """
+    values, left = list[np.ndarray](), iter(items)
+    while part := list(islice(left, size)):
+        full = part + part[-1:] * (size - len(part) if values else 0)
+        batch = tuple(map(np.stack, zip(*full, strict=True))) if isinstance(full[0], tuple) else np.stack(full)
+        values.append(check_features(np.asarray(function(batch))[: len(part)]))
+    return np.concatenate(values) if values else np.zeros(0, np.float32)
 
 
 def binary_scale(values: np.ndarray, axis: int | None = None) -> np.ndarray:

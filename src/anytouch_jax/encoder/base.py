@@ -22,8 +22,17 @@ from anytouch_jax.data.gels import RunningGel, other_unit, same_unit, untouched_
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
-from anytouch_jax.encoder.arrays import as_array, filled, rows_of_sensors, unit_rows
-from anytouch_jax.encoder.embed import Join, Log, Pooling, run_in_batches, warn
+from anytouch_jax.encoder.arrays import (
+    Join,
+    Log,
+    Pooling,
+    as_array,
+    filled,
+    rows_of_sensors,
+    run_in_batches,
+    unit_rows,
+    warn,
+)
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.attention import usable

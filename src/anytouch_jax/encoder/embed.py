@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,47 +14,13 @@ from anytouch_jax.bars import tracked
 from anytouch_jax.data.gels import ADVICE, UnitGels, gel_arrays, gels_of_arrays
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.arrays import BATCH, Join, Log, Pooling, run_in_batches, warn
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, read_arrays
 from anytouch_jax.shown import shown_short
 
 if TYPE_CHECKING:
-    from anytouch_jax.encoder.encoder import Encoder
-
-Pooling = Literal["class", "mean", "both"]
-Join = Literal["mean", "sum", "concat"]
-Log = Callable[[str], None]
-BATCH = 64
-
-
-def warn(sentence: str) -> None:
-    """Show a sentence as a Python warning."""
-    warnings.warn(sentence, stacklevel=4)
-
-
-def check_features(values: np.ndarray) -> np.ndarray:
-    """Return what an encoder computed. Raises UserError if it is not finite, since finite weights may overflow."""
-    if not np.isfinite(values).all():
-        raise UserError(
-            "the features are not finite (NaN or infinite): the weights are damaged or much too large. Load them again "
-            "from their source, or take an earlier checkpoint."
-        )
-    return values
-
-
-def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: int = BATCH) -> np.ndarray:
-    """Return the results (n, ...) of `function` over n items, in batches of `size`.
-
-    Items are arrays, which are stacked, or tuples of arrays, which are stacked one by one. The last batch is filled up
-    with its last item, so that `function` is compiled for one shape. Fewer items than `size` are one batch of their
-    number. Without items the result is empty, of shape (0,). Raises UserError for results that are not finite.
-    """
-    values, left = list[np.ndarray](), iter(items)
-    while part := list(islice(left, size)):
-        full = part + part[-1:] * (size - len(part) if values else 0)
-        batch = tuple(map(np.stack, zip(*full, strict=True))) if isinstance(full[0], tuple) else np.stack(full)
-        values.append(check_features(np.asarray(function(batch))[: len(part)]))
-    return np.concatenate(values) if values else np.zeros(0, np.float32)
+    from anytouch_jax.encoder.base import Encoder
 
 
 @shown_short

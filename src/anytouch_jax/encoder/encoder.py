@@ -21,9 +21,8 @@ import numpy as np
 from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import export
-from anytouch_jax.encoder.arrays import rows_of_sensors
+from anytouch_jax.encoder.arrays import Join, Pooling, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips, check_frames, random_encoder, touch_features, touch_only
-from anytouch_jax.encoder.embed import Join, Pooling
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.encoder.forks import refuse_forked

@@ -14,16 +14,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
+from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.errors import UserError
-
-if TYPE_CHECKING:
-    from anytouch_jax.encoder.embed import Pooling
 
 Engine = Literal["xla", "onnxruntime", "openvino"]
 CALIBRATION = 200  # touches that the ranges of int8 are measured on

@@ -24,16 +24,15 @@ from jax import export as jax_export
 from anytouch_jax.config import UNIVERSAL, parse_json, to_json
 from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.encoder import engines
-from anytouch_jax.encoder.arrays import as_array, filled, rows_of_sensors, unit_rows
+from anytouch_jax.encoder.arrays import Join, Pooling, as_array, filled, rows_of_sensors, run_in_batches, unit_rows
+from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
 from anytouch_jax.shown import described
 
 if TYPE_CHECKING:
-    from anytouch_jax.encoder.embed import Join, Pooling
-    from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.engines import Engine
+    from anytouch_jax.encoder.base import Encoder
 
 FORMAT = "anytouch_jax.export.1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -288,8 +287,6 @@ def _int8_error(
     encoder: Encoder, run: Any, touches: np.ndarray, rows: np.ndarray, pooling: Pooling
 ) -> dict[str, float]:
     """Return the largest difference of int8 on its calibration touches, and the mean cosine with the live features."""
-    from anytouch_jax.encoder.embed import run_in_batches
-
     items = list(zip(touches, rows, strict=True))
     live = run_in_batches(lambda part: encoder.encode_touch(*part, pooling=pooling), items, 20)
     own = run_in_batches(lambda part: run(*part), items, 20)

@@ -17,8 +17,8 @@ from PIL import Image
 
 from anytouch_jax.config import UNIVERSAL, Config, DataConfig, check_spelling
 from anytouch_jax.data.images import decode, to_rgb
+from anytouch_jax.encoder.arrays import Join, Log, Pooling, warn
 from anytouch_jax.encoder.base import Encoder, as_clips, check_choices, precision
-from anytouch_jax.encoder.embed import Join, Log, Pooling, warn
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Vit, VitConfig, VitOutput

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.data.gels import gel_arrays, gels_of_arrays
 from anytouch_jax.encoder import novelty
+from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.encoder.novelty import Assessment, Calibration
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, check_array, read_arrays
 from anytouch_jax.shown import described
-
-if TYPE_CHECKING:
-    from anytouch_jax.encoder.embed import Pooling
 
 Array = npt.NDArray[Any]
 FORMATS = ("anytouch_jax.head.2", "anytouch_jax.head.1")  # the second has no calibration

@@ -23,8 +23,8 @@ import numpy as np
 
 from anytouch_jax.data.cameras import open_source as open_source  # callers find it next to `stream`
 from anytouch_jax.data.images import QUIET, frame_time, to_rgb
+from anytouch_jax.encoder.arrays import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.base import Preprocess, precision
-from anytouch_jax.encoder.embed import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
 from anytouch_jax.errors import UserError
 from anytouch_jax.shown import shown_short

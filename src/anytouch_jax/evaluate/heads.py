@@ -26,7 +26,7 @@ from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.shown import shown_short
 
 if TYPE_CHECKING:
-    from anytouch_jax.encoder.embed import Pooling
+    from anytouch_jax.encoder.arrays import Pooling
 
 HeadName = Literal["linear", "knn", "gradient"]
 Scaling = Literal["column", "common"]

@@ -26,7 +26,7 @@ from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder import novelty
-from anytouch_jax.encoder.embed import Join, Pooling
+from anytouch_jax.encoder.arrays import Join, Pooling
 from anytouch_jax.encoder.linear_head import LinearHead, save_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, splits, statistics, tasks

@@ -28,7 +28,11 @@ Params = dict[str, Any]
 @shown_short
 @dataclass(frozen=True)
 class Net:
-    """The network of a model configuration, as functions of a plain nested dict of arrays."""
+    """The network of a model configuration, as functions of a plain nested dict of arrays.
+
+    A method of a part that the model lacks raises AttributeError. Call methods inside `jax.jit`: outside of it each
+    operation is compiled for itself.
+    """
 
     model: ModelConfig
 
@@ -90,11 +94,11 @@ class Net:
         return self.bind(params).text(ids, mask)
 
     def match(self, params: Params, z_first: Array, z_second: Array) -> Array:
-        """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5)."""
+        """Return matching logits f32 (B,) of two unit-norm touch embeddings (B, E) (Eq. 5)."""
         return self.bind(params).match(z_first, z_second)
 
     def scale(self, params: Params) -> Array:
-        """Return 1 / tau, the learned factor on cosine similarities."""
+        """Return 1 / tau f32 (), the learned factor on cosine similarities (Eq. 3)."""
         return jnp.exp(self.bind(params).logit_scale[...])
 
 
@@ -153,7 +157,7 @@ def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: ModelConfig, s
     if name == "logit_scale":
         value = -np.log(model.temperature)
     elif name == "decoder/position":
-        value = tokens.sincos_table(shape[1], model.image_size // model.patch)
+        value = jax.jit(tokens.sincos_table, static_argnums=(0, 1))(shape[1], model.image_size // model.patch)
     elif last == "scale":
         value = np.ones(shape)
     elif last in ("bias", "b"):  # b: LoRA starts as no change
@@ -163,4 +167,4 @@ def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: ModelConfig, s
         value = rng.uniform(-1, 1, shape) * np.sqrt(6 / (inputs + shape[-1]))
     else:  # tokens and positions; LoRA's a
         value = rng.standard_normal(shape) * (shape[-2] ** -0.5 if last == "a" else 0.02)
-    return jnp.asarray(value, leaf.dtype)
+    return jax.device_put(np.asarray(value, leaf.dtype))  # jnp.asarray would compile a program for each shape

@@ -36,7 +36,7 @@ def _equal_shapes(**arrays: Array) -> None:
 
 
 def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
-    """Divide the last axis by its length, or by `eps` if that is larger, as torch's `normalize`.
+    """Divide vectors (..., E) by their Euclidean length, or by `eps` if that is larger, as PyTorch's `normalize`.
 
     A power of two, which changes no digit, brings `x` to order one before it is squared: a length of 1e-7 or 1e20 is
     right too. The gradient at zero is 1 / eps.
@@ -49,7 +49,7 @@ def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
 
 
 def normalise_patches(patches: ArrayLike) -> Array:
-    """Bring each patch (..., C) to zero mean and unit *unbiased* variance (`norm_pix_loss`, golden Q6)."""
+    """Bring each patch (..., C) to zero mean and unit *unbiased* variance (MAE's `norm_pix_loss`, golden Q6)."""
     (patches,) = _wide(patches)
     centred = patches - jnp.mean(patches, axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1, keepdims=True) / max(patches.shape[-1] - 1, 1)
@@ -115,11 +115,14 @@ def info_nce(
 
 
 def centered(x: ArrayLike, present: ArrayLike) -> Array:
-    """Return unit vectors (B, E): `x` minus its mean over the rows that are `present` (B,), scaled to length 1."""
+    """Return unit vectors (B, E): `x` minus its mean over the rows that are `present` (B,) bool; others are 0.
+
+    Not in the paper. A vector within 0.001 of the mean stays shorter than 1: such a spread is rounding.
+    """
     (x,), present = _wide(x), jnp.asarray(present, bool)[:, None]
     x = jnp.where(present, x, 0.0)
     mean = jnp.sum(x, axis=0, keepdims=True) / jnp.maximum(jnp.sum(present).astype(x.dtype), 1)
-    return normalise(jnp.where(present, x - mean, 0.0), eps=1e-3)  # a smaller spread is rounding
+    return normalise(jnp.where(present, x - mean, 0.0), eps=1e-3)
 
 
 def alignment_loss(

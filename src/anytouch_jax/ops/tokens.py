@@ -124,7 +124,7 @@ def random_mask(noise: ArrayLike, keep: int) -> tuple[Array, Array, Array]:
 
 
 def keep(x: ArrayLike, keep_ids: ArrayLike) -> Array:
-    """Return the positions `keep_ids` (B, K) of `x` (B, N, ...), as (B, K, ...)."""
+    """Return the positions `keep_ids` i32 (B, K) of `x` (B, N, ...), as (B, K, ...) (He et al., 2022)."""
     x, keep_ids = jnp.asarray(x), jnp.asarray(keep_ids)
     ids = keep_ids.reshape(keep_ids.shape + (1,) * (x.ndim - 2))
     return jnp.take_along_axis(x, ids, axis=1)

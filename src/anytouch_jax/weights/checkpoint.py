@@ -122,6 +122,8 @@ class Checkpoints:
         arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}  # Orbax refuses arrays of size zero
         context = ocp.Context()
         context.array.saving.use_compression = False  # trained weights do not shrink, and a save takes twice as long
+        # Smaller ones are not cut among devices: each cut is a program to compile.
+        context.array.saving.min_slice_bytes_for_replica_parallel = 1 << 20
         release = _acquire_orbax()
         try:
             with self._one_sentence(target), context:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json, to_json
+from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
-from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import checkpoint, compatible, registry
 from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
 from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layout, refuse_unknown, to_params
@@ -23,6 +22,7 @@ from anytouch_jax.weights.safetensors import (
     BACKGROUND_KEY,
     MODEL_KEY,
     SEEN_KEY,
+    Loaded,
     WeightsError,
     existing_file,
     read_file_metadata,
@@ -40,33 +40,6 @@ _PATTERNS = ("*.safetensors", f"*.safetensors{_INDEX}", "*.bin", f"*.bin{_INDEX}
 _SHARD = re.compile(r"(.+)-\d{5}-of-(\d{5})(\.\w+)")
 _PREFIX = re.compile(r"(module|_orig_mod|model)\.")  # DistributedDataParallel, torch.compile, Lightning
 _INNER = re.compile(r"(^|\.)(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
-
-
-@shown_short
-@dataclass(frozen=True)
-class Loaded:
-    """Parameters from a run or a weights file, with every part it has: touch, decoder, image, text and others.
-
-    Sensors outside `trained_sensors` have the universal row. `trained_sensors` is None if the file does not store it.
-    `universal_drawn` is False if training never drew the universal tokens. `config` of a file has its model and its
-    background, and defaults elsewhere. `metadata` is that of the checkpoint or the file.
-    """
-
-    path: Path
-    params: Params = field(repr=False)
-    config: Config
-    trained_sensors: tuple[str, ...] | None
-    universal_drawn: bool
-    metadata: Mapping[str, Any]
-    from_run: bool
-
-    def export_metadata(self) -> dict[str, str]:
-        """Return the metadata of a safetensors file with these parameters."""
-        metadata = {"source": str(self.path), MODEL_KEY: to_json(self.config.model)}
-        metadata[BACKGROUND_KEY] = self.config.data.background
-        if self.trained_sensors is not None and "touch" in self.params:
-            metadata[SEEN_KEY] = ",".join(self.trained_sensors)
-        return metadata
 
 
 class Start(NamedTuple):

@@ -24,7 +24,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
-    from anytouch_jax.weights.load import Loaded
+    from anytouch_jax.weights.safetensors import Loaded
 
 DEFAULT = "anytouch-tiny"
 FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, model.safetensors, README.md

@@ -1,4 +1,4 @@
-"""Files of flat arrays: safetensors in and out, npz in."""
+"""Files of flat arrays: safetensors in and out, npz in; parameters with what is known of them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from anytouch_jax.config import Config, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, placeholder
+from anytouch_jax.shown import shown_short
 from anytouch_jax.weights.tree import flatten
 
 # Metadata of our files: heads, activation and training data leave no trace in shapes.
@@ -23,6 +26,33 @@ SEEN_KEY = "anytouch_jax.seen"
 
 class WeightsError(UserError):
     """A weights file that cannot be read or does not fit; the message names the file or the keys."""
+
+
+@shown_short
+@dataclass(frozen=True)
+class Loaded:
+    """Parameters from a run or a weights file, with every part it has: touch, decoder, image, text and others.
+
+    Sensors outside `trained_sensors` have the universal row. `trained_sensors` is None if the file does not store it.
+    `universal_drawn` is False if training never drew the universal tokens. `config` of a file has its model and its
+    background, and defaults elsewhere. `metadata` is that of the checkpoint or the file.
+    """
+
+    path: Path
+    params: dict[str, Any] = field(repr=False)
+    config: Config
+    trained_sensors: tuple[str, ...] | None
+    universal_drawn: bool
+    metadata: Mapping[str, Any]
+    from_run: bool
+
+    def export_metadata(self) -> dict[str, str]:
+        """Return the metadata of a safetensors file with these parameters."""
+        metadata = {"source": str(self.path), MODEL_KEY: to_json(self.config.model)}
+        metadata[BACKGROUND_KEY] = self.config.data.background
+        if self.trained_sensors is not None and "touch" in self.params:
+            metadata[SEEN_KEY] = ",".join(self.trained_sensors)
+        return metadata
 
 
 def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anytouch_jax.config import from_json, presets, to_json
+from anytouch_jax.config import presets
 from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.errors import UserError
@@ -74,11 +74,6 @@ def test_strata_follow_the_weights(make, settings):
 def test_weights_that_make_no_sense_are_errors(make, settings, weights, message):
     with pytest.raises(UserError, match=message):
         Loader(make(_sets({"a": 4, "b": 4})), settings(weights=weights))
-
-
-def test_weights_survive_the_configuration_file(settings):
-    config = settings(weights=(("a", 2.0), ("b", 0.5)))
-    assert from_json(to_json(config)) == config and from_json(to_json(settings())).data.weights is None
 
 
 def test_with_same_sensor_negatives_the_sensor_predicts_nothing(make, settings, rich):
@@ -296,11 +291,6 @@ def test_a_static_model_never_sees_a_clip(make, settings, name, stage, recipe):
     if stage == 1:
         assert loader.steps_per_epoch == 48 // SIZE  # clips that are never drawn make no epoch longer
     assert not any("all batches are stills" in note for note in loader.notes)
-
-
-def test_by_default_clips_are_half(make, settings):
-    loader = Loader(make(world()), settings(1))
-    assert [loader.kind(step) for step in range(4)] == ["still", "clip", "still", "clip"]
 
 
 def test_the_trained_sensors_are_those_drawn_from(make, settings):

@@ -83,13 +83,10 @@ def _outside_link(path):
 
 
 BAD = {
-    "missing": (lambda path: path.unlink(), "there is no file"),
-    "truncated": (_truncate, "corrupt or cut short"),
-    "garbage": (_garbage, "not a PNG"),
-    "nan": (_nan, "NaN pixels"),
-    "link": (_outside_link, "leaves the folder"),
+    "missing": (lambda path: path.unlink(), "there is no file"), "truncated": (_truncate, "corrupt or cut short"),
+    "garbage": (_garbage, "not a PNG"), "nan": (_nan, "NaN pixels"), "link": (_outside_link, "leaves the folder"),
     "path": (None, "leaves the folder"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("threads", [0, 2])

@@ -55,11 +55,8 @@ class Hub(BaseHTTPRequestHandler):
         if file.is_dir():
             return {"type": "directory", "path": name, "oid": "0" * 40}
         return {
-            "type": "file",
-            "path": name,
-            "oid": hashlib.sha1(name.encode()).hexdigest(),
-            "size": file.stat().st_size,
-        }
+            "type": "file", "path": name, "oid": hashlib.sha1(name.encode()).hexdigest(), "size": file.stat().st_size,
+        }  # fmt: skip
 
     def do_GET(self):
         path = unquote(urlsplit(self.path).path)

@@ -33,17 +33,13 @@ def _with_bars(picture):
 
 
 SPOILS = {
-    "flat": lambda picture: np.full_like(picture, 77),
-    "cut": _cut_jpeg,
-    "border": _with_bars,
+    "flat": lambda picture: np.full_like(picture, 77), "cut": _cut_jpeg, "border": _with_bars,
     "noise": lambda picture: np.random.default_rng(1).integers(0, 256, picture.shape, np.uint8),
     "grey": lambda picture: np.repeat(picture.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8),
-    "dark": lambda picture: picture // 8,
-    "inverted": lambda picture: 255 - picture,
-    "channels": lambda picture: picture[..., ::-1],
-    "turned": lambda picture: picture[::-1, ::-1],
+    "dark": lambda picture: picture // 8, "inverted": lambda picture: 255 - picture,
+    "channels": lambda picture: picture[..., ::-1], "turned": lambda picture: picture[::-1, ::-1],
     "wrong_size": lambda picture: picture[::2, ::2],
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", SPOILS)

@@ -49,13 +49,9 @@ def _harm(path, how):
     """Spoil a file: what is to be found is the first part of `how`."""
     path.unlink()
     data = {
-        "empty": b"",
-        "truncated jpeg": _encoded(".jpg")[:-40],
-        "truncated png": _encoded(".png")[:-400],
-        "unreadable bomb": _png_bomb(),
-        "unreadable text": b"not a picture",
-        "unreadable nan": b"",
-    }.get(how)
+        "empty": b"", "truncated jpeg": _encoded(".jpg")[:-40], "truncated png": _encoded(".png")[:-400],
+        "unreadable bomb": _png_bomb(), "unreadable text": b"not a picture", "unreadable nan": b"",
+    }.get(how)  # fmt: skip
     if how == "unreadable nan":
         with path.open("wb") as file:
             np.save(file, np.full((4, 4, 3), np.nan))

@@ -60,7 +60,7 @@ class Convolution(nnx.Module):
         y = jax.lax.conv_general_dilated(
             x.astype(dtype), kernel, (self.stride, self.stride), around, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
-        return y + self.bias[...].astype(dtype)
+        return y + self.bias[...].astype(dtype)[None, None, None]
 
 
 class FieldDecoder(nnx.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layou
 from anytouch_jax.weights.keymaps import Weights, param_shapes
 from anytouch_jax.weights.safetensors import (
     BACKGROUND_KEY,
+    FIELDS_KEY,
     MODEL_KEY,
     SEEN_KEY,
     WeightsError,
@@ -64,6 +66,9 @@ class Loaded:
         """Return the metadata of a safetensors file with these parameters."""
         metadata = {"source": str(self.path), MODEL_KEY: to_json(self.config.model)}
         metadata[BACKGROUND_KEY] = self.config.data.background
+        if "fields" in self.params and FIELDS_KEY in self.metadata:
+            stored = self.metadata[FIELDS_KEY]
+            metadata[FIELDS_KEY] = stored if isinstance(stored, str) else json.dumps(stored)
         if self.trained_sensors is not None and "touch" in self.params:
             metadata[SEEN_KEY] = ",".join(self.trained_sensors)
         return metadata

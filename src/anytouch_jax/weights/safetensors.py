@@ -19,6 +19,7 @@ from anytouch_jax.weights.tree import flatten
 MODEL_KEY = "anytouch_jax.model"
 BACKGROUND_KEY = "anytouch_jax.background"
 SEEN_KEY = "anytouch_jax.seen"
+FIELDS_KEY = "fields"  # calibration of what is measured, as JSON: `encoder.fields.scale_of`
 
 
 class WeightsError(UserError):

@@ -301,13 +301,14 @@ class Encoder:
         return measure(out, to_rgb(clips[0, -1], "the frame"))
 
     def measure_of(
-        self, sensor: str, background: npt.ArrayLike | None = None, width_mm: float | None = None, log: Log = warn
-    ) -> Measure:
-        """Return what turns outputs for frames of a sensor into `Fields`. Raises UserError as `measure`."""
+        self, sensor: str, background: npt.ArrayLike | None = None, width_mm: float | None = None, log: Log = warn,
+        *, rotate: int = 0, flip: Flip = "none",
+    ) -> Measure:  # fmt: skip
+        """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it. Raises UserError."""
         gel = None if background is None else to_rgb(np.asarray(background), "the background")
         if not self.measures:
             raise missing(self.source)
-        return Measure(scale_of(self.metadata, sensor, width_mm), sensor, gel, log)
+        return Measure(scale_of(self.metadata, sensor, width_mm), sensor, gel, log, rotate, flip)
 
     @property
     def measures(self) -> bool:

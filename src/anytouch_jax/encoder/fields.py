@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.health import UnitFrames, check_layout, known_gels
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
@@ -128,6 +130,17 @@ class Fields:
 
         return self._each(resized)
 
+    def points(self) -> Array:
+        """Return the surface of the gel as points f32 (B, h, w, 3) in mm, or in shares of the picture's width.
+
+        x is to the right and y down in the picture, from its middle, and z into the gel.
+        """
+        height, width = self.depth.shape[1:]
+        mm = self.width_mm or 1.0
+        y, x = np.mgrid[:height, :width] + 0.5
+        flat = (x / width - 0.5) * mm, (y / height - 0.5) * mm * self.shape
+        return np.stack([*(np.broadcast_to(axis, self.depth.shape) for axis in flat), self.depth], -1).astype("f4")
+
     def summary(self, row: int = 0) -> dict[str, Any]:
         """Return the numbers of a frame by name, each with its deviation `*_std`; None for what is unknown."""
         y, x = np.unravel_index(np.argmax(self.depth[row]), self.depth.shape[1:])
@@ -223,18 +236,20 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
 class Measure:
     """Turns outputs of the network for frames of one sensor into `Fields`, and looks for faults of the first frame.
 
-    `background` is the picture of its untouched gel, oriented as the frames are. A fault goes to `log` once.
+    `background` is the picture of its untouched gel. `oriented` turns and mirrors pictures as `Preprocess` does. A
+    fault goes to `log` once.
     """
 
     def __init__(
-        self, scale: Scale, sensor: str, background: Array | None, log: Callable[[str], None]
-    ) -> None:  # fmt: skip
-        self.scale, self._sensor, self._background, self._log = scale, sensor, background, log
+        self, scale: Scale, sensor: str, background: Array | None, log: Callable[[str], None], rotate: int, flip: Flip
+    ) -> None:
+        self.scale, self.oriented = scale, partial(orient_frame, rotate=rotate, flip=flip)
+        self._sensor, self._log = sensor, log
+        self._background = None if background is None else self.oriented(background)
         self._faults: tuple[str, ...] | None = None
-        self._is_grey = False
 
     def __call__(self, out: FieldOutput, frame: Array) -> Fields:
-        """Return the fields of frames that look like `frame`, RGB u8 (h, w, 3)."""
+        """Return the fields of frames that look like `frame`, RGB u8 (h, w, 3), oriented."""
         if self._faults is None:
             self._faults = faults_of(frame, self._background, self._sensor, self.scale.shape)
             for fault in self._faults:
@@ -323,17 +338,15 @@ def overlay(frame: Array, measured: Fields, row: int = 0) -> Array:
 def write_surface(path: Path, frame: Array, measured: Fields, row: int = 0) -> None:
     """Write the surface of the gel as a PLY mesh in mm, coloured by the frame. Depth goes down along z."""
     height, width = (max(side // _EDGE, 2) for side in frame.shape[:2])
-    one, mm = measured[row].at(height, width), measured.width_mm or 1.0
-    x = ((np.arange(width) + 0.5) / width - 0.5) * mm
-    y = (0.5 - (np.arange(height) + 0.5) / height) * mm * measured.shape  # up, as in space
     kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
     points = np.empty((height, width), kinds)
-    points["x"], points["y"], points["z"] = x, y[:, None], -one.depth[0]
+    at = measured[row].at(height, width).points()[0] * (1, -1, -1)  # y and z up, as in space
+    points["x"], points["y"], points["z"] = np.moveaxis(at, -1, 0)
     small = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
     for place, colour in enumerate(("red", "green", "blue")):
         points[colour] = small[..., place]
-    at = np.arange(height * width, dtype="<i4").reshape(height, width)
-    corners = [at[:-1, :-1], at[1:, :-1], at[:-1, 1:], at[:-1, 1:], at[1:, :-1], at[1:, 1:]]
+    grid = np.arange(height * width, dtype="<i4").reshape(height, width)
+    corners = [grid[:-1, :-1], grid[1:, :-1], grid[:-1, 1:], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]]
     triangles = np.stack(corners, -1).reshape(-1, 3)
     faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, triangles

@@ -65,7 +65,7 @@ class Unit(NamedTuple):
     gel: str
     presses: dict[float, str]  # radius of the ball in mm (NaN: unknown), and the pattern of its pictures
     width_mm: float | None
-    radii: tuple[int, int]  # pixels of a contact circle at least and at most
+    radii: tuple[int, int] | None  # pixels of a contact circle at least and at most, or None: it has no sharp rim
 
 
 # The source's own configuration gives 0.0634 mm a pixel: https://github.com/rpl-cmu/gelslam, config.yaml (ppmm).
@@ -76,9 +76,9 @@ UNITS = (
     Unit("9DTact", "9dtact", "9dtact-9dtact/sensor_1/ref.png",
          {float("nan"): "9dtact-9dtact/sensor_1/ball_press.png"}, None, (40, 200)),
     Unit("GelSlim, gel a", "gelslim", "nc/mcubelab_gelslim-gelslim3/gel_a_ball/ref.jpg",
-         {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_a_ball/press_*.jpg"}, None, (15, 90)),
+         {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_a_ball/press_*.jpg"}, None, None),
     Unit("GelSlim, gel b", "gelslim", "nc/mcubelab_gelslim-gelslim3/gel_b_ball/ref.jpg",
-         {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_b_ball/press_*.jpg"}, None, (15, 90)),
+         {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_b_ball/press_*.jpg"}, None, None),
 )  # fmt: skip
 
 
@@ -105,11 +105,22 @@ def difference(frame: Array, gel: Array) -> Array:
     return np.asarray(cv2.GaussianBlur(change - np.median(change, axis=(0, 1)), (0, 0), 1.0))
 
 
-def find_circle(change: Array, radii: tuple[float, float]) -> tuple[float, float, float]:
+def find_disc(change: Array) -> tuple[float, float, float]:
+    """Return centre x, y and radius in pixels of the disc whose area and centroid are those of the strongest change."""
+    size = cv2.GaussianBlur(np.abs(change).max(2), (0, 0), 3)
+    _, _, stats, centres = cv2.connectedComponentsWithStats((size > 0.35 * float(size.max())).astype(np.uint8))
+    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    return *map(float, centres[largest]), float(np.sqrt(stats[largest, cv2.CC_STAT_AREA] / np.pi))
+
+
+def find_circle(change: Array, radii: tuple[float, float] | None) -> tuple[float, float, float]:
     """Return centre x, y and radius in pixels of the circle over which the colours of `change` jump most.
 
-    After Daugman (1993): the jump is averaged along the circle, of which a third must lie in the picture.
+    After Daugman (1993): the jump is averaged along the circle, of which a third must lie in the picture. Without
+    `radii` in pixels it is `find_disc`.
     """
+    if radii is None:
+        return find_disc(change)
     scale = change.shape[1] / _WIDTH
     change = cv2.resize(change, (_WIDTH, round(change.shape[0] / scale)), interpolation=cv2.INTER_AREA)
     height, width = change.shape[:2]

@@ -55,7 +55,7 @@ class Ros:
                 assert all(type(value) is float for value in data)
                 self.data = data
 
-        def message(name: str, **kinds: type) -> type:
+        def message(title: str, /, **kinds: type) -> type:
             """A message of ROS: keyword arguments alone, each of its own type."""
 
             def init(self, **given):
@@ -63,7 +63,7 @@ class Ros:
                 assert all(type(value) is kinds[key] for key, value in given.items()), given
                 vars(self).update(given)
 
-            return type(name, (), {"__init__": init, "FLOAT32": 7})
+            return type(title, (), {"__init__": init, "FLOAT32": 7})
 
         three = dict.fromkeys("xyz", float)
         Vector3, Header = message("Vector3", **three), message("Header", stamp=str, frame_id=str)
@@ -98,7 +98,7 @@ class Ros:
 @pytest.mark.parametrize(("frames", "background", "measures"), [(99, True, False), (2, False, False), (99, True, True)])
 def test_what_every_frame_publishes_until_ros_ends(monkeypatch, tmp_path, tiny_run, frames, background, measures):
     monkeypatch.chdir(tmp_path)
-    gel = np.full((48, 48, 3), 90, np.uint8)
+    gel = np.tile(np.array([90, 110, 140], np.uint8), (48, 48, 1))
     press = gel.copy()
     press[10:30, 10:30] += 90
     cv2.imwrite("gel.png", gel)

@@ -101,7 +101,7 @@ def test_features_and_fields_come_from_one_pass(encoder):
 
 
 def test_what_cannot_be_measured_is_one_sentence(encoder, tiny_run):
-    with pytest.raises(UserError, match="--model.fields 32"):
+    with pytest.raises(UserError, match=r"--model\.fields 32"):
         load_encoder(tiny_run).measure(gel())
     for frame, background, width, word in (
         (gel(), None, 0.0, "above 0"), (gel(), None, np.inf, "above 0"), (gel(), gel(48, 48), 1.0, "48 x 48"),

@@ -88,7 +88,7 @@ def run(options: StreamOptions) -> int:
         gel = None if options.background is None else decode(options.background)
         turned: dict[str, Any] = {"rotate": options.rotate, "flip": options.flip}
         measure = encoder.measure_of(options.sensor or UNIVERSAL, gel, options.width_mm, log, **turned)
-    encoder = on_engine(encoder, options.engine, options.frames, pooling)
+    encoder = on_engine(encoder, options.engine, options.frames, pooling, fields=options.fields)
     known = encoder.gels if head is None else head.gels
     row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
     embedded = stream.stream(

@@ -1,14 +1,18 @@
-"""A ROS 2 node that publishes features and contact of a live camera: /touch/features and /touch/contact.
+"""A ROS 2 node of a live camera: /touch/features, /touch/contact, /touch/wrench (N, N m) and /touch/points (m).
 
 ros2 run needs a package. This file runs alone: python integrations/ros2/touch_node.py --ros-args -p sensor:=digit
+Wrench and points need an encoder that measures. Their frame is the parameter frame: x to the right of the picture, y
+down, z into the gel. The wrench is that of the object on the gel, about the centre of pressure.
 """
 
 import contextlib
 
 import rclpy
+from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from std_msgs.msg import Bool, Float32MultiArray
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Bool, Float32MultiArray, Header
 
 import anytouch_jax as at
 from anytouch_jax.data.images import decode
@@ -16,25 +20,47 @@ from anytouch_jax.encoder.novelty import ContactGate
 from anytouch_jax.encoder.stream import open_source, stream
 
 
+def wrench(fields, header: Header) -> WrenchStamped:
+    x, y, z = map(float, fields.force[0])
+    turn = Vector3(x=0.0, y=0.0, z=float(fields.torque[0]) / 1000)
+    return WrenchStamped(header=header, wrench=Wrench(force=Vector3(x=x, y=y, z=z), torque=turn))
+
+
+def cloud(fields, header: Header) -> PointCloud2:
+    points = fields.points()[0].astype("<f4") / 1000
+    axes = [PointField(name=name, offset=4 * place, datatype=PointField.FLOAT32, count=1)
+            for place, name in enumerate("xyz")]  # fmt: skip
+    height, width = points.shape[:2]
+    return PointCloud2(header=header, height=height, width=width, fields=axes, is_bigendian=False, point_step=12,
+                       row_step=12 * width, data=points.tobytes(), is_dense=True)  # fmt: skip
+
+
 def main() -> None:
     rclpy.init()
     node, any_type = Node("touch"), ParameterDescriptor(dynamic_typing=True)  # camera:=0 is a number for ROS
     values = {name: str(node.declare_parameter(name, default, any_type).value) for name, default in (
-        ("model", "anytouch-tiny"), ("camera", "0"), ("sensor", "digit"), ("background", ""))}  # fmt: skip
-    features = node.create_publisher(Float32MultiArray, "touch/features", 1)  # a queue of one: the newest counts
-    contact = node.create_publisher(Bool, "touch/contact", 1)
+        ("model", "anytouch-tiny"), ("camera", "0"), ("sensor", "digit"), ("background", ""), ("width_mm", "0"),
+        ("frame", "touch"))}  # fmt: skip
+    kinds = {"features": Float32MultiArray, "contact": Bool, "wrench": WrenchStamped, "points": PointCloud2}
+    send = {name: node.create_publisher(kind, f"touch/{name}", 1).publish for name, kind in kinds.items()}  # newest
     encoder, (source, live) = at.load_encoder(values["model"]), open_source(values["camera"])
     gel = decode(values["background"]) if values["background"] else None
     preprocess = at.Preprocess(encoder, gel)  # without a picture it estimates one from the frames
     gate, row = ContactGate(preprocess, values["sensor"]), encoder.sensor_row(values["sensor"])
-    frames = stream(encoder, source, preprocess, live=live, sensor=row, contact=gate)
+    width, length = float(values["width_mm"]) or None, encoder.config.model.frames if encoder.measures else 1
+    measure = encoder.measure_of(values["sensor"], gel, width) if encoder.measures else None
+    frames = stream(encoder, source, preprocess, live=live, sensor=row, contact=gate, frames=length, measure=measure)
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(frames):
         for frame in frames:
             if not rclpy.ok():  # Ctrl-C has ended ROS, which then refuses to publish
                 break
-            features.publish(Float32MultiArray(data=frame.values.tolist()))
+            send["features"](Float32MultiArray(data=frame.values.tolist()))
             if frame.contact == frame.contact:  # NaN without a background: contact is unknown
-                contact.publish(Bool(data=bool(frame.contact)))
+                send["contact"](Bool(data=bool(frame.contact)))
+            if frame.fields is not None and frame.fields.force is not None:  # None: nobody knows the width in mm
+                header = Header(stamp=node.get_clock().now().to_msg(), frame_id=values["frame"])
+                send["wrench"](wrench(frame.fields, header))
+                send["points"](cloud(frame.fields, header))
     node.destroy_node()
     rclpy.try_shutdown()
 

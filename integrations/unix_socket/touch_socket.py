@@ -1,4 +1,4 @@
-"""Features and contact of a live camera over a Unix socket: one JSON line a frame, for a controller without ROS.
+"""Features, contact and force of a live camera over a Unix socket: one JSON line a frame, without ROS.
 
 python integrations/unix_socket/touch_socket.py 0 digit /tmp/touch.sock gel.png
 """
@@ -32,6 +32,8 @@ def serve(embedded: Any, path: str) -> None:
             line = {"frame": frame.number, "time": frame.time, "features": frame.values.tolist()}
             line["contact"] = None if frame.contact != frame.contact else bool(frame.contact)  # NaN is unknown
             line |= {"background": "estimated"} if frame.estimated else {}
+            if frame.fields is not None:  # force in N, depth in mm and others, with deviations
+                line["fields"] = frame.fields.summary()
             for client in list(clients):
                 try:
                     client.sendall(json.dumps(line).encode() + b"\n")
@@ -51,6 +53,9 @@ if __name__ == "__main__":
         parser.add_argument(name, nargs=count)
     given = parser.parse_args()
     encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(given.camera)
-    preprocess = at.Preprocess(encoder, given.background and decode(given.background))  # without, it estimates one
-    row, gate = encoder.sensor_row(given.sensor), ContactGate(preprocess, given.sensor)
-    serve(stream(encoder, source, preprocess, live=live, sensor=row, contact=gate), given.address)
+    gel = given.background and decode(given.background)
+    preprocess, row = at.Preprocess(encoder, gel), encoder.sensor_row(given.sensor)  # without a gel it estimates one
+    gate, more = ContactGate(preprocess, given.sensor), {}
+    if encoder.measures:
+        more = {"measure": encoder.measure_of(given.sensor, gel), "frames": encoder.config.model.frames}
+    serve(stream(encoder, source, preprocess, live=live, sensor=row, contact=gate, **more), given.address)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from faulty_camera import FaultyCamera, write_uneven_video
+from measuring import measuring_weights
 
 from anytouch_jax.encoder import stream as streams
 
@@ -45,6 +46,24 @@ def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video,
     with np.load(streamed) as a:
         np.testing.assert_array_equal(np.asarray([line["features"] for line in lines], np.float32), a["features"])
     assert "4 frames embedded" in done.err
+
+
+def test_fields_are_those_of_measure(anytouch, mistake, tmp_path, video, tiny_run):
+    weights = measuring_weights(tmp_path / "weights.safetensors")
+    args = ("--model", weights, "--data", video, "--sensor", "tacto", "--width-mm", 10)
+    done = anytouch("stream", *args, "--frames", 3, "--fields", "--out", "-")
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    assert done.status == 0 and len(lines) == 4
+    assert anytouch("stream", *args, "--frames", 3, "--fields", "--out", tmp_path / "s.npz").status == 0
+    assert anytouch("measure", *args, "--out", tmp_path / "m.npz").status == 0
+    with np.load(tmp_path / "s.npz") as streamed, np.load(tmp_path / "m.npz") as measured:
+        force = [[line["fields"][f"force_{axis}"] for axis in "xyz"] for line in lines]
+        np.testing.assert_allclose(force, measured["force"][2:], atol=2e-4)
+        np.testing.assert_allclose(streamed["force_z"], measured["force"][2:, 2], atol=2e-4)
+        np.testing.assert_allclose(streamed["slip_std"], measured["slip_std"][2:], atol=2e-4)
+    assert "--model.fields 32" in mistake("stream", "--model", tiny_run, "--data", video, "--fields", "--out", "-")
+    assert "without --fields" in mistake("stream", *args, "--out", "-")
+    assert "clips of 3" in mistake("stream", *args, "--frames", 4, "--fields", "--out", "-")
 
 
 def test_what_cannot_be_streamed(mistake, tmp_path, video, tiny_run):

@@ -3,8 +3,10 @@
 import json
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
+from measuring import measuring_weights
 from tiny_models import touch_model
 
 from anytouch_jax.config import Config
@@ -178,3 +180,23 @@ def test_a_damaged_model_or_description_is_refused(exported, tmp_path):
         describes(path).write_text(json.dumps(about | same | change))
         with pytest.raises(UserError, match=word):
             load(path)
+
+
+@pytest.mark.parametrize(("frames", "pooling"), [(1, "class"), (3, "both")])
+def test_fields_on_an_engine_are_those_of_the_live_model(tmp_path, frames, pooling):
+    live = load_encoder(measuring_weights(tmp_path / "w.safetensors", {"depth": 2.0, "modulus": {"digit": 50.0}}))
+    rng = np.random.default_rng(1)
+    moved = jax.tree.map(lambda x: x + 0.05 * rng.standard_normal(x.shape).astype(np.float32), live.others["fields"])
+    live = replace(live, others={"fields": moved})
+    about = export(live, tmp_path / "m.onnx", frames=frames, pooling=pooling, form="onnx", fields=True)
+    assert about["worst_difference"] < 1e-5 and "aspect" in about
+    engine, clips = load_encoder(tmp_path / "m.onnx"), RNG.integers(0, 256, (2, frames, 30, 40, 3), np.uint8)
+    one, two = (each.measure(clips, None, "digit", width_mm=12.0) for each in (live, engine))
+    for name in ("depth", "depth_std", "shear", "contact", "force", "force_std", "torque", "slip_std", "centre"):
+        np.testing.assert_allclose(getattr(two, name), getattr(one, name), rtol=1e-3, atol=1e-4)
+    features = [each.encode_touch(CLIPS[:2, :frames], "digit", pooling=pooling) for each in (live, engine)]
+    np.testing.assert_allclose(*features, atol=1e-4)
+    plain = on_engine(live, "onnxruntime", frames)
+    for wrong in (lambda: plain.measure(clips), lambda: export(live, tmp_path / "m.bin", fields=True)):
+        with pytest.raises(UserError, match=r"--model\.fields 32|--to onnx"):
+            wrong()

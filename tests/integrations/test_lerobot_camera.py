@@ -6,8 +6,10 @@ import importlib
 import sys
 import tomllib
 
+import cv2
 import numpy as np
 import pytest
+from measuring import gel, measuring_weights
 from places import ROOT
 
 from anytouch_jax import load_encoder
@@ -82,7 +84,32 @@ def test_features_are_those_of_the_encoder(plugin, film, tmp_path):
         np.testing.assert_array_equal(camera.features(), encoder.encode_touch(encoder.preprocess(film[1]))[0])
 
 
-@pytest.mark.parametrize("wrong", [{"rotate": 45}, {"flip": "up"}])
+def test_a_film_never_ends_and_its_depth_is_a_grey_picture(plugin, tmp_path):
+    """LeRobot's own camera reads a film as fast as it can, and then its thread is over."""
+    path, weights = tmp_path / "film.avi", measuring_weights(tmp_path / "weights.safetensors")
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 100, (64, 48))
+    for number in range(4):
+        picture = gel()
+        picture[10:30, 10 : 20 + 8 * number] += 60
+        writer.write(picture[..., ::-1])
+    writer.release()
+    settings = {"index_or_path": path, "encoder": str(weights), "sensor": "tacto", "width_mm": 12.0}
+    camera = plugin.AnyTouchCamera(plugin.AnyTouchCameraConfig(**settings, depth=True, white_mm=0.1, rotate=90))
+    with camera_open(camera):
+        assert (camera.width, camera.height, camera.fps) == (48, 64, 100)
+        pictures = [camera.read() for _ in range(6)] + [camera.async_read(), camera.read_latest()]
+        assert all(one.shape == (64, 48, 3) and one.dtype == np.uint8 for one in pictures)
+        assert len({one.tobytes() for one in pictures}) > 2 and np.ptp(pictures[0]) > 20
+        assert (pictures[0] == pictures[0][..., :1]).all() and camera.features().shape == (12,)
+        measured = camera.fields()
+        assert measured.width_mm == 12 and measured.force.shape == (1, 3) and not measured.faults
+    assert not camera.is_connected
+    camera = plugin.AnyTouchCamera(plugin.AnyTouchCameraConfig(**settings | {"width_mm": None}, depth=True))
+    with pytest.raises(ValueError, match="width_mm"):
+        camera.connect()
+
+
+@pytest.mark.parametrize("wrong", [{"rotate": 45}, {"flip": "up"}, {"white_mm": 0.0}])
 def test_wrong_settings_are_one_sentence(plugin, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         plugin.AnyTouchCameraConfig(index_or_path=0, **wrong)

@@ -9,6 +9,7 @@ from types import ModuleType, SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from measuring import measuring_weights
 from places import ROOT
 
 
@@ -34,9 +35,12 @@ class Ros:
             def create_publisher(self, msg_type, topic, qos_profile):
                 def publish(message):
                     assert ros.is_on and type(message) is msg_type
-                    ros.sent.append((topic, message.data))
+                    ros.sent.append((topic, getattr(message, "data", message)))
 
                 return SimpleNamespace(publish=publish)
+
+            def get_clock(self):
+                return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "stamp"))
 
             def destroy_node(self):
                 ros.destroyed = True
@@ -51,6 +55,26 @@ class Ros:
                 assert all(type(value) is float for value in data)
                 self.data = data
 
+        def message(title: str, /, **kinds: type) -> type:
+            """A message of ROS: keyword arguments alone, each of its own type."""
+
+            def init(self, **given):
+                assert given.keys() <= kinds.keys(), given
+                assert all(type(value) is kinds[key] for key, value in given.items()), given
+                vars(self).update(given)
+
+            return type(title, (), {"__init__": init, "FLOAT32": 7})
+
+        three = dict.fromkeys("xyz", float)
+        Vector3, Header = message("Vector3", **three), message("Header", stamp=str, frame_id=str)
+        Wrench = message("Wrench", force=Vector3, torque=Vector3)
+        WrenchStamped = message("WrenchStamped", header=Header, wrench=Wrench)
+        PointField = message("PointField", name=str, offset=int, datatype=int, count=int)
+        PointCloud2 = message(
+            "PointCloud2", header=Header, height=int, width=int, fields=list, is_bigendian=bool, point_step=int,
+            row_step=int, data=bytes, is_dense=bool,
+        )  # fmt: skip
+
         def ok() -> bool:  # Ctrl-C comes after some frames
             self.is_on = self.is_on and sum(topic == "touch/features" for topic, _ in self.sent) < self.frames
             return self.is_on
@@ -61,7 +85,9 @@ class Ros:
         content = {
             "rclpy": {"init": switch(True), "ok": ok, "try_shutdown": switch(False)}, "rclpy.node": {"Node": Node},
             "rcl_interfaces.msg": {"ParameterDescriptor": SimpleNamespace},
-            "std_msgs.msg": {"Bool": Bool, "Float32MultiArray": Float32MultiArray},
+            "std_msgs.msg": {"Bool": Bool, "Float32MultiArray": Float32MultiArray, "Header": Header},
+            "geometry_msgs.msg": {"Vector3": Vector3, "Wrench": Wrench, "WrenchStamped": WrenchStamped},
+            "sensor_msgs.msg": {"PointCloud2": PointCloud2, "PointField": PointField},
         }  # fmt: skip
         modules = {part: ModuleType(part) for name in content for part in (name.partition(".")[0], name)}
         for name, values in content.items():
@@ -69,10 +95,10 @@ class Ros:
         return modules
 
 
-@pytest.mark.parametrize(("frames", "background"), [(99, True), (2, False)])
-def test_features_and_contact_of_every_frame_until_ros_ends(monkeypatch, tmp_path, tiny_run, frames, background):
+@pytest.mark.parametrize(("frames", "background", "measures"), [(99, True, False), (2, False, False), (99, True, True)])
+def test_what_every_frame_publishes_until_ros_ends(monkeypatch, tmp_path, tiny_run, frames, background, measures):
     monkeypatch.chdir(tmp_path)
-    gel = np.full((48, 48, 3), 90, np.uint8)
+    gel = np.tile(np.array([90, 110, 140], np.uint8), (48, 48, 1))
     press = gel.copy()
     press[10:30, 10:30] += 90
     cv2.imwrite("gel.png", gel)
@@ -81,7 +107,14 @@ def test_features_and_contact_of_every_frame_until_ros_ends(monkeypatch, tmp_pat
         writer.write(picture)
     writer.release()
     (tmp_path / "7.avi").rename("7")  # a number, as camera:=0 is for ROS
-    given = {"model": str(tiny_run), "camera": 7, "background": "gel.png" if background else ""}
+    model = measuring_weights(tmp_path / "weights.safetensors") if measures else tiny_run
+    given = {
+        "model": str(model),
+        "width_mm": 10.0,
+        "sensor": "tacto",
+        "camera": 7,
+        "background": "gel.png" if background else "",
+    }
     ros = Ros(given, frames)
     for name, module in ros.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
@@ -90,7 +123,12 @@ def test_features_and_contact_of_every_frame_until_ros_ends(monkeypatch, tmp_pat
     spec.loader.exec_module(node)
     node.main()
     features = [data for topic, data in ros.sent if topic == "touch/features"]
-    assert len(features) == min(frames, 4) and len({len(one) for one in features}) == 1
+    assert len(features) == min(frames, 2 if measures else 4) and len({len(one) for one in features}) == 1
     contact = [data for topic, data in ros.sent if topic == "touch/contact"]
-    assert contact == ([False, False, True, True] if background else [])
+    assert contact == ([False, False, True, True] if background else [])[-len(features) :]
+    wrenches = [one.wrench for topic, one in ros.sent if topic == "touch/wrench"]
+    clouds = [np.frombuffer(data, "<f4").reshape(14, 14, 3) for topic, data in ros.sent if topic == "touch/points"]
+    assert len(wrenches) == len(clouds) == (2 if measures else 0)
+    for force, points in zip(wrenches, clouds, strict=True):  # N, N m and metres
+        assert abs(force.force.z) > abs(force.torque.z) and np.ptp(points[..., 0]) == pytest.approx(0.01 * 13 / 14)
     assert ros.destroyed and not ros.is_on

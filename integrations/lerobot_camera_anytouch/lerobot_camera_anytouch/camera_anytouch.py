@@ -1,19 +1,22 @@
-"""The tactile camera: LeRobot's OpenCV camera, whose pictures are oriented and background-subtracted."""
+"""The tactile camera: LeRobot's OpenCV camera, whose pictures are oriented and background-subtracted, or depth."""
 
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lerobot.cameras.camera import Camera
 from lerobot.cameras.opencv import OpenCVCamera, OpenCVCameraConfig
 
-from anytouch_jax import load_encoder
+from anytouch_jax import Encoder, load_encoder
 from anytouch_jax.data.gels import RunningGel
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.transforms import orient_frame, subtract_background
+from anytouch_jax.encoder.fields import Fields, Measure
 from lerobot_camera_anytouch.config_anytouch import AnyTouchCameraConfig
+from lerobot_camera_anytouch.film import FilmCamera
 
 
 class AnyTouchCamera(Camera):
@@ -24,8 +27,12 @@ class AnyTouchCamera(Camera):
         self.config = config
         sides = (config.width, config.height)
         width, height = reversed(sides) if config.rotate in (90, 270) else sides
-        inner = OpenCVCameraConfig(index_or_path=config.index_or_path, fps=config.fps, width=width, height=height)
-        self._camera = OpenCVCamera(inner)
+        self._camera: Any
+        if Path(str(config.index_or_path)).is_file():
+            self._camera = FilmCamera(Path(str(config.index_or_path)))
+        else:
+            inner = OpenCVCameraConfig(index_or_path=config.index_or_path, fps=config.fps, width=width, height=height)
+            self._camera = OpenCVCamera(inner)
         self._gel = RunningGel()
 
     @property
@@ -49,6 +56,9 @@ class AnyTouchCamera(Camera):
         if self.config.background:
             self._gel.picture, self._gel.settled = decode(self.config.background), True
         self._gel.add(np.array(self._camera.read()))
+        self.__dict__.pop("_measure", None)  # it has the last gel
+        if self.config.depth:
+            self.fields()  # what cannot be measured fails here, and the encoder is ready for the first picture
 
     def disconnect(self) -> None:
         """Close the camera."""
@@ -68,12 +78,34 @@ class AnyTouchCamera(Camera):
 
     def features(self, max_age_ms: int = 500) -> np.ndarray:
         """Return the features f32 (E,) of the newest picture. The encoder is loaded at the first call."""
-        frame = self._oriented(self._camera.read_latest(max_age_ms=max_age_ms))
-        gel = self._untouched() if self._encoder.subtracts else None
-        return np.asarray(self._encoder.encode_touch(self._encoder.preprocess(frame, gel), self.config.sensor)[0])
+        frame = self._newest(max_age_ms)
+        return np.asarray(self._encoder.encode_touch(self._ready(frame), self.config.sensor)[0])
+
+    def fields(self, max_age_ms: int = 500) -> Fields:
+        """Return depth, shear, contact and force of the newest picture, as `Encoder.measure`."""
+        return self._measured(self._newest(max_age_ms))
+
+    def _newest(self, max_age_ms: int) -> np.ndarray:
+        return self._oriented(self._camera.read_latest(max_age_ms=max_age_ms))
+
+    def _ready(self, frame: np.ndarray) -> np.ndarray:
+        return self._encoder.preprocess(frame, self._untouched() if self._encoder.subtracts else None)
+
+    def _measured(self, frame: np.ndarray) -> Fields:
+        measure, row = self._measure
+        aspect = np.full(1, np.log(frame.shape[0] / frame.shape[1]), np.float32)
+        return measure(self._encoder.encode_and_measure(self._ready(frame)[None, None], row, aspect)[1], frame)
 
     @cached_property
-    def _encoder(self) -> Any:
+    def _measure(self) -> tuple[Measure, np.ndarray]:
+        encoder, config = self._encoder, self.config
+        measure = encoder.measure_of(config.sensor, self._untouched(), config.width_mm)
+        if measure.scale.width is None:
+            raise ValueError(f"nobody knows the mm that a picture of {config.sensor} shows: name width_mm")
+        return measure, np.full(1, encoder.sensor_row(config.sensor), np.int32)
+
+    @cached_property
+    def _encoder(self) -> Encoder:
         return load_encoder(self.config.encoder)
 
     def _oriented(self, frame: np.ndarray) -> np.ndarray:
@@ -89,4 +121,8 @@ class AnyTouchCamera(Camera):
 
     def _prepared(self, frame: np.ndarray) -> np.ndarray:
         upright = self._oriented(frame)
+        if self.config.depth:
+            depth = self._measured(upright).at(*upright.shape[:2]).depth[0]
+            grey = np.clip(255 * depth / self.config.white_mm, 0, 255).astype(np.uint8)
+            return np.repeat(grey[..., None], 3, axis=2)
         return subtract_background([upright], self._untouched())[0] if self.config.subtract else upright

@@ -15,7 +15,9 @@ class AnyTouchCameraConfig(CameraConfig):
 
     `width` and `height` are those of the oriented picture. `rotate` turns clockwise by degrees, then `flip` mirrors.
     `background` is a picture of the untouched gel in the camera's own orientation. `encoder` and `sensor` are for
-    `AnyTouchCamera.features`.
+    features and fields. With `depth`, pictures show the depth in grey: 0 is none, and 255 is `white_mm` mm or more.
+    `width_mm` is what the picture's width shows, for a sensor that the encoder does not know. `index_or_path` may be a
+    film, which plays again and again.
     """
 
     index_or_path: int | Path
@@ -25,9 +27,14 @@ class AnyTouchCameraConfig(CameraConfig):
     background: Path | None = None
     encoder: str = "anytouch-tiny"
     sensor: str = "universal"
+    depth: bool = False
+    white_mm: float = 2.0
+    width_mm: float | None = None
 
     def __post_init__(self) -> None:
         if self.rotate not in (0, 90, 180, 270):
             raise ValueError(f"rotate is 0, 90, 180 or 270, not {self.rotate}")
         if self.flip not in ("none", "across", "down"):
             raise ValueError(f"flip is none, across or down, not {self.flip!r}")
+        if not self.white_mm > 0:
+            raise ValueError(f"white_mm is the depth in mm that is white, above 0, not {self.white_mm}")

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameOptions:
-    """The options that embed and stream share."""
+class SensorOptions:
+    """The options that embed, measure and stream share."""
 
     model: Path = Path(DEFAULT)
     """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
@@ -38,6 +38,12 @@ class FrameOptions:
     rotate: Literal[0, 90, 180, 270] = 0  # Turn the frames clockwise by so many degrees, before anything else.
     flip: Literal["none", "across", "down"] = "none"
     """Mirror the frames after that: across exchanges left and right, down exchanges top and bottom."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameOptions(SensorOptions):
+    """The options that embed and stream share."""
+
     frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for clips (in segments of three).
     pooling: Literal["class", "mean", "both"] | None = None
     """Features: the class token, the mean of the patch tokens, or both (default: that of --head, else class)."""
@@ -154,7 +160,7 @@ def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def frames_input(
-    encoder: Encoder, options: FrameOptions, data: Path, known: Mapping[str, np.ndarray]
+    encoder: Encoder, options: SensorOptions, data: Path, known: Mapping[str, np.ndarray]
 ) -> tuple[int, Preprocess, ContactGate, dict[str, str]]:
     """Return the sensor's row, preprocessing, contact gate and metadata of the frames of a folder, video or camera.
 
@@ -238,7 +244,7 @@ def gels_of(preprocess: Preprocess, options: FrameOptions) -> dict[str, np.ndarr
     )
 
 
-def log_universal(encoder: Encoder, options: FrameOptions) -> None:
+def log_universal(encoder: Encoder, options: SensorOptions) -> None:
     """Warn about a missing --sensor, after the work: a mistake gets one sentence only."""
     if options.sensor is None and len(encoder.config.model.sensors) > 1:
         names = ", ".join(name for name in encoder.config.model.sensors if name != UNIVERSAL)
@@ -336,12 +342,12 @@ def _embed_frames(
     data, times, contact = options.data[0], list[float](), list[float]()
 
     def frames() -> Iterator[tuple[int, str, np.ndarray | None]]:
-        for number, name, frame in _numbered_frames(data, options.on_bad_sample, times):
+        for number, name, frame in numbered_frames(data, options.on_bad_sample, times):
             contact.append(np.nan if frame is None else gate(frame))
             yield number, name, frame
 
     features = embed_frames(
-        encoder, tracked(frames(), "frames embedded", _frame_count(data)), row, preprocess, length=options.frames,
+        encoder, tracked(frames(), "frames embedded", frame_count(data)), row, preprocess, length=options.frames,
         pooling=pooling, join=options.join, batch=options.batch,
     )  # fmt: skip
     features.predictions["contact"] = np.asarray(contact)[features.rows]
@@ -351,7 +357,7 @@ def _embed_frames(
     return features
 
 
-def _frame_count(data: Path) -> int:
+def frame_count(data: Path) -> int:
     """Return the number of frames of a folder or a video, known before reading."""
     from anytouch_jax.data import images
 
@@ -360,9 +366,7 @@ def _frame_count(data: Path) -> int:
     return len(images.list_images(data)[0]) if data.is_dir() else images.count_frames(data)
 
 
-def _numbered_frames(
-    data: Path, on_bad_sample: str, times: list[float]
-) -> Iterator[tuple[int, str, np.ndarray | None]]:
+def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[tuple[int, str, np.ndarray | None]]:
     """Yield number, name and RGB u8 pixels of each frame; the frames of a video have no names.
 
     A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped, and the

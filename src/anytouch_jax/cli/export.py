@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from anytouch_jax.encoder.encoder import Encoder
 
-_INT8 = ("int8", "data")
+_INT8 = ("int8", "data", "fields")
 # What two networks must share to be interpolated.
 _SAME = (
     "touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "pre_norm", "activation", "sensors",
@@ -44,6 +44,7 @@ class ExportOptions:
     """jax: the touch encoder as a program. onnx: the same for onnxruntime and OpenVINO. safetensors: all weights
     by this package's names. release: weights by the names of the authors' files."""
     int8: bool = False  # onnx: integer products of 8 bits, calibrated on 200 touches of --data.
+    fields: bool = False  # onnx: also the outputs of depth, shear, contact and force, see OUT.json.
     data: tuple[Path, ...] = ()  # onnx: manifests (.csv, .parquet) with touches like those to come.
     frames: Count[int] = 1  # jax, onnx: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")  # jax: the platforms it runs on.
@@ -82,7 +83,7 @@ def run(options: ExportOptions) -> int:
     names = ("frames", "platforms", "pooling", "join")
     about = export(
         encoder, options.out, form="onnx" if onnx else "jax",
-        **(_calibration(encoder, options) if options.int8 else {}),
+        fields=options.fields, **(_calibration(encoder, options) if options.int8 else {}),
         **{name: getattr(options, name) for name in names},
     )  # fmt: skip
     print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; {about['input']}")

@@ -56,17 +56,13 @@ def _health(options: InfoOptions) -> int:
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import health
     from anytouch_jax.evaluate.statistics import markdown_table
-    from anytouch_jax.sim.sensing.sensors import SENSORS, bases
 
     check_folder(options.picture, "--picture", read=options.paths, suffix=".png")
     table = manifests.read(options.paths)
     units = list(health.read_units(table))
     if not units:
         raise UserError("No picture of a sensor can be read. Check the manifest with `anytouch data verify`.")
-    # Only these looks are of real units.
-    real = [sensor for sensor in SENSORS.values() if sensor.real]
-    references = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
-    results = health.check_units(units, references)
+    results = health.check_units(units, {unit.sensor: health.known_gels(unit.sensor) for unit in units})
     if options.model is not None:
         results = [_seen_by(options.model, table, unit) for unit in results]
     marks = {True: "", False: "FAULT ", None: "? "}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
+from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.config.parsing import Above0, Count, NotNegative
 from anytouch_jax.errors import UserError
 
@@ -57,6 +58,10 @@ class StreamOptions(CameraOptions, embed.FrameOptions):
     reuse: NotNegative[float] = 0.0
     """Reuse features while no place changes by more than so many times the camera's noise (0: while frames are
     equal)."""
+    fields: bool = False
+    """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with deviations. Shear and
+    slip need --frames 3."""
+    width_mm: float | None = None  # --fields: mm that the picture's width shows. Known sensors need none.
 
 
 def run(options: StreamOptions) -> int:
@@ -67,6 +72,9 @@ def run(options: StreamOptions) -> int:
         check_folder(options.out, read=(options.model, data), suffix=".npz")
     if options.frames == 1:
         refuse_unused(options, ("stride",), "on single frames. Ask for clips with --frames, or")
+    if not options.fields:
+        refuse_unused(options, ("width_mm",), "without --fields")
+    from anytouch_jax.data.images import decode
     from anytouch_jax.encoder import stream
     from anytouch_jax.encoder.embed import Features
     from anytouch_jax.encoder.encoder import on_engine
@@ -75,12 +83,18 @@ def run(options: StreamOptions) -> int:
     if not live:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "with a film")
     encoder, pooling, head = embed.load_inputs(options)
-    encoder = on_engine(encoder, options.engine, options.frames, pooling)
+    measure = None
+    if options.fields:
+        gel = None if options.background is None else decode(options.background)
+        turned: dict[str, Any] = {"rotate": options.rotate, "flip": options.flip}
+        measure = encoder.measure_of(options.sensor or UNIVERSAL, gel, options.width_mm, log, **turned)
+    encoder = on_engine(encoder, options.engine, options.frames, pooling, fields=options.fields)
     known = encoder.gels if head is None else head.gels
     row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
     embedded = stream.stream(
         encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,
         pooling=pooling, join=options.join, log=log, contact=gate, reuse=options.reuse,
+        measure=measure,
     )  # fmt: skip
     result = stream.collect(embedded, (lambda frame: _print_line(frame, live, head)) if lines else None)
     if result.error is not None and not result.total:
@@ -100,6 +114,7 @@ def run(options: StreamOptions) -> int:
         features = Features(result.values, result.numbers, {"frame_index": result.numbers, "time": result.time})
         features.keys.update(reused=result.reused, estimated=result.estimated)
         features.gels.update(embed.gels_of(preprocess, options))
+        features.predictions.update(result.fields or {})
         features.predictions["contact"] = result.contact
         embed.save_features(options.out, encoder, features, head, options, about)
     embed.log_universal(encoder, options)
@@ -126,4 +141,5 @@ def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
         (label,), p = head(frame.values[None])
         line |= {"label": str(label), "p": round(float(p.max()), 6)}
     line |= {"contact": None if frame.contact != frame.contact else bool(frame.contact)}
-    print(json.dumps(line | {"features": values}), flush=True)
+    measured = {} if frame.fields is None else {"fields": frame.fields.summary()}
+    print(json.dumps(line | measured | {"features": values}), flush=True)

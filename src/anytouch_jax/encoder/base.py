@@ -33,9 +33,11 @@ from anytouch_jax.encoder.arrays import (
     unit_rows,
     warn,
 )
+from anytouch_jax.encoder.fields import Fields, Measure, missing, output_of, scale_of
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.attention import usable
+from anytouch_jax.nn.fields import FieldOutput
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_image, normalise_touch
 from anytouch_jax.ops import losses
@@ -274,6 +276,78 @@ class Encoder:
         ids, mask = tokenizer.encode(texts, text.length)
         return self._embeddings(tower, zip(ids, mask, strict=True), batch)
 
+    def measure(
+        self, frames: Any, background: npt.ArrayLike | None = None, sensor: str = UNIVERSAL, *,
+        width_mm: float | None = None, log: Log = warn,
+    ) -> Fields:  # fmt: skip
+        """Return depth, shear, contact and force of B frames in mm and N, with their deviations.
+
+        `frames` are those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), whose
+        last frame is measured. A still shows little of shear and slip: their deviations are wide. `background` is the
+        picture of the untouched gel. A sensor that is not in `fields.GELS` needs `width_mm`, the mm that the picture's
+        width shows. Without it lengths are shares of that width, and there is no force. A grey, turned or mirrored
+        picture is logged and has wide deviations. Raises UserError if the weights do not measure.
+        """
+        measure = self.measure_of(sensor, background, width_mm, log)
+        frames = np.asarray(frames)
+        clips = as_clips(frames[..., None] if frames.ndim == 2 else frames)
+        if clips.ndim != 5 or not len(clips):
+            raise UserError(f"frames must be (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), not {frames.shape}")
+        check_frames(self.config.model, clips.shape[1])
+        clips = clips[:, -self.config.model.frames :]
+        prepared = (np.stack([self.preprocess(frame, background) for frame in clip]) for clip in clips)
+        aspect, row = np.log(np.float32(clips.shape[2] / clips.shape[3])), self.sensor_row(sensor, log)
+        forms = list[tuple[int, ...]]()
+
+        def run(batch: np.ndarray) -> np.ndarray:
+            out = self.encode_and_measure(batch, np.full(len(batch), row, np.int32), np.full(len(batch), aspect))[1]
+            forms[:] = [value.shape[1:] for value in out]
+            return np.concatenate([np.reshape(value, (len(batch), -1)) for value in out], axis=1)
+
+        packed = run_in_batches(run, prepared)
+        parts = np.split(packed, np.cumsum([int(np.prod(form)) for form in forms])[:-1], axis=1)
+        out = output_of(part.reshape(-1, *form) for part, form in zip(parts, forms, strict=True))
+        return measure(out, to_rgb(clips[0, -1], "the frame"))
+
+    def measure_of(
+        self, sensor: str, background: npt.ArrayLike | None = None, width_mm: float | None = None, log: Log = warn,
+        *, rotate: int = 0, flip: Flip = "none",
+    ) -> Measure:  # fmt: skip
+        """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it. Raises UserError."""
+        gel = None if background is None else to_rgb(np.asarray(background), "the background")
+        if not self.measures:
+            raise missing(self.source)
+        return Measure(scale_of(self.metadata, sensor, width_mm), sensor, gel, log, rotate, flip)
+
+    @property
+    def measures(self) -> bool:
+        """Whether the weights measure depth, shear, contact and force."""
+        return "fields" in self.others
+
+    def encode_and_measure(
+        self, clips: np.ndarray, rows: np.ndarray, aspect: np.ndarray, pooling: Pooling = "class"
+    ) -> tuple[np.ndarray, FieldOutput]:
+        """Return features and raw fields, see `nn.fields`, of prepared clips u8 (B, T, H, W, 3) in one pass.
+
+        `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over width.
+        """
+        if (key := ("fields", pooling)) not in self._compiled:
+            self._compiled[key] = jax.jit(self.traceable_fields(pooling))
+        with precision(self.config):
+            values, out = self._compiled[key](self._placed_fields, clips, rows, aspect)
+        return np.asarray(values), output_of(map(np.asarray, out))
+
+    def traceable_fields(self, pooling: Pooling = "class") -> Callable[..., tuple[jax.Array, FieldOutput]]:
+        """Return the function of parameters, clips, rows and aspects that `encode_and_measure` compiles."""
+        assert self.whole is not None
+        return partial(features_and_fields, net=build(usable(self.whole)), pooling=pooling)
+
+    @cached_property
+    def _placed_fields(self) -> Params:
+        if not self.measures:
+            raise missing(self.source)
+        return self._placed | jax.device_put({"fields": self.part_params("fields")})
+
     def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:
         values = run_in_batches(lambda part: tower(jax.tree.map(filled, part)), items, batch)
         return values if len(values) else np.zeros((0, self.config.model.embed), np.float32)
@@ -449,6 +523,17 @@ def touch_features(
     return jnp.concatenate(both if pooling == "both" else both[1:], axis=-1).astype(jnp.float32)
 
 
+def features_and_fields(
+    params: Any, clips: jax.Array, sensor: jax.Array, aspect: jax.Array, *, net: Net, pooling: Pooling
+) -> tuple[jax.Array, FieldOutput]:
+    """Return features f32 (B, E) and fields of touches u8 (B, T, H, W, 3), sensor rows and aspects (B,)."""
+    check_choices(pooling, "mean")
+    token, mean, out = net.encode_and_measure(params, normalise_touch(clips), sensor, aspect)
+    values = {"class": (token,), "mean": (mean,), "both": (token, mean)}[pooling]
+    wide = jax.tree.map(lambda value: value.astype(jnp.float32), out)
+    return jnp.concatenate(values, axis=-1).astype(jnp.float32), wide
+
+
 def random_encoder(config: Config, seed: int = 0) -> Encoder:
     """Return an untrained encoder of the same form: the control of every probe."""
     config = touch_only(config)
@@ -459,7 +544,7 @@ def random_encoder(config: Config, seed: int = 0) -> Encoder:
 
 def bare_model(model: ModelConfig) -> ModelConfig:
     """Return a model without towers and heads."""
-    return replace(usable(model), image=None, text=None, match_head="none", lora_rank=0)
+    return replace(usable(model), image=None, text=None, match_head="none", lora_rank=0, fields=0)
 
 
 def touch_only(config: Config) -> Config:

@@ -25,9 +25,11 @@ from anytouch_jax.encoder.arrays import Join, Pooling, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips, check_frames, random_encoder, touch_features, touch_only
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
+from anytouch_jax.encoder.fields import METADATA, missing
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
+from anytouch_jax.nn.fields import FieldOutput
 from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import load, registry
 from anytouch_jax.weights.families import Size, load_family
@@ -96,6 +98,17 @@ class EngineEncoder(Encoder):
     def gels(self) -> dict[str, np.ndarray]:
         return self.run.gels
 
+    @property
+    def measures(self) -> bool:
+        return "fields" in self.run.about
+
+    def encode_and_measure(
+        self, clips: np.ndarray, rows: np.ndarray, aspect: np.ndarray, pooling: Pooling = "class"
+    ) -> tuple[np.ndarray, FieldOutput]:
+        if not self.measures:
+            raise missing(self.source)
+        return self.run.measure(clips, rows, aspect)
+
     def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
         if dtype == "bfloat16":
             raise UserError(f"{self.source} is computed in float32 or int8; leave out --dtype")
@@ -122,18 +135,24 @@ def load_engine(path: str | Path, engine: Engine | None = None) -> EngineEncoder
         raise UserError(f"{path} is for jax alone; call it by anytouch_jax.load_exported, or export it with --to onnx")
     config, trained = from_json(json.dumps(run.about["config"])), run.about.get("trained_sensors")
     sensors = trained and tuple(map(str, trained))
-    return EngineEncoder(config, {}, str(path), sensors, run.about["universal_drawn"], run=run)
+    metadata = {METADATA: run.about.get("fields", {}).get("calibration", {})}
+    return EngineEncoder(config, {}, str(path), sensors, run.about["universal_drawn"], metadata=metadata, run=run)
 
 
-def on_engine(encoder: Encoder, engine: Engine | None, frames: int, pooling: Pooling = "class") -> Encoder:
-    """Return the same encoder on an engine, exported for touches of `frames` frames; None leaves it where it is."""
+def on_engine(
+    encoder: Encoder, engine: Engine | None, frames: int, pooling: Pooling = "class", *, fields: bool = False
+) -> Encoder:
+    """Return the same encoder on an engine, exported for touches of `frames` frames; None leaves it where it is.
+
+    With `fields` it measures too.
+    """
     if isinstance(encoder, EngineEncoder):
         return encoder if engine is None else load_engine(encoder.source, engine)
     if engine in (None, "xla"):
         return encoder
     with TemporaryDirectory() as folder:
         path = Path(folder) / "encoder.onnx"
-        export.export(encoder, path, frames=frames, pooling=pooling, form="onnx")
+        export.export(encoder, path, frames=frames, pooling=pooling, form="onnx", fields=fields)
         return replace(load_engine(path, engine), source=encoder.source)
 
 

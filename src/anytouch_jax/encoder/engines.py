@@ -22,6 +22,7 @@ import numpy as np
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
 from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.errors import UserError
+from anytouch_jax.nn.fields import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE, FieldOutput
 
 Engine = Literal["xla", "onnxruntime", "openvino"]
 CALIBRATION = 200  # touches that the ranges of int8 are measured on
@@ -76,7 +77,8 @@ class _Graph:
 def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling = "class") -> bytes:
     """Return an ONNX model of touches u8 (B, T, H, W, 3) and sensor rows i32 (B,) to features f32 (B, E).
 
-    Raises UserError for touches of more than one segment.
+    If `params` have fields, it has their input aspect f32 (B,) and the outputs of `nn.fields.FieldOutput` too. Raises
+    UserError for touches of more than one segment.
     """
     with _needed("anytouch_jax[engines]"):
         from onnx import TensorProto, helper
@@ -86,11 +88,14 @@ def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling =
     touch, graph, side = jax.tree.map(np.asarray, params["touch"]), _Graph(), model.image_size
     x = _tokens(graph, touch, model, frames)
     x = graph.norm(x, touch["pre_norm"], model.norm_eps) if model.pre_norm else x
-    for number in range(model.touch.depth):
+    depth, measures = model.touch.depth, "fields" in params
+    read, states = [round(number * depth / (STATES - 1)) for number in range(STATES)], [x]
+    for number in range(depth):
         graph.part = f"{_BLOCK}{number}."
-        last = number == model.touch.depth - 1
+        last = number == depth - 1
         block = jax.tree.map(operator.itemgetter(number), touch["blocks"])
-        x = _block(graph, x, block, model, first=last and pooling == "class")
+        x = _block(graph, x, block, model, first=last and pooling == "class" and not measures)
+        states += [x] * read.count(number + 1)
     graph.part, values = "", []
     if pooling != "mean":
         token = graph("Squeeze", graph("Slice", x, [0], [1], [1]), [1])
@@ -104,6 +109,10 @@ def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling =
     about = helper.make_tensor_value_info
     inputs = [about("frames", TensorProto.UINT8, ("B", frames, side, side, 3)), about("sensor", TensorProto.INT32, "B")]
     outputs = [about("features", TensorProto.FLOAT, ("B", count))]
+    if measures:
+        inputs.append(about("aspect", TensorProto.FLOAT, "B"))
+        shapes = _fields(graph, jax.tree.map(np.asarray, params["fields"]), model, frames, states)
+        outputs += [about(name, TensorProto.FLOAT, ("B", *shape)) for name, shape in shapes.items()]
     made = helper.make_graph(graph.nodes, "touch_encoder", inputs, outputs, graph.constants)
     opset = [helper.make_opsetid("", OPSET)]
     return bytes(helper.make_model(made, opset_imports=opset, ir_version=10).SerializeToString())
@@ -150,6 +159,73 @@ def _convolutional(graph: _Graph, patch: Any, kernel: np.ndarray, model: ModelCo
         x = graph("Transpose", x, perm=[0, 3, 1, 2]) if number == 1 else x
     last = patch["last"]
     return graph.dense(graph("Reshape", x, [-1, model.patches, len(last["kernel"])]), last)
+
+
+def _fields(graph: _Graph, own: Any, model: ModelConfig, frames: int, states: list[str]) -> dict[str, tuple[int, ...]]:
+    """Add the outputs of `nn.fields.FieldDecoder` from states (B, 1 + S + N, D), and return their shapes."""
+    from onnx import helper
+
+    half, grid, eps = model.image_size // HALF, model.image_size // model.patch, model.norm_eps
+
+    def convolved(x: str, name: str, stride: int = 1) -> str:
+        part = own[name]
+        if "norm" in part:
+            x = graph("Gelu", graph.norm(x, part["norm"], eps))
+        count, outputs = part["kernel"].shape
+        inputs = len(part["norm"]["scale"]) if "norm" in part else 6
+        side = round((count // inputs) ** 0.5)
+        kernel = part["kernel"].reshape(side, side, inputs, outputs).transpose(3, 2, 0, 1)
+        settings: dict[str, Any] = {"kernel_shape": [side] * 2, "pads": [side // 2] * 4, "strides": [stride] * 2}
+        x = graph("Conv", graph("Transpose", x, perm=[0, 3, 1, 2]), kernel, part["bias"], **settings)
+        return graph("Transpose", x, perm=[0, 2, 3, 1])
+
+    def resized(x: str, factor: float) -> str:
+        x = graph("Transpose", x, perm=[0, 3, 1, 2])
+        x = graph("Resize", x, "", [1.0, 1.0, factor, factor], mode="linear")
+        return graph("Transpose", x, perm=[0, 2, 3, 1])
+
+    clip = graph("Cast", "frames", to=1)  # float32
+    last, first = (graph("Squeeze", graph("Slice", clip, [at], [at + 1], [1]), [1]) for at in (frames - 1, 0))
+    change = graph("Mul", graph("Sub", last, first), _SCALE)
+    sharp = convolved(graph("Concat", graph("Add", graph("Mul", last, _SCALE), _SHIFT), change, axis=-1), "stem", 2)
+    x = convolved(sharp, "down", 2)
+    joined, start = graph("Concat", *states, axis=-1), 1 + model.sensor_tokens
+    aspect = graph("Unsqueeze", "aspect", [1])
+    tokens = graph.dense(graph("Slice", joined, [start], [start + model.patches], [1]), own["read"])
+    tokens = graph("Add", tokens, graph("Unsqueeze", graph.dense(aspect, own["aspect"]), [1]))
+    coarse = graph("Reshape", tokens, [-1, grid, grid, own["read"]["kernel"].shape[1]])
+    quarter = (half + 1) // 2
+    x = convolved(graph("Concat", resized(coarse, quarter / grid), x, axis=-1), "middle1")
+    x = graph("Add", x, convolved(x, "middle2"))
+    pooled = graph("ReduceMean", x, [1, 2], keepdims=0)
+    x = convolved(graph("Concat", resized(x, half / quarter), sharp, axis=-1), "fine1")
+    x = graph("Add", x, convolved(x, "fine2"))
+    maps = graph.dense(graph("Gelu", x), own["maps"])
+    token = graph("Squeeze", graph("Slice", joined, [0], [1], [1]), [1])
+    whole = graph.dense(graph("Concat", token, pooled, axis=-1), own["whole"]["up"])
+    whole = graph.dense(graph("Gelu", whole), own["whole"]["down"])
+
+    def part(x: str, at: int, axis: int) -> str:
+        return graph("Squeeze", graph("Slice", x, [at], [at + 1], [axis]), [axis])
+
+    pressure = graph("Mul", graph("Softplus", part(maps, 4, 3)), graph("Sigmoid", part(maps, 3, 3)))
+    pressure = graph("Mul", pressure, STRESS)
+    normal = graph("Mul", graph("ReduceMean", pressure, [1, 2], keepdims=0), graph("Exp", "aspect"))
+    sideways = graph("Mul", graph("Slice", whole, [0], [2], [1]), FORCE)
+    made = (
+        graph("Mul", part(maps, 0, 3), LENGTH), graph("Mul", graph("Slice", maps, [1], [3], [3]), LENGTH),
+        part(maps, 3, 3), pressure, part(maps, 5, 3), part(maps, 6, 3),
+        graph("Concat", sideways, graph("Unsqueeze", normal, [1]), axis=1),
+        graph("Mul", part(whole, 2, 1), TORQUE), part(whole, 3, 1), graph("Slice", whole, [4], [6], [1]),
+        part(whole, 6, 1), part(whole, 7, 1),
+    )  # fmt: skip
+    values = dict(zip(FieldOutput._fields, made, strict=True))
+    graph.nodes += [helper.make_node("Identity", [value], [name], name) for name, value in values.items()]
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+        ("depth", "contact", "pressure", "depth_log", "shear_log"), (half, half)
+    )
+    shapes |= {"shear": (half, half, 2), "force": (3,), "force_log": (2,)}
+    return {name: shapes.get(name, ()) for name in values}
 
 
 def _block(graph: _Graph, x: str, block: Any, model: ModelConfig, *, first: bool) -> str:
@@ -206,10 +282,11 @@ def quantised(data: bytes, touches: np.ndarray, rows: np.ndarray) -> bytes:
         return out.read_bytes()
 
 
-def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[..., Any]:
     """Return the function of an ONNX model on an engine: touches u8, sensor rows i32 (B,) to features f32 (B, E).
 
-    It uses every core that the process may use, in float32. Raises UserError for an engine that is not installed.
+    A model with fields takes aspects f32 (B,) too, and returns features and the arrays of `FieldOutput`. It uses every
+    core that the process may use, in float32. Raises UserError for an engine that is not installed.
     """
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if engine == "openvino":
@@ -220,10 +297,22 @@ def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[[np.ndarray
         core = openvino.Core()
         settings = {"INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": "f32"}
         model = core.compile_model(core.read_model(data), "CPU", settings)
-        return lambda frames, rows: np.asarray(model({"frames": frames, "sensor": rows})["features"])
+        names = [output.get_any_name() for output in model.outputs]
+        return _call(names, lambda given: [np.asarray(value) for value in model(given).values()])
     with _needed("anytouch_jax[engines]"):
         import onnxruntime
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = threads, 3
     running = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    return lambda frames, rows: np.asarray(running.run(["features"], {"frames": frames, "sensor": rows})[0])
+    names = [output.name for output in running.get_outputs()]
+    return _call(names, lambda given: running.run(names, given))
+
+
+def _call(names: list[str], run: Callable[[dict[str, np.ndarray]], list[Any]]) -> Callable[..., Any]:
+    """Return the function of a model with these outputs; features are the first."""
+
+    def call(*given: np.ndarray) -> Any:
+        values = run(dict(zip(("frames", "sensor", "aspect"), given, strict=False)))
+        return np.asarray(values[0]) if len(names) == 1 else (values[0], FieldOutput(*values[1:]))
+
+    return call

@@ -26,9 +26,11 @@ from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.encoder import engines
 from anytouch_jax.encoder.arrays import Join, Pooling, as_array, filled, rows_of_sensors, run_in_batches, unit_rows
 from anytouch_jax.encoder.engines import Engine
+from anytouch_jax.encoder.fields import METADATA
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
+from anytouch_jax.nn.fields import FieldOutput
 from anytouch_jax.shown import described
 
 if TYPE_CHECKING:
@@ -106,6 +108,8 @@ class Exported:
             shape = ", ".join(str(size) for size in wanted)
             raise UserError(f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
         rows = rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
+        if "fields" in self.about:  # the aspect does not change features
+            return np.asarray(self.measure(frames, rows, np.zeros(len(frames), np.float32))[0])
         if self.about["form"] == "onnx":
             return np.asarray(self._run(frames, rows))
         refuse_forked()
@@ -116,6 +120,11 @@ class Exported:
     def gels(self) -> dict[str, np.ndarray]:
         """Pictures RGB u8 (h, w, 3) of the untouched gel, by unit, of the touches that int8 was calibrated on."""
         return {name: decode_bytes(b64decode(text), name) for name, text in self.about.get("gels", {}).items()}
+
+    def measure(self, frames: np.ndarray, rows: np.ndarray, aspect: np.ndarray) -> tuple[np.ndarray, FieldOutput]:
+        """Return features and fields, as `Encoder.encode_and_measure`, of a model that has fields."""
+        values, out = self._run(frames, rows, aspect)
+        return values, out
 
     def _row(self, name: str) -> int:
         sensors: dict[str, int] = self.about["sensors"]
@@ -163,14 +172,15 @@ def export(
     encoder: Encoder, path: str | Path, *, frames: int = 1, platforms: Sequence[str] = ("cpu", "cuda"),
     pooling: Pooling = "class", join: Join = "mean", form: Literal["jax", "onnx"] = "jax",
     calibration: tuple[np.ndarray, np.ndarray] | None = None, gels: Mapping[str, np.ndarray] | None = None,
+    fields: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
 
     The artefact is first called with 1 and 5 touches and compared with the live model. ONNX is float32, for CPUs. With
     `calibration`, touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), its linear layers become int8 after the
-    comparison. `gels` are pictures of the untouched gel of their units, for the description. Raises CheckError if they
-    differ, UserError for what ONNX is not written for and if it cannot be compared on this machine, OSError for a full
-    disk.
+    comparison. `gels` are pictures of the untouched gel of their units, for the description. With `fields`, ONNX has
+    the outputs of `nn.fields` too. Raises CheckError if they differ, UserError for what ONNX is not written for and if
+    it cannot be compared on this machine, OSError for a full disk.
     """
     from anytouch_jax.encoder.base import check_frames
 
@@ -179,6 +189,9 @@ def export(
         if encoder.blank.dtype != np.uint8:
             raise UserError(f"ONNX is written for AnyTouch's own network; export {encoder.source} with --to jax")
     path, model = Path(path), encoder.config.model
+    if fields and (form != "onnx" or calibration is not None):
+        raise UserError("fields are exported to ONNX in float32: use --to onnx, without --int8")
+    params = encoder.params | ({"fields": encoder.part_params("fields")} if fields else {})
     check_frames(model, frames)
     wrong = ", ".join(name for name in platforms if name not in PLATFORMS)
     if wrong or not platforms:
@@ -192,12 +205,12 @@ def export(
     live = plain if model.attention == "cudnn" and _here() != "cuda" else encoder
     with jax.enable_x64(model.dtype == "float64"):
         if form == "onnx":
-            data = engines.touch_graph(encoder.params, model, frames, pooling)
+            data = engines.touch_graph(params, model, frames, pooling)
             run: Any = engines.session(data)
         else:
             data = _artefact(plain, frames, platforms, pooling, join)
             run = jax.jit(jax_export.deserialize(bytearray(data)).call)
-        differs, width = _worst(live, run, frames, pooling, join)
+        differs, width = _worst(live, run, frames, pooling, join, fields)
     if differs > (tolerance := ONNX_TOLERANCE if form == "onnx" else TOLERANCE[model.dtype]):
         raise CheckError(
             f"the artefact differs from the live model by {differs:.2g} of its largest feature, more than "
@@ -207,6 +220,9 @@ def export(
     if form == "onnx":
         config, drawn = json.loads(to_json(encoder.config)), encoder.universal_drawn
         more = {"platforms": ["cpu"], "config": config, "weights": encoder.fingerprint, "universal_drawn": drawn}
+    if fields:
+        more["fields"] = {"outputs": list(FieldOutput._fields), "calibration": encoder.metadata.get(METADATA, {})}
+        more["aspect"] = "float32 (B,): the logarithm of the height over the width that the picture shows"
     if calibration is not None:
         data = engines.quantised(data, *calibration)
         more["int8"] = _int8_error(live, engines.session(data), *calibration, pooling)
@@ -267,15 +283,30 @@ def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: 
     return bytes(jax_export.export(jax.jit(run), platforms=tuple(platforms))(touches, rows).serialize())
 
 
-def _worst(encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join) -> tuple[float, int]:
-    """Return the largest difference from the live model, as a share of the largest feature, and the feature count."""
+def _worst(
+    encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join, fields: bool = False
+) -> tuple[float, int]:
+    """Return the largest difference from the live model, as a share of the largest feature, and the feature count.
+
+    With `fields` it is that of any output, as a share of its largest value or of 1.
+    """
     model, rng, worst, width, blank = encoder.config.model, np.random.default_rng(0), 0.0, 0, encoder.blank
     for count in _CHECKED:
         clips = rng.integers(0, 256, (count, frames, *blank.shape), np.uint8)
         clips = clips if blank.dtype == np.uint8 else clips.astype(blank.dtype) / 255
         rows = rng.integers(0, len(model.sensors), count).astype(np.int32)
-        live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
-        exported = np.asarray(run(clips, rows))
+        if fields:
+            aspect = rng.uniform(-0.5, 0.5, count).astype(np.float32)
+            (live, mine), (exported, theirs) = (
+                encoder.encode_and_measure(clips, rows, aspect, pooling),
+                run(clips, rows, aspect),
+            )
+            pairs = [(np.asarray(a), np.asarray(b)) for a, b in zip(mine, theirs, strict=True)]
+            off = [np.inf if a.shape != b.shape else np.abs(a - b).max() / max(np.abs(a).max(), 1e-3) for a, b in pairs]
+            worst = max(worst, float(np.max(off)))
+        else:
+            live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
+            exported = np.asarray(run(clips, rows))
         if exported.shape != live.shape or not np.isfinite(exported).all():
             raise CheckError(f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite")
         worst = max(worst, float(np.abs(exported - live).max() / np.abs(live).max()))

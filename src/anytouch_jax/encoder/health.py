@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,11 @@ from anytouch_jax.data.manifest.manifest import Manifest, group_rows
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS, spread
 from anytouch_jax.data.prepare.untouched_gel import DOT_DEPTH, UntouchedGel, close_dots, has_dots, scale_picture
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_arrays
 
 Array = npt.NDArray[Any]
 
+_LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "looks.npz"  # real untouched gels, in the package
 RECORDINGS, FRAMES = 24, 6  # that are read of a unit, and of a recording
 SIDE = 16  # of the layout of a picture
 LIMITS = {
@@ -190,6 +192,14 @@ def check_units(units: Sequence[UnitFrames], references: Mapping[str, Sequence[A
         known = [*references.get(unit.sensor, ()), *(other.untouched() for other in others)]
         results.append(examine(unit, known, others))
     return results
+
+
+@lru_cache
+def known_gels(sensor: str) -> list[Array]:
+    """Return small untouched gels RGB u8 (30, 40, 3) of real units of a sensor family, none of an unknown one."""
+    name = f"{sensor}.bases"
+    gels = read_arrays(_LOOKS, only=name.__eq__).get(name, np.zeros(0))
+    return list(gels) if gels.dtype == np.uint8 else []  # the simulator invents the look of the others
 
 
 def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:

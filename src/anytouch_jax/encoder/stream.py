@@ -26,6 +26,7 @@ from anytouch_jax.data.images import QUIET, frame_time, to_rgb
 from anytouch_jax.encoder.arrays import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.base import Preprocess, precision
 from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
+from anytouch_jax.encoder.fields import Fields, Measure
 from anytouch_jax.errors import UserError
 from anytouch_jax.shown import shown_short
 
@@ -87,7 +88,7 @@ class Embedded(NamedTuple):
     frame to its features, with decoding and waiting. `started`: start of the stream in Unix seconds. `time`: the time
     stamp of a video's frame, or `at` of a camera's. `picture` and `missed` are those of `Frame`. `contact`: 1, 0 or
     NaN (unknown). `reused`: the features are those of the last clip that was embedded (`Reuse`). `estimated`: the
-    untouched gel is a running estimate, which may still improve.
+    untouched gel is a running estimate, which may still improve. `fields` is what was measured, or None.
     """
 
     number: int
@@ -102,6 +103,7 @@ class Embedded(NamedTuple):
     contact: float = float("nan")
     reused: bool = False
     estimated: bool = False
+    fields: Fields | None = None
 
 
 class Mailbox:
@@ -150,28 +152,31 @@ class Mailbox:
 def stream(
     encoder: Encoder, source: Source, preprocess: Preprocess | None = None, *, live: bool, sensor: int,
     frames: int = 1, stride: int = 1, pooling: Pooling = "class", join: Join = "mean", log: Log = warn,
-    contact: Callable[[np.ndarray], float] | None = None, reuse: float = 0.0,
+    contact: Callable[[np.ndarray], float] | None = None, reuse: float = 0.0, measure: Measure | None = None,
 ) -> Generator[Embedded]:  # fmt: skip
     """Yield features of the frames of `source`; the encoder is compiled before the first frame is read.
 
     A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
     `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy, and `log` gets one
     sentence each about a missed read, a frozen and a black picture. `contact` decides contact of a frame, as
-    `novelty.ContactGate` does. `reuse` is the factor of `Reuse`. Close the iterator to stop and to release the
+    `novelty.ContactGate` does. `reuse` is the factor of `Reuse`. With `measure`, of `Encoder.measure_of`, the frames
+    are measured too, in the same pass. Close the iterator to stop and to release the
     source. Raises UserError for a wrong length or factor, and CameraError if no frame can be read for RETRY seconds.
     """
     check_frames(encoder.config.model, frames)
     if stride < 1:
         raise UserError(f"the stride of a clip must be at least 1, not {stride}")
     is_served = Reuse(reuse)
-    embed = compile_for_one(encoder, sensor, frames, pooling, join)
+    if measure is not None and frames not in (1, encoder.config.model.frames):
+        raise UserError(f"fields are measured on 1 frame or clips of {encoder.config.model.frames}, not of {frames}")
+    embed = compile_for_one(encoder, sensor, frames, pooling, join, measures=measure is not None)
     mailbox = Mailbox(replace=live)
     arrived = _camera_frames(source, mailbox, log) if live else _video_frames(source)
     arguments = (arrived, preprocess or Preprocess(encoder), frames, stride, mailbox, contact)
     reader = threading.Thread(target=_read, args=arguments, daemon=True)
 
     def embedded() -> Generator[Embedded]:
-        started, start = time.time(), time.perf_counter()
+        started, start, measured = time.time(), time.perf_counter(), None
         try:
             reader.start()  # Ctrl-C may come already while the thread starts
             while (clip := mailbox.take(HANG if live else None)) is not None:
@@ -179,13 +184,20 @@ def stream(
                 if not (reused := is_served(clip.frames)):
                     there = jax.device_put(clip.frames[None]).block_until_ready()
                     copied = time.perf_counter()
-                    values = check_features(np.asarray(embed(there))[0])
+                    if measure is None:
+                        out = embed(there)
+                    else:
+                        picture = measure.oriented(clip.last.pixels)
+                        aspect = np.log(picture.shape[0] / picture.shape[1])
+                        out, raw = embed(there, np.full(1, aspect, np.float32))
+                        measured = measure(raw, picture)
+                    values = check_features(np.asarray(out)[0])
                 end = time.perf_counter()
                 last, at = clip.last, clip.last.read - start
                 seconds = (last.decode, clip.resize, copied - begin, end - copied)
                 stamp = at if last.time is None else last.time
                 age = end - last.read
-                about = (last.picture, last.missed, clip.contact, reused, clip.estimated)
+                about = (last.picture, last.missed, clip.contact, reused, clip.estimated, measured)
                 yield Embedded(last.number, at, values, seconds, age, started, stamp, *about)
         finally:
             mailbox.close()
@@ -233,10 +245,17 @@ def largest_change(clip: np.ndarray, other: np.ndarray) -> float:
 
 
 def compile_for_one(
-    encoder: Encoder, sensor: int, frames: int, pooling: Pooling = "class", join: Join = "mean"
-) -> Callable[[jax.Array], jax.Array | np.ndarray]:
-    """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm, parameters on the device."""
-    touch = np.tile(encoder.blank, (1, frames, 1, 1, 1))
+    encoder: Encoder, sensor: int, frames: int, pooling: Pooling = "class", join: Join = "mean", *,
+    measures: bool = False,
+) -> Callable[..., Any]:  # fmt: skip
+    """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm, parameters on the device.
+
+    If it `measures`, it takes the aspect f32 (1,) too, and returns the features and the fields.
+    """
+    touch, row = np.tile(encoder.blank, (1, frames, 1, 1, 1)), np.full(1, sensor, np.int32)
+    if measures:
+        encoder.encode_and_measure(touch, row, np.zeros(1, np.float32), pooling)
+        return lambda clip, aspect: encoder.encode_and_measure(clip, row, aspect, pooling)
     if isinstance(encoder, EngineEncoder):
         call = partial(encoder.encode_touch, sensor=np.full(1, sensor), pooling=pooling, join=join)
         call(touch)
@@ -391,6 +410,7 @@ class Result(NamedTuple):
     contact: np.ndarray = np.zeros(0)
     reused: np.ndarray = np.zeros(0, bool)
     estimated: np.ndarray = np.zeros(0, bool)
+    fields: dict[str, np.ndarray] | None = None  # numbers of each frame by name, as in a line of `Fields.summary`
 
 
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
@@ -401,6 +421,7 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
     stored: deque[Embedded] = deque(maxlen=KEPT if on_each else None)
     total, interrupted, failure = 0, False, None
     pictures: Counter[str] = Counter()
+    names, summaries = list[str](), list[list[float]]()
     try:
         with contextlib.closing(embedded), _sigterm_as_ctrl_c():
             for frame in embedded:
@@ -408,6 +429,12 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
                 pictures[frame.picture] += 1
                 if on_each is not None:
                     on_each(frame)
+                elif frame.fields is not None:
+                    summary = frame.fields.summary()  # maps of every frame would fill the memory
+                    summaries.append([np.nan if value is None else value for value in summary.values()])
+                    names = list(summary)
+                frame = frame._replace(fields=None)
+                if on_each is not None:
                     frame = frame._replace(values=np.zeros(0, np.float32))
                 stored.append(frame)
     except KeyboardInterrupt:
@@ -423,6 +450,7 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         numbers.astype(np.int64), at, seconds.reshape(-1, len(PARTS)), age, total, interrupted,
         stored[-1].started if stored else 0.0, times, stored[-1].missed if stored else 0, pictures["frozen"],
         pictures["black"], failure, contact, reused.astype(bool), estimated.astype(bool),
+        dict(zip(names, np.transpose(summaries), strict=True)) if names else None,
     )  # fmt: skip
 
 

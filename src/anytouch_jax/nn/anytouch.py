@@ -93,6 +93,13 @@ class AnyTouch(nnx.Module):
         """Return the fields of the last frame of clips, see `FieldDecoder`."""
         return self.fields(self.touch.states(clip, sensor, STATES), clip, aspect)
 
+    def encode_and_measure(self, clip: Array, sensor: Array, aspect: Array) -> tuple[Array, Array, FieldOutput]:
+        """Return in one pass `encode_poolings` and `measure` of clips of one segment."""
+        states = self.touch.states(clip, sensor, STATES)
+        hidden = states[..., -self.touch.width :]
+        mean = jnp.mean(self.touch.projection(hidden[:, self.decoder.special :]), axis=1)
+        return self.touch.embedding(hidden[:, 0]), mean, self.fields(states, clip, aspect)
+
     def match(self, z_first: Array, z_second: Array) -> Array:
         """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5), from their element-wise product."""
         if self.matcher is None:

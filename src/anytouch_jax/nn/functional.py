@@ -85,6 +85,12 @@ class Net:
         """
         return self.bind(params).measure(clip, sensor, aspect)
 
+    def encode_and_measure(
+        self, params: Params, clip: Array, sensor: Array, aspect: Array
+    ) -> tuple[Array, Array, FieldOutput]:
+        """Return both poolings (B, E) and the fields of clips of one segment, in one pass."""
+        return self.bind(params).encode_and_measure(clip, sensor, aspect)
+
     def encode_image(self, params: Params, image: Array) -> Array:
         """Return image embeddings (V, E) of normalised photographs (V, H, W, 3); not unit-norm."""
         return self.bind(params).image(image)

@@ -103,7 +103,7 @@ class TouchEncoder(nnx.Module):
         self.blocks = stacked_blocks(model.touch, model, model.norm_eps, ACTIVATIONS[model.activation])
         self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
-        self.patch_size, self.depth, self.remat = model.patch, model.touch.depth, model.remat
+        self.patch_size, self.depth, self.width, self.remat = model.patch, model.touch.depth, width, model.remat
 
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""

@@ -21,7 +21,7 @@ from anytouch_jax.weights.tree import flatten, nest
 Params = dict[str, Any]
 
 # Parts that some model of ours has, and the classifier that came with a probe file.
-_OWN_PARTS = ("touch", "decoder", "image", "lora", "text", "logit_scale", "matcher", "force", "head")
+_OWN_PARTS = ("touch", "decoder", "image", "lora", "text", "logit_scale", "matcher", "fields", "force", "head")
 _LISTED = 6  # names in one error message
 _HEAD = {"head.weight": "head/kernel", "head.bias": "head/bias"}
 

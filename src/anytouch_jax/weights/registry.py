@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 DEFAULT = "anytouch-tiny"
 FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, model.safetensors, README.md
 WEIGHTS, CARD = "model.safetensors", "config.json"
-PARTS = ("touch", "text", "logit_scale")  # for features, zero-shot questions and the start of a run
+PARTS = ("touch", "fields", "text", "logit_scale")  # for features, depth and force, zero-shot questions
 _HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
 _FILES = ["*.safetensors", "*.pth", "*.pt", "*.bin", "*.ckpt", "*.json", "calibration/*.png"]
 
@@ -106,7 +106,7 @@ def write_encoder(
     model = replace(
         model, image=model.image if "image" in params else None, text=model.text if "text" in params else None,
         match_head=model.match_head if "matcher" in params else "none", lora_rank=0,
-        dtype="float32",
+        fields=model.fields if "fields" in params else 0, dtype="float32",
     )  # fmt: skip
     write_safetensors(folder / WEIGHTS, arrays, loaded.export_metadata() | {MODEL_KEY: to_json(model), "source": ""})
     if tokenizer is not None and "text" in params:

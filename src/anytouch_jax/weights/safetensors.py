@@ -22,6 +22,7 @@ from anytouch_jax.weights.tree import flatten
 MODEL_KEY = "anytouch_jax.model"
 BACKGROUND_KEY = "anytouch_jax.background"
 SEEN_KEY = "anytouch_jax.seen"
+FIELDS_KEY = "fields"  # calibration of what is measured, as JSON: `encoder.fields.scale_of`
 
 
 class WeightsError(UserError):
@@ -50,6 +51,9 @@ class Loaded:
         """Return the metadata of a safetensors file with these parameters."""
         metadata = {"source": str(self.path), MODEL_KEY: to_json(self.config.model)}
         metadata[BACKGROUND_KEY] = self.config.data.background
+        if "fields" in self.params and FIELDS_KEY in self.metadata:
+            stored = self.metadata[FIELDS_KEY]
+            metadata[FIELDS_KEY] = stored if isinstance(stored, str) else json.dumps(stored)
         if self.trained_sensors is not None and "touch" in self.params:
             metadata[SEEN_KEY] = ",".join(self.trained_sensors)
         return metadata

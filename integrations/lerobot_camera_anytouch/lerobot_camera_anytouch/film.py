@@ -1,0 +1,51 @@
+"""A film in the place of LeRobot's OpenCV camera, which reads a film as fast as it can and ends with it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from anytouch_jax.view.live import LoopedFilm
+
+
+class FilmCamera:
+    """A film at its frame rate, again and again, with the methods of a camera of LeRobot. Pictures are RGB."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._at = path, 0.0
+        self._film: LoopedFilm | None = None
+        self._latest: np.ndarray | None = None
+        self.width = self.height = self.fps = 0
+
+    @property
+    def is_connected(self) -> bool:
+        return self._film is not None
+
+    def connect(self, warmup: bool = True) -> None:
+        self._film = LoopedFilm(self._path)
+        self.fps = round(self._film.get(cv2.CAP_PROP_FPS)) or 30
+        self.height, self.width = self.read().shape[:2]
+
+    def disconnect(self) -> None:
+        if self._film is not None:
+            self._film.release()
+        self._film = self._latest = None
+
+    def read(self, *settings: object) -> np.ndarray:
+        if self._film is None:
+            raise ConnectionError(f"the film {self._path} is not connected")
+        whole, picture = self._film.retrieve() if self._film.grab() else (False, None)
+        if not whole or picture is None:
+            raise RuntimeError(f"the film {self._path} cannot be read")
+        self._latest, self._at = np.ascontiguousarray(picture[..., ::-1]), time.perf_counter()
+        return self._latest
+
+    def async_read(self, timeout_ms: float = 200) -> np.ndarray:
+        return self.read()
+
+    def read_latest(self, max_age_ms: int = 500) -> np.ndarray:
+        is_new = self._latest is not None and time.perf_counter() - self._at < 1 / max(self.fps, 1)
+        return self._latest if is_new and self._latest is not None else self.read()

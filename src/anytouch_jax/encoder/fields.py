@@ -1,0 +1,366 @@
+"""Touch in millimetres and newtons: depth, shear, contact and force of frames, with standard deviations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.data.transforms import Flip, orient_frame
+from anytouch_jax.encoder.health import UnitFrames, check_layout, known_gels
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_write
+from anytouch_jax.nn.fields import FORCE, LENGTH, TORQUE, FieldOutput
+
+Array = npt.NDArray[Any]
+
+
+class Gel(NamedTuple):
+    """What a sensor shows: mm of the picture's width, its height over its width, and kPa of the gel's modulus."""
+
+    width: float
+    shape: float
+    modulus: float
+
+
+GELS = {
+    "gelsight": Gel(18.88, 0.75, 150), "gelsight_mini": Gel(18.88, 0.75, 180), "gelslim": Gel(20.0, 0.75, 220),
+    "digit": Gel(14.25, 4 / 3, 120), "9dtact": Gel(24.0, 0.75, 120), "duragel": Gel(18.7, 0.75, 350),
+}  # fmt: skip
+OTHER_MODULUS, OTHER_SPREAD = 170.0, 0.4  # kPa of an unknown gel, and its deviation as a share
+LEAST_FORCE = 1e-3  # over modulus times width squared: the deviation of a smaller normal force is that of this one
+METADATA = "fields"  # of weights: factors on the deviations by name, and the modulus of sensors
+SHAPE_LIMIT = 0.1  # difference of proportions that shows a turned or cropped picture
+_NAMES = ("depth", "shear", "normal", "tangential", "torque", "slip")
+_SIDE = 40  # pixels of a picture's width, when compared with its background
+_EDGE = 4  # pixels, along each side, of one vertex of a surface
+
+
+class Scale(NamedTuple):
+    """What turns outputs into mm and N: `width` mm of the picture or None, the gel's modulus in kPa and its deviation
+    as a share, the usual proportions of the picture or None, and factors on the deviations."""
+
+    width: float | None
+    modulus: float
+    spread: float
+    shape: float | None
+    factors: dict[str, float]
+
+
+def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = None) -> Scale:
+    """Return the scale of a sensor: that of GELS, of the weights' `metadata`, or of a picture `width_mm` mm wide.
+
+    Raises UserError for a width that is no positive number, and for damaged metadata.
+    """
+    if width_mm is not None and not 0 < width_mm < np.inf:
+        raise UserError(f"the width of the picture must be a number of mm above 0, not {width_mm:g}")
+    try:
+        stored = metadata.get(METADATA, {})
+        stored = json.loads(stored) if isinstance(stored, str) else stored
+        factors = {name: float(stored.get(name, 1.0)) for name in _NAMES}
+        moduli = {name: float(value) for name, value in stored.get("modulus", {}).items()}
+    except (ValueError, TypeError, AttributeError):
+        raise UserError("the calibration of fields in the weights is damaged; load the weights again") from None
+    gel = GELS.get(sensor)
+    shape = gel.shape if gel and width_mm is None else None
+    if gel is None:
+        spread = 0.0 if sensor in moduli else OTHER_SPREAD
+        return Scale(width_mm, moduli.get(sensor, OTHER_MODULUS), spread, shape, factors)
+    return Scale(width_mm or gel.width, moduli.get(sensor, gel.modulus), 0.0, shape, factors)
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """What B frames measure, each value with its standard deviation, as maps (B, h, w) over the whole picture.
+
+    `depth` mm into the gel. `shear` (B, h, w, 2) mm along x and y of the picture, and one deviation for both.
+    `contact` is a probability. `force` (B, 3) N along x, along y and into the gel. `torque` (B,) N mm about the centre
+    of pressure. `slip` (B,) share of the contact that slides. `area` (B,) mm2. `centre` (B, 2) mm of the pressure from
+    the middle of the picture, x to the right and y down, NaN without contact. Without a width (`width_mm` None)
+    lengths are shares of the picture's width, areas of its square, and force and torque are None. `shape` is the
+    picture's height over its width. `faults` are reasons not to trust the values: their deviations are then wide.
+    """
+
+    depth: Array
+    depth_std: Array
+    shear: Array
+    shear_std: Array
+    contact: Array
+    force: Array | None
+    force_std: Array | None
+    torque: Array | None
+    torque_std: Array | None
+    slip: Array
+    slip_std: Array
+    area: Array
+    area_std: Array
+    centre: Array
+    centre_std: Array
+    width_mm: float | None
+    shape: float
+    faults: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+    def __getitem__(self, row: int) -> Fields:
+        """Return the fields of one frame, still with an axis of 1."""
+        at = range(len(self))[row]  # raises IndexError
+        return self._each(lambda name, value: value[at : at + 1])
+
+    def _each(self, change: Callable[[str, Array], Array]) -> Fields:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        arrays: Any = {name: change(name, value) for name, value in values.items() if isinstance(value, np.ndarray)}
+        return replace(self, **arrays)
+
+    def at(self, height: int, width: int) -> Fields:
+        """Return the same fields with maps (B, height, width), such as the frame's."""
+
+        def resized(name: str, value: Array) -> Array:
+            if value.ndim < 3:
+                return value
+            return np.stack([cv2.resize(one, (width, height), interpolation=cv2.INTER_LINEAR) for one in value])
+
+        return self._each(resized)
+
+    def points(self) -> Array:
+        """Return the surface of the gel as points f32 (B, h, w, 3) in mm, or in shares of the picture's width.
+
+        x is to the right and y down in the picture, from its middle, and z into the gel.
+        """
+        height, width = self.depth.shape[1:]
+        mm = self.width_mm or 1.0
+        y, x = np.mgrid[:height, :width] + 0.5
+        flat = (x / width - 0.5) * mm, (y / height - 0.5) * mm * self.shape
+        return np.stack([*(np.broadcast_to(axis, self.depth.shape) for axis in flat), self.depth], -1).astype("f4")
+
+    def summary(self, row: int = 0) -> dict[str, Any]:
+        """Return the numbers of a frame by name, each with its deviation `*_std`; None for what is unknown."""
+        y, x = np.unravel_index(np.argmax(self.depth[row]), self.depth.shape[1:])
+        values: dict[str, Any] = {}
+        for place, axis in enumerate("xyz"):
+            values[f"force_{axis}"] = None if self.force is None else self.force[row, place]
+            values[f"force_{axis}_std"] = None if self.force_std is None else self.force_std[row, place]
+        values["torque"] = None if self.torque is None else self.torque[row]
+        values["torque_std"] = None if self.torque_std is None else self.torque_std[row]
+        values |= {"depth": self.depth[row, y, x], "depth_std": self.depth_std[row, y, x]}
+        values |= {"area": self.area[row], "area_std": self.area_std[row]}
+        values |= {"centre_x": self.centre[row, 0], "centre_y": self.centre[row, 1]}
+        values |= {"centre_std": self.centre_std[row], "slip": self.slip[row], "slip_std": self.slip_std[row]}
+        numbers = {name: None if value is None else round(float(value), 5) for name, value in values.items()}
+        return {name: None if value != value else value for name, value in numbers.items()}
+
+
+_ARRAYS = tuple(one.name for one in fields(Fields) if one.name not in ("width_mm", "shape", "faults"))
+
+
+def stacked(parts: Sequence[Fields]) -> dict[str, Array]:
+    """Return the arrays of several `Fields` as one, by name, maps as float16. Unknown force is NaN."""
+    arrays = {}
+    for name in _ARRAYS:
+        values = [getattr(part, name) for part in parts]
+        width = (3,) if name.startswith("force") else ()
+        whole = [
+            np.full((len(part), *width), np.nan, np.float32) if value is None else value
+            for part, value in zip(parts, values, strict=True)
+        ]
+        array = np.concatenate(whole)
+        arrays[name] = array.astype(np.float16) if name.removesuffix("_std") in ("depth", "shear", "contact") else array
+    widths = [np.full(len(part), np.nan if part.width_mm is None else part.width_mm) for part in parts]
+    return arrays | {"width_mm": np.concatenate(widths)}
+
+
+def output_of(arrays: Iterable[Any]) -> FieldOutput:
+    """Return the output of the network of its arrays, in their order."""
+    return FieldOutput(*arrays)
+
+
+def _deviation(log: Any) -> Array:
+    """Return the standard deviation of a Laplace error from its bent logarithm, as `ops.losses.laplace_loss`."""
+    return np.asarray(np.sqrt(2) * np.exp(5 * np.tanh(log / 5)))
+
+
+def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, ...] = ()) -> Fields:
+    """Return the output of the network, as numpy arrays, in mm and N. `shape` is the picture's height over width."""
+    out = output_of(np.asarray(value, np.float32) for value in out)
+    mm, own = scale.width or 1.0, scale.factors
+    rows, columns = out.depth.shape[1:]
+    contact = 1 / (1 + np.exp(-out.contact))
+    inside = contact > 0.5
+    cell = mm**2 * shape / (rows * columns)
+    area, area_std = cell * inside.sum((1, 2)), cell * np.minimum(contact, 1 - contact).sum((1, 2))
+    weight = np.where(inside, out.pressure + 1e-9, 0)
+    weight = weight / np.where(area > 0, weight.sum((1, 2)), np.nan)[:, None, None]
+    x = (np.arange(columns) + 0.5) / columns - 0.5
+    y = ((np.arange(rows) + 0.5) / rows - 0.5) * shape
+    centre = mm * np.stack([weight.sum(1) @ x, weight.sum(2) @ y], axis=1)
+    round_edge = np.sqrt(4 * np.pi * np.where(area > 0, area, np.nan))
+    slip = 1 / (1 + np.exp(-out.slip))
+    values: dict[str, Any] = {
+        "depth": mm * out.depth, "depth_std": mm * LENGTH * own["depth"] * _deviation(out.depth_log),
+        "shear": mm * out.shear, "shear_std": mm * LENGTH * own["shear"] * _deviation(out.shear_log),
+        "slip": slip, "slip_std": np.minimum(own["slip"] * _deviation(out.slip_log), 1),
+        "area": area, "area_std": area_std, "centre": centre, "centre_std": area_std / round_edge,
+        "force": None, "force_std": None, "torque": None, "torque_std": None,
+    }  # fmt: skip
+    if scale.width is not None:
+        newton = scale.modulus * mm**2 / 1000  # kPa mm2 are mN
+        deviation = _deviation(out.force_log)
+        sideways = np.repeat(own["tangential"] * FORCE * deviation[:, :1], 2, axis=1)
+        normal = own["normal"] * (out.force[:, 2:] + LEAST_FORCE) * deviation[:, 1:]
+        values |= {
+            "force": newton * out.force, "force_std": newton * np.concatenate([sideways, normal], axis=1),
+            "torque": newton * mm * out.torque,
+            "torque_std": newton * mm * TORQUE * own["torque"] * _deviation(out.torque_log),
+        }  # fmt: skip
+        for name in ("force", "torque"):
+            values[f"{name}_std"] = np.hypot(values[f"{name}_std"], scale.spread * values[name])
+    if faults:  # no value is known better than its own size, nor than a usual touch
+        usual = {"depth": LENGTH * mm, "shear": LENGTH * mm, "slip": 1.0, "area": (mm / 4) ** 2, "centre": mm / 2}
+        usual |= {"force": FORCE * scale.modulus * mm**2 / 1000, "torque": TORQUE * scale.modulus * mm**3 / 1000}
+        for name, size in usual.items():
+            if values[name] is not None:
+                value = np.abs(values[name]).max(-1) if name in ("shear", "centre") else np.abs(values[name])
+                values[f"{name}_std"] = np.hypot(values[f"{name}_std"], value + size)
+    values = {name: None if value is None else np.asarray(value, np.float32) for name, value in values.items()}
+    return Fields(**values, contact=contact, width_mm=scale.width, shape=shape, faults=faults)
+
+
+class Measure:
+    """Turns outputs of the network for frames of one sensor into `Fields`, and looks for faults of the first frame.
+
+    `background` is the picture of its untouched gel. `oriented` turns and mirrors pictures as `Preprocess` does. A
+    fault goes to `log` once.
+    """
+
+    def __init__(
+        self, scale: Scale, sensor: str, background: Array | None, log: Callable[[str], None], rotate: int, flip: Flip
+    ) -> None:
+        self.scale, self.oriented = scale, partial(orient_frame, rotate=rotate, flip=flip)
+        self._sensor, self._log = sensor, log
+        self._background = None if background is None else self.oriented(background)
+        self._faults: tuple[str, ...] | None = None
+
+    def __call__(self, out: FieldOutput, frame: Array) -> Fields:
+        """Return the fields of frames that look like `frame`, RGB u8 (h, w, 3), oriented."""
+        if self._faults is None:
+            self._faults = faults_of(frame, self._background, self._sensor, self.scale.shape)
+            for fault in self._faults:
+                self._log(f"do not trust what is measured, its deviations are wide: {fault}")
+        return fields_of(out, self.scale, frame.shape[0] / frame.shape[1], self._faults)
+
+
+def faults_of(frame: Array, background: Array | None, sensor: str, shape: float | None) -> tuple[str, ...]:
+    """Return sentences on a frame RGB u8 (h, w, 3) that a known sensor in order does not give.
+
+    It is grey, turned, mirrored or cropped, or its red and blue are exchanged. `shape` is the usual height over width.
+    Raises UserError for a background of other proportions.
+    """
+    (height, width), faults = frame.shape[:2], list[str]()
+    if background is not None and abs(np.log(background.shape[0] * width / (background.shape[1] * height))) > 0.03:
+        raise UserError(
+            f"the frame has {width} x {height} pixels and its background {background.shape[1]} x "
+            f"{background.shape[0]}: they show different parts of the gel. Take both with one setting of the camera."
+        )
+    if shape is not None and abs(np.log(height / (width * shape))) > SHAPE_LIMIT:
+        faults.append(
+            f"a picture of {sensor} has a height of {shape:.3g} widths, and this one has {width} x {height} pixels. "
+            "Turn it, or name the width that it shows (width_mm)."
+        )
+    few = frame[::4, ::4].astype(np.int16)
+    if np.abs(few - few[..., :1]).max() <= 2:
+        faults.append("the picture is grey, and colours show the slopes. Read it in colour.")
+        return tuple(faults)
+    if background is not None and (turned := _unlike(frame, background)):
+        faults.append(f"it looks {turned} when compared with its background. Read both in the same way.")
+    known = known_gels(sensor)
+    known = known if background is not None else known[:: max(len(known) // 3, 1)][:3]  # too few for small signs
+    check = check_layout(UnitFrames(sensor, "", [[frame]], background), known)
+    if check.ok is False:
+        faults.append(f"unlike other units of {sensor} it looks {check.value}. {check.advice}")
+    return tuple(faults)
+
+
+def _unlike(frame: Array, background: Array) -> str:
+    """Return how a frame was turned or recoloured against its background, "" if it was not.
+
+    A press covers the smaller part of a picture, so the median difference is that of the untouched part.
+    """
+    size = (_SIDE, max(1, round(_SIDE * frame.shape[0] / frame.shape[1])))
+    small, gel = (cv2.resize(one, size, interpolation=cv2.INTER_AREA).astype(np.float32) for one in (frame, background))
+
+    def differs(other: Array) -> float:
+        change = other - gel
+        return float(np.median(np.abs(change - np.median(change, axis=(0, 1))).max(2)))
+
+    others = {
+        "mirrored left to right": small[:, ::-1], "mirrored top to bottom": small[::-1],
+        "upside down": small[::-1, ::-1], "as with red and blue exchanged": small[..., ::-1],
+    }  # fmt: skip
+    nearest = min(others, key=lambda name: differs(others[name]))
+    return nearest if 1.05 * differs(others[nearest]) + 0.5 < differs(small) else ""
+
+
+def overlay(frame: Array, measured: Fields, row: int = 0) -> Array:
+    """Return a picture u8 (h, w, 3) of a frame with its depth in colour, the rim of contact, shear and force."""
+    height, width = frame.shape[:2]
+    one = measured[row].at(height, width)
+    deepest = max(float(one.depth.max()), LENGTH * (one.width_mm or 1.0))
+    level = np.clip(255 * one.depth[0] / deepest, 0, 255).astype(np.uint8)
+    colours = cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1]
+    share = (0.7 * np.clip(level / 64, 0, 1))[..., None]
+    view = np.ascontiguousarray((frame * (1 - share) + colours * share).astype(np.uint8))
+    inside = (one.contact[0] > 0.5).astype(np.uint8)
+    cv2.drawContours(view, cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0], -1, (255, 255, 255))
+    step, long = max(min(height, width) // 14, 1), 4 * width / (one.width_mm or 1.0)  # arrows four times their length
+    for y in range(step // 2, height, step):
+        for x in range(step // 2, width, step):
+            if inside[y, x]:
+                tip = np.rint((x, y) + long * one.shear[0, y, x]).astype(int)
+                cv2.arrowedLine(view, (x, y), tuple(tip.tolist()), (120, 255, 120), 1, cv2.LINE_AA, tipLength=0.3)
+    about = one.summary()
+    unit, force = "" if one.width_mm is None else " mm", about["force_z"]
+    text = f"{about['depth']:.2f}+-{about['depth_std']:.2f}{unit}"
+    text += "" if force is None else f"  {force:.2f}+-{about['force_z_std']:.2f} N"
+    cv2.putText(
+        view, text, (6, height - 8), cv2.FONT_HERSHEY_SIMPLEX, width / 800 + 0.1, (255, 255, 255), 1, cv2.LINE_AA
+    )
+    return view
+
+
+def write_surface(path: Path, frame: Array, measured: Fields, row: int = 0) -> None:
+    """Write the surface of the gel as a PLY mesh in mm, coloured by the frame. Depth goes down along z."""
+    height, width = (max(side // _EDGE, 2) for side in frame.shape[:2])
+    kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
+    points = np.empty((height, width), kinds)
+    at = measured[row].at(height, width).points()[0] * (1, -1, -1)  # y and z up, as in space
+    points["x"], points["y"], points["z"] = np.moveaxis(at, -1, 0)
+    small = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
+    for place, colour in enumerate(("red", "green", "blue")):
+        points[colour] = small[..., place]
+    grid = np.arange(height * width, dtype="<i4").reshape(height, width)
+    corners = [grid[:-1, :-1], grid[1:, :-1], grid[:-1, 1:], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]]
+    triangles = np.stack(corners, -1).reshape(-1, 3)
+    faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, triangles
+    properties = "".join(f"property {'float' if kind == '<f4' else 'uchar'} {name}\n" for name, kind in kinds)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {points.size}\n{properties}"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    atomic_write(path, header.encode() + points.tobytes() + faces.tobytes())
+
+
+def missing(source: str) -> UserError:
+    """Return the error of an encoder without a decoder of fields."""
+    return UserError(
+        f"{source} does not measure depth and force: its weights have no fields. Use anytouch-tiny, or train with "
+        "--model.fields 32"
+    )

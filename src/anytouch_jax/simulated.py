@@ -419,7 +419,7 @@ def _warped(clip: Array, draw: Array, affine: tuple[float, float, float]) -> Arr
 
 
 def _prepared(key: Array, clip: Array, background: Array, config: Config, *, jitter: bool = True) -> Array:
-    """Return clips u8 (B, T, S, S, 3) as the network reads them: less the background, or for some as they are.
+    """Return clips u8 (B, T, S, S, 3) as the network reads them: with or without the background subtracted.
 
     With `jitter` brightness, contrast and colours change a little, as by another camera.
     """

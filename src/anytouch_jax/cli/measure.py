@@ -137,22 +137,19 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
     import numpy as np
 
     from anytouch_jax.config import UNIVERSAL
-    from anytouch_jax.data.images import BACKGROUND, decode, list_images
+    from anytouch_jax.data.gels import as_taken
     from anytouch_jax.data.transforms import orient_frame
 
-    data, gel, length = options.data[0], options.background, encoder.config.model.frames
-    if gel is None and data.is_dir():
-        gel = list_images(data)[1].get(BACKGROUND)
+    data, length = options.data[0], encoder.config.model.frames
     times, ring, last = list[float](), list[np.ndarray](), -1
-    background = None if gel is None else orient_frame(decode(gel), options.rotate, options.flip)
+    known = {name: as_taken(gel, options.rotate, options.flip) for name, gel in encoder.gels.items()}
+    gel, _ = embed.choose_gel(encoder, options.background, data, known)
+    background = None if gel is None else np.ascontiguousarray(orient_frame(gel, options.rotate, options.flip))
     for number, name, frame in tracked(
         embed.numbered_frames(data, "error", times), "frames measured", embed.frame_count(data)
     ):
         assert frame is not None  # an unreadable one is an error
         frame = np.ascontiguousarray(orient_frame(frame, options.rotate, options.flip))
-        if background is None and encoder.needs_background:
-            log("the first frame is the untouched gel (see --background)")
-            background = frame
         is_next = number == last + 1 and ring and ring[-1].shape == frame.shape
         ring, last = [*(ring if is_next else [frame] * length), frame][-length:], number
         time = times[-1] if times else float("nan")
@@ -165,23 +162,27 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
     """Yield the rows of manifests that have images. Before the first frame of a sequence nothing moved."""
     import numpy as np
 
+    from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.images import decode
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder.embed import with_backgrounds
+    from anytouch_jax.encoder.embed import rows_with_gel
 
     manifest, length = manifests.read(options.data), encoder.config.model.frames
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     rows = embed.usable_rows(manifest, rows, 1)
-    manifest = with_backgrounds(encoder, manifest, rows, log)
+    gels = UnitGels(manifest, encoder.gels, log) if encoder.subtracts else None
+    rows = rows_with_gel(encoder, gels, rows, log)
+    if gels is not None:
+        log(gels.report(rows))
     before = {later: earlier for earlier, later in manifest.clips(2).tolist()}
-    sensors, given = manifest.text_column("sensor"), manifest.present("background_path")
-    picture, gel_of = lru_cache(length)(decode), lru_cache(8)(decode)
+    sensors, picture = manifest.text_column("sensor"), lru_cache(length)(decode)
+    gel_of = (lambda row: None) if gels is None else gels.shared(lambda gel: gel, 8)
     for row in tracked(rows.tolist(), "frames measured", len(rows)):
         clip = [row]
         while len(clip) < length:
             clip.append(before.get(clip[-1], clip[-1]))
         frames = [picture(manifest.file(one)) for one in reversed(clip)]
-        gel = gel_of(manifest.file(row, "background_path")) if given[row] else None
+        gel = gel_of(row)
         same = [frame if frame.shape == frames[-1].shape else frames[-1] for frame in frames]
         yield Touch(str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel)
 

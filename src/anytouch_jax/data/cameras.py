@@ -114,6 +114,7 @@ def open_source(
     camera = camera_of(name)
     if camera is None and not Path(name).is_file():
         raise UserError(f"there is no video and no camera {name}; {_connected()}")
+    source: Any
     with QUIET:
         if isinstance(camera, str):
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _PATIENCE, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _PATIENCE]

@@ -64,10 +64,10 @@ class World(NamedTuple):
 class Sampling:
     """What to sample: clips of `frames` frames of `size` pixels, by `takes` sensors for each touch.
 
-    `coarse` is the share of touches at which every sensor touches as by hand, `free` the share of takes without
-    contact, and `vision` the share of touches at a place of which there is a photograph. `wild` is the share of takes
-    by a sensor that mixes two families, with other lights and markers. `fields` are those of `recorder.simulate_clip`,
-    at `field_size` pixels, of the last frame.
+    `coarse` is the share of touches at which every sensor touches as by hand. `free` is the share of takes without
+    contact, `vision` the share of touches at a photographed place. `wild` is the share of takes
+    by a sensor that mixes two families, with other lights and markers. The `fields` of `recorder.simulate_clip` are of
+    the last frame, at `field_size` pixels.
     """
 
     frames: int = 1

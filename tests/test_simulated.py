@@ -13,7 +13,7 @@ from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.pretrain import pretrain
-from anytouch_jax.simulated import SIMULATED, SimulatedLoader, _partners, augmented, choose_tokenizer, load_real
+from anytouch_jax.simulated import SIMULATED, SimulatedLoader, _partners, augmented, caption_tokenizer, load_real
 
 TINY = Stack(width=16, depth=1, heads=2, mlp=16)
 
@@ -67,7 +67,7 @@ def test_a_batch_depends_on_seed_and_step_alone():
 def test_stage_2_mixes_simulated_and_real_pairs(recordings):
     config = tiny(2, **{"data.weights": ((SIMULATED, 1.0),), "data.manifests": (SIMULATED, str(recordings))})
     manifest = manifests.read((str(recordings),))
-    loader = SimulatedLoader(config, manifest, tokenizer=choose_tokenizer(config, manifest))
+    loader = SimulatedLoader(config, manifest, tokenizer=caption_tokenizer(config, manifest))
     align, match, fields = loader.batch(0)
     assert fields is None and match.clip.shape == (8, 1, 28, 28, 3)
     place = np.asarray(match.place)

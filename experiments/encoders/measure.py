@@ -67,7 +67,7 @@ def batches(world: endless.World, config: Config, count: int, seed: int, **optio
     @partial(jax.jit, static_argnums=(2,))
     def make(key: jax.Array, world: endless.World, frames: int) -> FieldBatch:
         draw, prepare, toss = jax.random.split(key, 3)
-        touches = endless.sample(draw, world, sampling(frames, **options), count)
+        touches = endless.sample_touches(draw, world, sampling(frames, **options), count)
         batch = field_batch(prepare, touches, jnp.asarray(rows)[touches.sensor], config, count)
         own = jax.random.uniform(toss, (count,)) >= UNIVERSAL
         sensor = jnp.where(own, batch.sensor, config.model.universal_row)
@@ -180,7 +180,9 @@ def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], 
     for number in range(touches // size):
         frames = (1, config.model.frames)[number % 2]
         key = jax.random.fold_in(jax.random.key(11), number)
-        touch = jax.jit(endless.sample, static_argnums=(2, 3))(key, world, sampling(frames, wild=0, free=0), size)
+        touch = jax.jit(endless.sample_touches, static_argnums=(2, 3))(
+            key, world, sampling(frames, wild=0, free=0), size
+        )
         batch = field_batch(key, touch, jnp.full((size, 1), row), config, size)
         out = jax.device_get(measure(params, normalise_touch(batch.clip), batch.sensor, batch.aspect))
         batch, width, stiff = jax.device_get((batch, touch.width[:, -1], touch.modulus[:, -1]))

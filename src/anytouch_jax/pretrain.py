@@ -181,7 +181,7 @@ def _choose_tokenizer(
     elif config.data.tokenizer is None and config.towers == "pretrained":
         file = (Path(clip) if Path(clip).is_dir() else Path(clip).parent) / TOKENIZER
     if simulates:
-        own = simulated.choose_tokenizer(config, manifest) if file is None else load_tokenizer(file)
+        own = simulated.caption_tokenizer(config, manifest) if file is None else load_tokenizer(file)
         if config.towers == "pretrained":
             return config, own
         return config.with_settings({"model.text": replace(config.model.text, vocab=own.vocab_size)}), own

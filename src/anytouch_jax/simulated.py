@@ -75,13 +75,15 @@ class Texts(NamedTuple):
     mask: Any
 
 
-_sample = jax.jit(endless.sample, static_argnames=("sampling", "count"))  # one program for all loaders of one form
+_sample = jax.jit(
+    endless.sample_touches, static_argnames=("sampling", "count")
+)  # one program for all loaders of one form
 
 
 class SimulatedLoader:
     """Batches for `config.stage` with the interface of `Loader`. `manifest` has real recordings, or is None.
 
-    A text tower needs the `tokenizer` of `choose_tokenizer`. Raises UserError for settings that simulation does not
+    A text tower needs the `tokenizer` of `caption_tokenizer`. Raises UserError for settings that simulation does not
     serve, and for more real frames than fit.
     """
 
@@ -197,7 +199,7 @@ def real_captions(manifest: Manifest | None) -> list[str]:
     return [str(text) for text in manifest.column("text").combine_chunks().dictionary_encode().dictionary.to_pylist()]
 
 
-def choose_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
+def caption_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
     """Return the tokenizer `data.tokenizer`, or one trained on captions of the objects and of the manifest."""
     if config.data.tokenizer is not None:
         return load_tokenizer(config.data.tokenizer)

@@ -16,14 +16,13 @@ from anytouch_jax.evaluate.probing import (
     Outcome,
     ProbeResult,
     SubsetResult,
-    label_verdicts,
     leave_groups_out,
     majority_baseline,
     probe_features,
     probe_json,
     probe_table,
-    verdict,
 )
+from anytouch_jax.evaluate.verdict import label_verdicts, verdict
 
 Array = np.ndarray[Any, Any]
 

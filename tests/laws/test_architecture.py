@@ -29,7 +29,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "batch": {"shown"},
     "config": {"errors", "shown"},
     "nn": {"ops", "config", "shown"},
-    "objectives": {"ops", "nn.functional", "batch", "config"},
+    "objectives": {"ops", "nn.functional", "nn.fields", "batch", "config"},
+    "simulated": {"sim", "data", "batch", "config", "errors"},
     "weights": {"nn", "config", "files", "errors", "shown"},
     "data": {"config", "batch", "files", "errors", "bars", "shown"},
     "sim": {"data.manifest", "data.tokenizer", "config", "files", "errors"},
@@ -42,11 +43,13 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 FREE = {"cli", "pretrain", "__init__", "__main__"}  # may import anything of ours, except that nobody imports cli
 # readers know the helpers of their folder and manifests, nothing else of `data`
-READERS_MAY_IMPORT = {"data.readers", "data.manifest", "data.images", "config", "files", "errors", "bars"}
+READERS_MAY_IMPORT = {"data.readers", "data.manifest", "data.images", "data.names", "config", "files", "errors", "bars"}
 
 # library -> the only rooms (or modules) that know it
 ONLY_IN: dict[str, set[str]] = {
-    "jax": {"ops", "nn", "objectives", "train", "weights", "encoder", "evaluate", "sim", "cli", "pretrain"},
+    "jax": {
+        "ops", "nn", "objectives", "train", "weights", "encoder", "evaluate", "sim", "simulated", "cli", "pretrain",
+    },
     "flax": {"nn"}, "optax": {"train", "evaluate", "encoder"}, "orbax": {"weights.checkpoint"}, "sklearn": {"evaluate"},
     "matplotlib": {"evaluate"}, "openai": {"data.prepare"}, "tyro": {"cli"}, "torch": set(), "tensorflow": set(),
     "pickle": {"weights.torch_file", "data.readers.common"}, "starlette": {"view.server"}, "uvicorn": {"view.server"},

@@ -67,7 +67,9 @@ SAMPLING = endless.Sampling(frames=1, takes=2, size=32, vision=0.5, fields=("dis
 
 @pytest.fixture(scope="module")
 def touches(world):
-    return jax.device_get(jax.jit(endless.sample, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12))
+    return jax.device_get(
+        jax.jit(endless.sample_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12)
+    )
 
 
 def test_touches_have_their_shapes_and_a_key_decides_them(world, touches):

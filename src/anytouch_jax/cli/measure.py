@@ -42,7 +42,7 @@ class MeasureOptions(embed.SensorOptions):
     ply: Path | None = None  # Surface of the deepest frame, a mesh in mm (.ply).
 
 
-class Touch(NamedTuple):
+class MeasureInput(NamedTuple):
     """Frames (T, h, w, 3) that end with frame `name`, and how to measure them."""
 
     name: str
@@ -81,9 +81,9 @@ def run(options: MeasureOptions) -> int:
     parts, names, times, lines = list[fields.Fields](), list[str](), list[float](), list[dict[str, Any]]()
     deepest: tuple[float, Any, Any] = (-np.inf, None, None)
     film = None if options.film is None else _Film(options.film)
-    for part, measured in _measured(encoder, touches, options.width_mm):
+    for some, measured in _measured(encoder, touches, options.width_mm):
         parts.append(measured)
-        for row, touch in enumerate(part):
+        for row, touch in enumerate(some):
             line = measured.summary(row)
             names.append(touch.name)
             times.append(touch.time)
@@ -98,13 +98,13 @@ def run(options: MeasureOptions) -> int:
         raise UserError(f"there are no frames to measure in {options.data[0]}. Check the path, and --split.")
     if options.ply is not None:
         fields.write_surface(options.ply, *deepest[1:])
-    with atomic_path(table) as target, open(target, "w", newline="", encoding="utf-8") as file:
+    with atomic_path(table) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
         writer.writerows(lines)
     arrays: dict[str, Any] = fields.stacked(parts) | {"name": np.array(names), "time": np.array(times)}
     arrays |= {"about/encoder": np.array(encoder.source), "about/weights": np.array(encoder.fingerprint)}
-    with atomic_path(options.out) as target, open(target, "wb") as file:
+    with atomic_path(options.out) as part, open(part, "wb") as file:
         np.savez(file, **arrays)
     if not is_manifest:
         embed.log_universal(encoder, options)
@@ -113,8 +113,8 @@ def run(options: MeasureOptions) -> int:
 
 
 def _measured(
-    encoder: Encoder, touches: Iterator[Touch], width_mm: float | None
-) -> Iterator[tuple[tuple[Touch, ...], Fields]]:
+    encoder: Encoder, touches: Iterator[MeasureInput], width_mm: float | None
+) -> Iterator[tuple[tuple[MeasureInput, ...], Fields]]:
     """Yield touches of one sensor, background and size in batches, and their fields. Each warning is logged once."""
     import numpy as np
 
@@ -132,7 +132,7 @@ def _measured(
             yield part, encoder.measure(frames, first.background, first.sensor, width_mm=width_mm, log=once)
 
 
-def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
+def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[MeasureInput]:
     """Yield every frame of a folder, a picture or a video. Before the first frame nothing moved."""
     import numpy as np
 
@@ -153,12 +153,12 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
         is_next = number == last + 1 and ring and ring[-1].shape == frame.shape
         ring, last = [*(ring if is_next else [frame] * length), frame][-length:], number
         time = times[-1] if times else float("nan")
-        yield Touch(name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background)
+        yield MeasureInput(name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background)
     if times:
         embed.log_if_cut(data, len(times))
 
 
-def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
+def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[MeasureInput]:
     """Yield the rows of manifests that have images. Before the first frame of a sequence nothing moved."""
     import numpy as np
 
@@ -184,7 +184,9 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
         frames = [picture(manifest.file(one)) for one in reversed(clip)]
         gel = gel_of(row)
         same = [frame if frame.shape == frames[-1].shape else frames[-1] for frame in frames]
-        yield Touch(str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel)
+        yield MeasureInput(
+            str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel
+        )
 
 
 class _Film:

@@ -21,8 +21,9 @@ from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import statistics
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore, encoder_features
-from anytouch_jax.evaluate.probing import interval_text, probe_tasks
+from anytouch_jax.evaluate.probing import probe_tasks
 from anytouch_jax.evaluate.statistics import Array, GroupSums
+from anytouch_jax.evaluate.verdict import interval_text
 
 REAL, SHUFFLED, SHIFTED, BACKGROUND, MEAN = (
     "real touch", "shuffled touch", "time-shifted touch", "background only", "mean touch",

@@ -36,6 +36,7 @@ from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearModel, P
 from anytouch_jax.evaluate.splits import SIDES, LabelledFeatures, RowRoles, Selection, Split
 from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows
+from anytouch_jax.evaluate.verdict import interval_text, share_text, verdict
 from anytouch_jax.files import atomic_write
 from anytouch_jax.shown import shown_short
 
@@ -250,37 +251,6 @@ def probe_json(results: Sequence[ProbeResult]) -> str:
     return json.dumps(records, indent=2, allow_nan=False)
 
 
-def verdict(name: str, gain: Mapping[str, float | None], task: str = "") -> str:
-    """Return a sentence on features against raw pixels, from a `statistics.paired_gain`."""
-    points, low, high = (100 * (gain[key] or 0.0) for key in ("difference", "low", "high"))
-    of = f"{task}: " if task else ""
-    if gain["low"] is None:
-        return f"{of}{name} is {points:+.0f} points from raw pixels, by too few test recordings to be sure."
-    interval = f"({low:.0f} to {high:.0f})"
-    if low > 0:
-        return f"{of}{name} is {points:.0f} points above raw pixels {interval}."
-    return (
-        f"{of}{name} is no better than raw pixels: {points:+.0f} points {interval}. Try --pooling both, more "
-        "recordings, or another encoder, and look at the untouched gel with `anytouch view`."
-    )
-
-
-def label_verdicts(results: Sequence[ProbeResult]) -> list[str]:
-    """Return a sentence on each source of features of `probe_label` against raw pixels, by its first head."""
-    first: dict[str, ProbeResult] = {}
-    for result in results:
-        first.setdefault(result.probe.partition(": ")[0], result)
-    sums = {
-        name: statistics.classification_sums(one.outcome.correct, one.outcome.groups)
-        for name, one in first.items() if one.outcome is not None and ": " in one.probe
-    }  # fmt: skip
-    raw = sums.pop(RAW, None)
-    sums.pop(RANDOM, None)
-    return [] if raw is None else [
-        verdict(name, statistics.paired_gain([one], [raw], False)) for name, one in sums.items()
-    ]  # fmt: skip
-
-
 def probe_table(
     results: Sequence[ProbeResult | Mapping[str, Any]], paper: float | None = None, *, details: bool = False
 ) -> str:
@@ -314,11 +284,15 @@ def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
     if result.measured:
         line["MAE 95 %"] = interval_text(result.mae_low, result.mae_high, 1.0, 3)
     else:
-        refits = f"{_share(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}" if result.seeds else "-"
-        line |= {"balanced": _share(result.balanced_accuracy), "refits": refits, "classes": str(len(result.classes))}
+        refits = f"{share_text(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}" if result.seeds else "-"
+        line |= {
+            "balanced": share_text(result.balanced_accuracy),
+            "refits": refits,
+            "classes": str(len(result.classes)),
+        }
     line["penalty or k"] = "-" if result.penalty is None else f"{result.penalty:g} ({result.chosen_on})"
     parts = [
-        {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol, "score": _share(part.accuracy),
+        {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol, "score": share_text(part.accuracy),
          "95 %": interval_text(part.low, part.high), "test (groups)": str(part.n_test)}
         for part in result.parts
     ]  # fmt: skip
@@ -328,24 +302,15 @@ def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
 def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
     """Return the cells of a result of `probe_tasks` that every table has."""
     cells = {
-        "score": _share(row["mean"]),
+        "score": share_text(row["mean"]),
         "95 %": interval_text(row["low"], row["high"]),
-        "chance": _share(row["chance"]),
+        "chance": share_text(row["chance"]),
     }
     if row["metric"] == "r2":
         mae, chance = (f"{row[name]:.3g} {row['unit']}".strip() for name in ("mae", "chance_mae"))
         interval = interval_text(row["low"], row["high"], 1.0, 3)
         cells = {"score": f"R2 {row['mean']:.3f}, {mae}", "95 %": interval, "chance": chance}
     return cells | {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None or np.isnan(value) else f"{100 * value:.1f} %"
-
-
-def interval_text(low: float | None, high: float | None, factor: float = 100.0, digits: int = 1) -> str:
-    """Return an interval as text, "-" if there is none; shares are in points by default."""
-    return "-" if low is None or high is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
 
 
 def probe_label(

@@ -1,8 +1,8 @@
 """Endless touch: simulated touches as a pure function of a key, for training without a data set.
 
-A `World` holds what is drawn once: height maps, materials and the families of sensors. `sample` draws touches from it
-inside a compiled program, with the distributions of `scene` and `sensors`. All camera sensors share one program: they
-are solved on one square grid and shown at one size, as `encoder.preprocess` shows a real picture.
+A `World` holds what is drawn once: height maps, materials and the families of sensors. `sample_touches` draws touches
+from it inside a compiled program, with the distributions of `scene` and `sensors`. All camera sensors share one
+program: they are solved on one square grid and shown at one size, as `encoder.preprocess` shows a real picture.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _PLACES = 7  # tag of the random stream of photographed places
 _BASE = 40  # pixels of an untouched gel's side
 
 
-class Family(NamedTuple):
+class SensorFamily(NamedTuple):
     """The numbers of a family of sensors, as arrays: `sensors.Sensor`, its look and its untouched gels."""
 
     field: Any  # (2,) mm
@@ -56,7 +56,7 @@ class World(NamedTuple):
 
     relief: Any  # f16 (n, RELIEF, RELIEF) mm
     material: Any  # f32 (n, 2) modulus kPa, friction
-    families: Family  # stacked over the sensors
+    families: SensorFamily  # stacked over the sensors
     places: Any  # f32 (n, P, 2) mm, places of each object of which there is a photograph
 
 
@@ -96,10 +96,12 @@ class SimulatedTouches(NamedTuple):
     aspect: Any  # f32 (B, M) logarithm of the height over the width that the picture shows
     modulus: Any  # f32 (B, M) kPa of the family's gel
     labels: dict[str, Any]  # f32 (B, M, T) each, see `recorder.ClipOutput`
-    inputs: tuple[ClipInput, Family, Any]  # clip, family and pitch mm that were simulated, with leading axes (B, M)
+    inputs: tuple[
+        ClipInput, SensorFamily, Any
+    ]  # clip, family and pitch mm that were simulated, with leading axes (B, M)
 
 
-def family(sensor: Sensor) -> Family:
+def family(sensor: Sensor) -> SensorFamily:
     """Return the numbers of a camera sensor. Raises UserError for a field sensor."""
     photometry = look(sensor)
     real = bases(sensor)[:MOST_BASES]
@@ -113,10 +115,10 @@ def family(sensor: Sensor) -> Family:
     numbers = (sensor.field, (sensor.gel.modulus, sensor.gel.thickness), shade, lattice, markers.ink)
     field, gel, shades, dots, ink = (np.asarray(x, np.float32) for x in numbers)
     light = jax.tree.map(lambda x: np.asarray(x, np.float32), photometry._replace(widest=widest))
-    return Family(field, gel, shades, dots, ink, light, gels)
+    return SensorFamily(field, gel, shades, dots, ink, light, gels)
 
 
-def as_sensor(numbers: Family) -> Sensor:
+def as_sensor(numbers: SensorFamily) -> Sensor:
     """Return a `Sensor` of these numbers, which may be traced."""
     skin, contrast, vignette, halo, noise = numbers.shade
     pitch, radius, aspect, share, bend = numbers.markers
@@ -161,14 +163,16 @@ def over_cores(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
         return list(pool.map(work, items))
 
 
-def sample(key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None) -> SimulatedTouches:
+def sample_touches(
+    key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None
+) -> SimulatedTouches:
     """Return `count` touches drawn from `key`. `sampling` and `count` are static under jit.
 
     The second take is by the family `gallery`, if given. A key gives the same touches on one machine.
     """
     keys = jax.random.split(key, count)
     sensor, thing, photo, inputs = jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
-    out = jax.vmap(jax.vmap(partial(simulate, sampling=sampling)))(*inputs)
+    out = jax.vmap(jax.vmap(partial(simulate_take, sampling=sampling)))(*inputs)
     field = inputs[1].field
     fields = None if out.field is None else out.field[:, :, -1]
     return SimulatedTouches(
@@ -177,7 +181,7 @@ def sample(key: Array, world: World, sampling: Sampling, count: int, gallery: Ar
     )  # fmt: skip
 
 
-def simulate(clip: ClipInput, numbers: Family, pitch: Array, sampling: Sampling) -> ClipOutput:
+def simulate_take(clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling: Sampling) -> ClipOutput:
     """Return the simulated clip of one take by a sensor of these numbers, on a grid of `pitch` mm."""
     side = (sampling.field_size, sampling.field_size)
     view = View((GRID, GRID), pitch, (sampling.size, sampling.size), numbers.photometry, True, side)
@@ -186,7 +190,7 @@ def simulate(clip: ClipInput, numbers: Family, pitch: Array, sampling: Sampling)
 
 def _draw(
     key: Array, world: World, sampling: Sampling, gallery: Array | None
-) -> tuple[Array, Array, Array, tuple[ClipInput, Family, Array]]:
+) -> tuple[Array, Array, Array, tuple[ClipInput, SensorFamily, Array]]:
     """Return the sensors (M,), the object, its photograph, and what is simulated for all takes of one touch."""
     rng = Draws(key)
     thing = rng.integers(len(world.relief))
@@ -201,7 +205,7 @@ def _draw(
     steps = sampling.frames - 1
     relief = world.relief[thing].astype(jnp.float32)
 
-    def take(key: Array, number: Array) -> tuple[Array, tuple[ClipInput, Family, Array]]:
+    def take(key: Array, number: Array) -> tuple[Array, tuple[ClipInput, SensorFamily, Array]]:
         rng, families = Draws(key, 2048), len(world.families.gels)  # blotches are 1,600 values
         sensor = rng.integers(families)
         if gallery is not None:
@@ -242,10 +246,10 @@ def _cropped(rng: Draws) -> Array:
     return jnp.where(rng.uniform() < 0.5, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])) * (share - 1) + 1
 
 
-def wild(one: Family, other: Family, rng: Draws) -> Family:
+def wild(one: SensorFamily, other: SensorFamily, rng: Draws) -> SensorFamily:
     """Return a family between two, with lights of other colours, and dots of another size, distance and ink."""
     share = rng.uniform()
-    mixed: Family = jax.tree.map(lambda a, b: share * a + (1 - share) * b, one, other)
+    mixed: SensorFamily = jax.tree.map(lambda a, b: share * a + (1 - share) * b, one, other)
     turn = jnp.asarray(_ORDERS)[rng.integers(len(_ORDERS))] * rng.choice(
         [-1.0, 1.0]
     )  # lights that change places, or a side

@@ -57,14 +57,14 @@ def exported(
     """
     place, record = find_export(index.root, folder, stream)
     is_new = record is None or not _is_same(record, sources, part)
-    written = part_path(index.root / f"{folder}.{zlib.crc32(stream.encode()):08x}")  # two may be open at once
-    export = Export(place or folder, is_new, written if is_new else index.root / str(place))
+    part = part_path(index.root / f"{folder}.{zlib.crc32(stream.encode()):08x}")  # two may be open at once
+    export = Export(place or folder, is_new, part if is_new else index.root / str(place))
     try:
         yield export
         if is_new and export.names:
             state = {"stream": stream, "part": part, "sources": _state(sources), "pictures": export.names}
-            written.joinpath(EXPORT_RECORD).write_text(json.dumps(state), encoding="utf-8")
-            export.folder = _move(index, written, folder, place, record, export.names)
+            part.joinpath(EXPORT_RECORD).write_text(json.dumps(state), encoding="utf-8")
+            export.folder = _move(index, part, folder, place, record, export.names)
             index.written += len(export.names)
     except OSError as error:
         raise UserError(
@@ -72,7 +72,7 @@ def exported(
             "its folder writable"
         ) from None
     finally:
-        shutil.rmtree(written, ignore_errors=True)
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def find_export(root: Path, folder: str, stream: str) -> tuple[str | None, dict[str, Any] | None]:
@@ -125,7 +125,7 @@ def _digest(file: Path) -> str:
 
 
 def _move(
-    index: DatasetIndex, written: Path, folder: str, place: str | None, record: dict[str, Any] | None, names: list[str]
+    index: DatasetIndex, part: Path, folder: str, place: str | None, record: dict[str, Any] | None, names: list[str]
 ) -> str:
     """Move new pictures to their folder, and return it. Files of the user in a replaced folder stay in it."""
     if place is not None and record is not None:
@@ -135,7 +135,7 @@ def _move(
             raise DatasetError(f"{old / both[0]} is a file of yours where a picture has to go; move it elsewhere")
         aside = part_path(old.with_name(f"{old.name}.old"))
         os.replace(old, aside)
-        os.replace(written, old)
+        os.replace(part, old)
         for name in own:
             os.replace(aside / name, old / name)
         shutil.rmtree(aside, ignore_errors=True)
@@ -145,19 +145,19 @@ def _move(
         if target.is_dir() and not any(target.iterdir()):
             target.rmdir()
         if not target.exists():
-            os.replace(written, target)
+            os.replace(part, target)
             break
-        if target.is_dir() and _record(target) is None and _has_same(target, written, names):  # of an older version
-            os.replace(written / EXPORT_RECORD, target / EXPORT_RECORD)
+        if target.is_dir() and _record(target) is None and _has_same(target, part, names):  # of an older version
+            os.replace(part / EXPORT_RECORD, target / EXPORT_RECORD)
             break
     if name != folder:
         index.notes.append(f"{folder} holds something else: the pictures of its name are in {name}")
     return name
 
 
-def _has_same(folder: Path, written: Path, names: list[str]) -> bool:
+def _has_same(folder: Path, part: Path, names: list[str]) -> bool:
     return all(
-        (folder / name).is_file() and (folder / name).read_bytes() == (written / name).read_bytes() for name in names
+        (folder / name).is_file() and (folder / name).read_bytes() == (part / name).read_bytes() for name in names
     )
 
 

@@ -42,7 +42,7 @@ class MeasureOptions(embed.SensorOptions):
     ply: Path | None = None  # Surface of the deepest frame, a mesh in mm (.ply).
 
 
-class Touch(NamedTuple):
+class _Touch(NamedTuple):
     """Frames (T, h, w, 3) that end with frame `name`, and how to measure them."""
 
     name: str
@@ -113,8 +113,8 @@ def run(options: MeasureOptions) -> int:
 
 
 def _measured(
-    encoder: Encoder, touches: Iterator[Touch], width_mm: float | None
-) -> Iterator[tuple[tuple[Touch, ...], Fields]]:
+    encoder: Encoder, touches: Iterator[_Touch], width_mm: float | None
+) -> Iterator[tuple[tuple[_Touch, ...], Fields]]:
     """Yield touches of one sensor, background and size in batches, and their fields. Each warning is logged once."""
     import numpy as np
 
@@ -132,58 +132,57 @@ def _measured(
             yield part, encoder.measure(frames, first.background, first.sensor, width_mm=width_mm, log=once)
 
 
-def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
+def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     """Yield every frame of a folder, a picture or a video. Before the first frame nothing moved."""
     import numpy as np
 
     from anytouch_jax.config import UNIVERSAL
-    from anytouch_jax.data.images import BACKGROUND, decode, list_images
     from anytouch_jax.data.transforms import orient_frame
 
-    data, gel, length = options.data[0], options.background, encoder.config.model.frames
-    if gel is None and data.is_dir():
-        gel = list_images(data)[1].get(BACKGROUND)
+    data, length = options.data[0], encoder.config.model.frames
+    gel, _ = embed.choose_gel(encoder, options.background, data, {})
     times, ring, last = list[float](), list[np.ndarray](), -1
-    background = None if gel is None else orient_frame(decode(gel), options.rotate, options.flip)
+    background = None if gel is None else orient_frame(gel, options.rotate, options.flip)
     for number, name, frame in tracked(
         embed.numbered_frames(data, "error", times), "frames measured", embed.frame_count(data)
     ):
         assert frame is not None  # an unreadable one is an error
         frame = np.ascontiguousarray(orient_frame(frame, options.rotate, options.flip))
-        if background is None and encoder.needs_background:
-            log("the first frame is the untouched gel (see --background)")
-            background = frame
         is_next = number == last + 1 and ring and ring[-1].shape == frame.shape
         ring, last = [*(ring if is_next else [frame] * length), frame][-length:], number
         time = times[-1] if times else float("nan")
-        yield Touch(name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background)
+        yield _Touch(name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background)
     if times:
         embed.log_if_cut(data, len(times))
 
 
-def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[Touch]:
+def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     """Yield the rows of manifests that have images. Before the first frame of a sequence nothing moved."""
     import numpy as np
 
+    from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.images import decode
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder.embed import with_backgrounds
+    from anytouch_jax.encoder.embed import rows_with_gel
 
     manifest, length = manifests.read(options.data), encoder.config.model.frames
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     rows = embed.usable_rows(manifest, rows, 1)
-    manifest = with_backgrounds(encoder, manifest, rows, log)
+    gels = UnitGels(manifest)
+    if encoder.subtracts:
+        log(gels.report(rows))
+    rows = rows_with_gel(encoder, gels, rows, log)
     before = {later: earlier for earlier, later in manifest.clips(2).tolist()}
-    sensors, given = manifest.text_column("sensor"), manifest.present("background_path")
-    picture, gel_of = lru_cache(length)(decode), lru_cache(8)(decode)
+    sensors, picture = manifest.text_column("sensor"), lru_cache(length)(decode)
+    gel_of = gels.shared(lambda gel: gel)
     for row in tracked(rows.tolist(), "frames measured", len(rows)):
         clip = [row]
         while len(clip) < length:
             clip.append(before.get(clip[-1], clip[-1]))
         frames = [picture(manifest.file(one)) for one in reversed(clip)]
-        gel = gel_of(manifest.file(row, "background_path")) if given[row] else None
+        gel = gel_of(row) if encoder.subtracts else None
         same = [frame if frame.shape == frames[-1].shape else frames[-1] for frame in frames]
-        yield Touch(str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel)
+        yield _Touch(str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel)
 
 
 class _Film:

@@ -42,7 +42,7 @@ class MeasureOptions(embed.SensorOptions):
     ply: Path | None = None  # Surface of the deepest frame, a mesh in mm (.ply).
 
 
-class MeasureInput(NamedTuple):
+class _Touch(NamedTuple):
     """Frames (T, h, w, 3) that end with frame `name`, and how to measure them."""
 
     name: str
@@ -81,9 +81,9 @@ def run(options: MeasureOptions) -> int:
     parts, names, times, lines = list[fields.Fields](), list[str](), list[float](), list[dict[str, Any]]()
     deepest: tuple[float, Any, Any] = (-np.inf, None, None)
     film = None if options.film is None else _Film(options.film)
-    for some, measured in _measured(encoder, touches, options.width_mm):
+    for part, measured in _measured(encoder, touches, options.width_mm):
         parts.append(measured)
-        for row, touch in enumerate(some):
+        for row, touch in enumerate(part):
             line = measured.summary(row)
             names.append(touch.name)
             times.append(touch.time)
@@ -98,13 +98,13 @@ def run(options: MeasureOptions) -> int:
         raise UserError(f"there are no frames to measure in {options.data[0]}. Check the path, and --split.")
     if options.ply is not None:
         fields.write_surface(options.ply, *deepest[1:])
-    with atomic_path(table) as part, open(part, "w", newline="", encoding="utf-8") as file:
+    with atomic_path(table) as target, open(target, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
         writer.writerows(lines)
     arrays: dict[str, Any] = fields.stacked(parts) | {"name": np.array(names), "time": np.array(times)}
     arrays |= {"about/encoder": np.array(encoder.source), "about/weights": np.array(encoder.fingerprint)}
-    with atomic_path(options.out) as part, open(part, "wb") as file:
+    with atomic_path(options.out) as target, open(target, "wb") as file:
         np.savez(file, **arrays)
     if not is_manifest:
         embed.log_universal(encoder, options)
@@ -113,8 +113,8 @@ def run(options: MeasureOptions) -> int:
 
 
 def _measured(
-    encoder: Encoder, touches: Iterator[MeasureInput], width_mm: float | None
-) -> Iterator[tuple[tuple[MeasureInput, ...], Fields]]:
+    encoder: Encoder, touches: Iterator[_Touch], width_mm: float | None
+) -> Iterator[tuple[tuple[_Touch, ...], Fields]]:
     """Yield touches of one sensor, background and size in batches, and their fields. Each warning is logged once."""
     import numpy as np
 
@@ -132,19 +132,17 @@ def _measured(
             yield part, encoder.measure(frames, first.background, first.sensor, width_mm=width_mm, log=once)
 
 
-def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[MeasureInput]:
+def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     """Yield every frame of a folder, a picture or a video. Before the first frame nothing moved."""
     import numpy as np
 
     from anytouch_jax.config import UNIVERSAL
-    from anytouch_jax.data.gels import as_taken
     from anytouch_jax.data.transforms import orient_frame
 
     data, length = options.data[0], encoder.config.model.frames
+    gel, _ = embed.choose_gel(encoder, options.background, data, {})
     times, ring, last = list[float](), list[np.ndarray](), -1
-    known = {name: as_taken(gel, options.rotate, options.flip) for name, gel in encoder.gels.items()}
-    gel, _ = embed.choose_gel(encoder, options.background, data, known)
-    background = None if gel is None else np.ascontiguousarray(orient_frame(gel, options.rotate, options.flip))
+    background = None if gel is None else orient_frame(gel, options.rotate, options.flip)
     for number, name, frame in tracked(
         embed.numbered_frames(data, "error", times), "frames measured", embed.frame_count(data)
     ):
@@ -153,12 +151,12 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[MeasureInp
         is_next = number == last + 1 and ring and ring[-1].shape == frame.shape
         ring, last = [*(ring if is_next else [frame] * length), frame][-length:], number
         time = times[-1] if times else float("nan")
-        yield MeasureInput(name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background)
+        yield _Touch(name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background)
     if times:
         embed.log_if_cut(data, len(times))
 
 
-def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[MeasureInput]:
+def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     """Yield the rows of manifests that have images. Before the first frame of a sequence nothing moved."""
     import numpy as np
 
@@ -170,23 +168,21 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[MeasureI
     manifest, length = manifests.read(options.data), encoder.config.model.frames
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     rows = embed.usable_rows(manifest, rows, 1)
-    gels = UnitGels(manifest, encoder.gels, log) if encoder.subtracts else None
-    rows = rows_with_gel(encoder, gels, rows, log)
-    if gels is not None:
+    gels = UnitGels(manifest)
+    if encoder.subtracts:
         log(gels.report(rows))
+    rows = rows_with_gel(encoder, gels, rows, log)
     before = {later: earlier for earlier, later in manifest.clips(2).tolist()}
     sensors, picture = manifest.text_column("sensor"), lru_cache(length)(decode)
-    gel_of = (lambda row: None) if gels is None else gels.shared(lambda gel: gel, 8)
+    gel_of = gels.shared(lambda gel: gel)
     for row in tracked(rows.tolist(), "frames measured", len(rows)):
         clip = [row]
         while len(clip) < length:
             clip.append(before.get(clip[-1], clip[-1]))
         frames = [picture(manifest.file(one)) for one in reversed(clip)]
-        gel = gel_of(row)
+        gel = gel_of(row) if encoder.subtracts else None
         same = [frame if frame.shape == frames[-1].shape else frames[-1] for frame in frames]
-        yield MeasureInput(
-            str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel
-        )
+        yield _Touch(str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel)
 
 
 class _Film:

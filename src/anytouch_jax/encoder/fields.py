@@ -22,7 +22,7 @@ from anytouch_jax.nn.fields import FORCE, LENGTH, TORQUE, FieldOutput
 Array = npt.NDArray[Any]
 
 
-class GelSize(NamedTuple):
+class KnownGel(NamedTuple):
     """What a sensor shows: mm of the picture's width, its height over its width, and kPa of the gel's modulus."""
 
     width: float
@@ -31,9 +31,9 @@ class GelSize(NamedTuple):
 
 
 GELS = {
-    "gelsight": GelSize(18.88, 0.75, 150), "gelsight_mini": GelSize(18.88, 0.75, 180),
-    "gelslim": GelSize(20.0, 0.75, 220),
-    "digit": GelSize(14.25, 4 / 3, 120), "9dtact": GelSize(24.0, 0.75, 120), "duragel": GelSize(18.7, 0.75, 350),
+    "gelsight": KnownGel(18.88, 0.75, 150), "gelsight_mini": KnownGel(18.88, 0.75, 180),
+    "gelslim": KnownGel(20.0, 0.75, 220), "digit": KnownGel(14.25, 4 / 3, 120),
+    "9dtact": KnownGel(24.0, 0.75, 120), "duragel": KnownGel(18.7, 0.75, 350),
 }  # fmt: skip
 OTHER_MODULUS, OTHER_SPREAD = 170.0, 0.4  # kPa of an unknown gel, and its deviation as a share
 LEAST_FORCE = 1e-3  # over modulus times width squared: the deviation of a smaller normal force is that of this one
@@ -45,10 +45,10 @@ _EDGE = 4  # pixels, along each side, of one vertex of a surface
 
 
 class Scale(NamedTuple):
-    """What turns outputs into mm and N.
+    """What turns outputs into mm and N: `width` mm of the picture or None, and the gel's `modulus` in kPa.
 
-    They are `width` mm of the picture or None, the gel's modulus in kPa and its deviation as a share, the usual
-    proportions of the picture or None, and factors on the deviations.
+    `spread` is the deviation of the modulus as a share. `shape` is the usual height over width of the picture, or None.
+    `factors` multiply the deviations, by name.
     """
 
     width: float | None

@@ -17,6 +17,8 @@ NEWER     := .venv-jax-$(JAX)
 PRESET     ?= tiny
 SCENES     ?= data/scenes
 DATA       ?= $(SCENES)/manifest.parquet
+# Training draws simulated touches that never repeat, unless data are given.
+TRAINED_ON  = $(if $(findstring file,$(origin DATA)),simulated,$(DATA))
 INIT       ?= runs/stage1
 STEPS      ?=
 STOP_AFTER ?=
@@ -29,8 +31,8 @@ WORKERS    ?= 2
 CORPUS     ?= data/corpus
 REAL       ?=
 TOUCH      ?=
-ENCODER    ?= anytouch-tiny
-WEIGHTS    ?= runs/$(ENCODER)
+WEIGHTS    ?= runs/anytouch-tiny
+MINUTES    ?= 12
 ENCODERS   ?=
 
 DEMO       ?= runs/demo
@@ -67,7 +69,7 @@ help: ## list the targets
 	@echo
 	@echo "  DATA=a.parquet   manifest of frames, Parquet or CSV; several in quotes: DATA=\"a.parquet b.csv\""
 	@echo "                   a path with spaces in quotes of its own: DATA=\"'my folder/a.parquet' b.csv\""
-	@echo "                   (default: simulated scenes in $(SCENES), which are made when they are not there)"
+	@echo "                   (default: training simulates touches that never repeat; probe makes scenes in $(SCENES))"
 	@echo "  RUN=folder       where the run is kept and resumed from (runs/stage1, runs/stage2)"
 	@echo "  INIT=path        what stage 2 starts from: a stage-1 run or a weights file ($(INIT))"
 	@echo "  PRESET=name      tiny, small, base or large ($(PRESET))"
@@ -87,11 +89,11 @@ demo: $(STAMP) ## simulate, train both stages, probe and report, in 4 to 12 minu
 simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
 	$(ANYTOUCH) data simulate --out $(SCENES)
 
-train-stage1: $(STAMP) $(scenes) ## masked and next-frame pre-training: [DATA= RUN= PRESET= STEPS= STOP_AFTER= SAVE= ARGS=]
-	$(ANYTOUCH) train --stage 1 --data $(DATA) $(OPTIONS) $(ARGS)
+train-stage1: $(STAMP) ## masked and next-frame pre-training: [DATA=simulated RUN= PRESET= STEPS= STOP_AFTER= SAVE= ARGS=]
+	$(ANYTOUCH) train --stage 1 --data $(TRAINED_ON) $(OPTIONS) $(ARGS)
 
-train-stage2: $(STAMP) $(scenes) ## alignment and matching on top of INIT: [DATA= INIT= RUN= PRESET= STEPS= ...]
-	$(ANYTOUCH) train --stage 2 --data $(DATA) $(OPTIONS) --init $(INIT) $(ARGS)
+train-stage2: $(STAMP) ## alignment and matching on top of INIT: [DATA=simulated INIT= RUN= PRESET= STEPS= ...]
+	$(ANYTOUCH) train --stage 2 --data $(TRAINED_ON) $(OPTIONS) --init $(INIT) $(ARGS)
 
 probe: $(STAMP) $(scenes) ## linear and kNN probes of a run on a label column: [DATA= LABEL= RUN=]
 	$(ANYTOUCH) probe label --model $(RUN) --data $(DATA) --label $(LABEL)
@@ -150,11 +152,11 @@ results: $(STAMP) ## the pages of experiments/results from their data alone: [OU
 notebooks: $(STAMP) ## run the notebooks of experiments/notebooks again, in place: [PAGES="01 04" SCENES= for other scenes]
 	$(if $(findstring file,$(origin SCENES)),,SCENES=$(abspath $(SCENES)) )$(PY) -m experiments.notebooks.execute $(PAGES)
 
-corpus: $(STAMP) ## the simulated touches that the shipped encoders are trained on: [CORPUS=data/corpus]
+corpus: $(STAMP) ## simulated touches on disk, of which the encoders are asked for look-alikes: [CORPUS=data/corpus]
 	$(PY) -m experiments.encoders.corpus $(CORPUS)
 
-weights: $(STAMP) ## train a shipped encoder again: [ENCODER=anytouch-tiny CORPUS= REAL="a.csv b.csv" WEIGHTS=runs/ENCODER]
-	$(PY) -m experiments.encoders.train --encoder $(ENCODER) --corpus $(CORPUS) --real $(REAL) --out $(WEIGHTS)
+weights: $(STAMP) ## train an encoder on endless touches for a time, and go on later: [MINUTES=12 REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
+	$(PY) -m experiments.encoders.train --minutes $(MINUTES) --real $(REAL) --out $(WEIGHTS)
 
 figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
 	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny anytouch-tiny-conv untrained:anytouch-tiny-conv$(if $(TOUCH), --data $(TOUCH))

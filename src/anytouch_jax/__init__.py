@@ -20,6 +20,7 @@ _HOMES = {
     "train.optim": "optimizer",
     "train.loop": "fit",
     "pretrain": "pretrain",
+    "sim.touch": "simulate_touch",
     "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",
     "data.gels": "untouched_gel",

@@ -81,9 +81,9 @@ def run(options: MeasureOptions) -> int:
     parts, names, times, lines = list[fields.Fields](), list[str](), list[float](), list[dict[str, Any]]()
     deepest: tuple[float, Any, Any] = (-np.inf, None, None)
     film = None if options.film is None else _Film(options.film)
-    for part, measured in _measured(encoder, touches, options.width_mm):
+    for some, measured in _measured(encoder, touches, options.width_mm):
         parts.append(measured)
-        for row, touch in enumerate(part):
+        for row, touch in enumerate(some):
             line = measured.summary(row)
             names.append(touch.name)
             times.append(touch.time)
@@ -98,13 +98,13 @@ def run(options: MeasureOptions) -> int:
         raise UserError(f"there are no frames to measure in {options.data[0]}. Check the path, and --split.")
     if options.ply is not None:
         fields.write_surface(options.ply, *deepest[1:])
-    with atomic_path(table) as target, open(target, "w", newline="", encoding="utf-8") as file:
+    with atomic_path(table) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
         writer.writerows(lines)
     arrays: dict[str, Any] = fields.stacked(parts) | {"name": np.array(names), "time": np.array(times)}
     arrays |= {"about/encoder": np.array(encoder.source), "about/weights": np.array(encoder.fingerprint)}
-    with atomic_path(options.out) as target, open(target, "wb") as file:
+    with atomic_path(options.out) as part, open(part, "wb") as file:
         np.savez(file, **arrays)
     if not is_manifest:
         embed.log_universal(encoder, options)

@@ -1,24 +1,27 @@
-"""The recipes of the encoders in the package: every option is understood, and each part starts as the card says."""
+"""The recipe of the encoder: both stages are understood, mix simulated touches with real ones, and fit the package."""
 
 from __future__ import annotations
 
 import pytest
 
-from anytouch_jax.cli import train
-from anytouch_jax.weights.registry import list_encoders, read_card
-from experiments.encoders.train import RECIPES
+from anytouch_jax.config import from_json, to_json
+from anytouch_jax.nn.functional import build
+from anytouch_jax.simulated import SIMULATED
+from anytouch_jax.weights.tree import flatten
+from experiments.encoders.train import configure
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_is_understood_and_ends_as_its_card(name):
-    for folder, stage, steps, _, recipe, share in RECIPES[name]:
-        words = ["--stage", str(stage), "--data", "a.parquet", "--run", folder, "--steps", str(steps), *recipe, *share]
-        config = train.parse(train.TrainOptions, "train", words).config
-        assert config.model.patch_encoder == ("convolutional" if name.endswith("conv") else "shared")
-        assert config.data.background == "subtract" and config.data.weights
-    card = read_card(name)
-    assert (config.stage, config.run.steps, config.model.image_size) == (2, card["steps"], card["image_size"])
+@pytest.mark.parametrize("stage", [1, 2])
+def test_a_stage_is_understood(stage):
+    config = configure(stage, ["a.csv"], 3, {"data.batch_size": 16})
+    assert config.stage == stage and config.run.seed == 3 and config.data.batch_size == 16
+    assert config.data.manifests == (SIMULATED, "a.csv") and dict(config.data.weights)[SIMULATED] > 1
+    assert config.data.background == "either" and config.model.image_size == 112 and config.model.fields
+    assert from_json(to_json(config)) == config
+    assert (config.model.match_head == "cosine") == (stage == 2)
 
 
-def test_every_encoder_in_the_package_has_a_recipe():
-    assert list_encoders() == sorted(RECIPES)
+def test_the_encoder_and_its_decoder_of_fields_keep_their_size():
+    params = build(configure(1, [], 0, {}).model).abstract()
+    millions = {name: sum(leaf.size for leaf in flatten(part).values()) / 1e6 for name, part in params.items()}
+    assert millions["touch"] < 4 and millions["fields"] < 2

@@ -141,7 +141,9 @@ def _rigid(plan: Plan, pitch: Array, motion: Array, centre: Array) -> Array:
 
 
 def _length(field: Array) -> Array:
-    return jnp.sqrt(jnp.sum(field * field, -1))
+    squared = jnp.sum(field * field, -1)
+    tiny = squared < 1e-24  # of a length whose gradient would overflow
+    return jnp.where(tiny, 0, jnp.sqrt(jnp.where(tiny, 1, squared)))
 
 
 def _returned(traction: Array, limit: Array) -> Array:

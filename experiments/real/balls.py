@@ -196,9 +196,9 @@ def error_of(depth: Array, press: Press, mm: float) -> Error:
     """Compare a measured depth (h, w) in mm with that of a ball."""
     _, _, r = distance(press)
     wanted = true_depth(press, mm)
-    rim = float(np.median(depth[np.abs(r - press.radius) < 1.5]))
+    near = (r > 0.85 * press.radius) & (r < press.radius - 1)  # the zero is that of the rim, from its inside
+    own = depth - float(np.median((depth - wanted)[near]))
     inside = r < press.radius
-    own = depth - rim
     centre = float(np.mean(own[r < 3])) - float(np.nanmean(wanted[r < 3]))
     profile = float(np.nanmean(np.abs(own - wanted)[inside]))
     return Error(sphere(depth, press, mm) / press.ball - 1, centre, profile, float(np.nanmax(wanted)))

@@ -111,7 +111,7 @@ def test_what_every_frame_publishes_until_ros_ends(monkeypatch, tmp_path, tiny_r
     given = {
         "model": str(model),
         "width_mm": 10.0,
-        "sensor": "tacto",
+        "sensor": "tacto" if measures else "digit",
         "camera": 7,
         "background": "gel.png" if background else "",
     }

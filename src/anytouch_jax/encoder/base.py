@@ -23,10 +23,12 @@ from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
 from anytouch_jax.encoder.arrays import (
+    BATCH,
     Join,
     Log,
     Pooling,
     as_array,
+    check_features,
     filled,
     rows_of_sensors,
     run_in_batches,
@@ -289,24 +291,20 @@ class Encoder:
         picture is logged and has wide deviations. Raises UserError if the weights do not measure.
         """
         measure = self.measure_of(sensor, background, width_mm, log)
-        frames = np.asarray(frames)
+        frames = as_array(frames, "frames")
         clips = as_clips(frames[..., None] if frames.ndim == 2 else frames)
         if clips.ndim != 5 or not len(clips):
             raise UserError(f"frames must be (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), not {frames.shape}")
         check_frames(self.config.model, clips.shape[1])
         clips = clips[:, -self.config.model.frames :]
-        prepared = (np.stack([self.preprocess(frame, background) for frame in clip]) for clip in clips)
-        aspect, row = np.log(np.float32(clips.shape[2] / clips.shape[3])), self.sensor_row(sensor, log)
-        forms = list[tuple[int, ...]]()
-
-        def run(batch: np.ndarray) -> np.ndarray:
-            out = self.encode_and_measure(batch, np.full(len(batch), row, np.int32), np.full(len(batch), aspect))[1]
-            forms[:] = [value.shape[1:] for value in out]
-            return np.concatenate([np.reshape(value, (len(batch), -1)) for value in out], axis=1)
-
-        packed = run_in_batches(run, prepared)
-        parts = np.split(packed, np.cumsum([int(np.prod(form)) for form in forms])[:-1], axis=1)
-        out = output_of(part.reshape(-1, *form) for part, form in zip(parts, forms, strict=True))
+        aspect, row = np.log(clips.shape[2] / clips.shape[3]), self.sensor_row(sensor, log)
+        parts = []
+        for start in range(0, len(clips), BATCH):
+            part = clips[start : start + BATCH]
+            ready = np.stack([[self.preprocess(frame, background) for frame in clip] for clip in part])
+            numbers = np.full(len(part), row, np.int32), np.full(len(part), aspect, np.float32)
+            parts.append(self.encode_and_measure(ready, *numbers)[1])
+        out = output_of(check_features(np.concatenate(values)) for values in zip(*parts, strict=True))
         return measure(out, to_rgb(clips[0, -1], "the frame"))
 
     def measure_of(
@@ -314,7 +312,7 @@ class Encoder:
         *, rotate: int = 0, flip: Flip = "none",
     ) -> Measure:  # fmt: skip
         """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it. Raises UserError."""
-        gel = None if background is None else to_rgb(np.asarray(background), "the background")
+        gel = None if background is None else to_rgb(as_array(background, "the background"), "the background")
         if not self.measures:
             raise missing(self.source)
         return Measure(scale_of(self.metadata, sensor, width_mm), sensor, gel, log, rotate, flip)
@@ -332,15 +330,11 @@ class Encoder:
         `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over width.
         """
         if (key := ("fields", pooling)) not in self._compiled:
-            self._compiled[key] = jax.jit(self.traceable_fields(pooling))
+            net = build(usable(self.whole or self.config.model))
+            self._compiled[key] = jax.jit(partial(features_and_fields, net=net, pooling=pooling))
         with precision(self.config):
-            values, out = self._compiled[key](self._placed_fields, clips, rows, aspect)
-        return np.asarray(values), output_of(map(np.asarray, out))
-
-    def traceable_fields(self, pooling: Pooling = "class") -> Callable[..., tuple[jax.Array, FieldOutput]]:
-        """Return the function of parameters, clips, rows and aspects that `encode_and_measure` compiles."""
-        assert self.whole is not None
-        return partial(features_and_fields, net=build(usable(self.whole)), pooling=pooling)
+            values, out = self._compiled[key](self._placed_fields, *map(filled, (clips, rows, aspect)))
+        return np.asarray(values)[: len(clips)], output_of(np.asarray(value)[: len(clips)] for value in out)
 
     @cached_property
     def _placed_fields(self) -> Params:

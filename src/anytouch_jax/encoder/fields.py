@@ -45,10 +45,10 @@ _EDGE = 4  # pixels, along each side, of one vertex of a surface
 
 
 class Scale(NamedTuple):
-    """What turns outputs into mm and N.
+    """What turns outputs into mm and N: `width` mm of the picture or None, and the gel's `modulus` in kPa.
 
-    They are `width` mm of the picture or None, the gel's modulus in kPa and its deviation as a share, the usual
-    proportions of the picture or None, and factors on the deviations.
+    `spread` is the deviation of the modulus as a share. `shape` is the usual height over width of the picture, or None.
+    `factors` multiply the deviations, by name.
     """
 
     width: float | None

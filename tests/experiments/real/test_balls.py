@@ -21,7 +21,7 @@ def test_a_perfect_depth_has_no_error_and_a_wrong_one_has_its_own():
     assert exact.radius == pytest.approx(0, abs=0.01) and exact.centre == pytest.approx(0, abs=0.02)
     assert exact.profile < 0.02 and exact.true_centre == pytest.approx(3 - np.sqrt(9 - 1.8**2), abs=2e-3)
     steep = balls.error_of(1.3 * cap(), PRESS, MM)
-    assert steep.centre == pytest.approx(0.3 * exact.true_centre, abs=0.03) and steep.radius < -0.1
+    assert steep.centre == pytest.approx(0.3 * exact.true_centre, rel=0.25) and steep.radius < -0.1
 
 
 def test_slopes_of_a_ball_integrate_to_it():

@@ -85,9 +85,14 @@ def test_plain_make_lists_every_target() -> None:
     assert """DATA="'my folder/a.parquet' b.csv\"\n""" in done.stdout  # as the test above has it
 
 
-@pytest.mark.parametrize("target", ["train-stage1", "train-stage2", "probe"])
-def test_without_data_the_simulated_scenes_are_made_first(target: str, tmp_path: Path) -> None:
-    scenes = tmp_path / "scenes"
+@pytest.mark.parametrize("target", ["train-stage1", "train-stage2"])
+def test_without_data_training_simulates_touches(target: str) -> None:
+    assert parsed(planned(target)[-1]).options.data == (Path("simulated"),)
+    assert parsed(planned(target, "DATA=a.csv")[-1]).options.data == (Path("a.csv"),)
+
+
+def test_without_data_the_simulated_scenes_are_made_first(tmp_path: Path) -> None:
+    target, scenes = "probe", tmp_path / "scenes"
     simulate, use = planned(target, f"SCENES={scenes}")
     assert simulate[:2] == ["data", "simulate"] and parsed(simulate).out == scenes
     assert f"{scenes}/manifest.parquet" in use
@@ -159,12 +164,13 @@ NOT_RUN = {
     "bench": "it measures for minutes, and tests/experiments/benchmarks runs its parts",
     "compare": "it measures encoders of full size, and test_compare.py runs a small one",
     "docs": "it installs packages from the network",
+    "train-stage2": "the tests above read its command, which is that of train-stage1",
+    "probe": "tests/cli/test_probe.py runs its command",
 }  # fmt: skip
 SMALL = " ".join(f"--{name} {value}" for name, value in SIZES.items())
 RUN = {
     "parity": [],
     "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"],
-    "probe": ["RUN=anytouch-tiny", "LABEL=object", "DATA={world}"],
 }  # fmt: skip
 
 

@@ -19,8 +19,8 @@ FIELDS = ("displacement", "shear", "pressure")
 class SimulatedTouch(NamedTuple):
     """Pictures u8 (B, h, w, 3), the gel's `background`, and fields of B touches at the picture's pixels.
 
-    `depth` (B, h, w) mm is the gel's displacement, `shear` (B, h, w, 2) mm along x and y of the picture, `pressure`
-    (B, h, w) kPa, `force` (B, 3) N along x, y and into the gel, `torque` (B,) N mm.
+    `depth` (B, h, w) is the gel's displacement in mm. `shear` (B, h, w, 2) is in mm along x and y of the picture.
+    `pressure` (B, h, w) is in kPa, `force` (B, 3) in N along x, y and into the gel, `torque` (B,) in N mm.
     """
 
     image: Any
@@ -39,10 +39,11 @@ def simulate_touch(
     """Press a surface into the gel of a sensor, and return what the camera sees and the gel feels.
 
     `height_map` (H, W) is in mm, with 0.1 mm between pixels, its highest part nearest to the gel. `pose` (B, 4) is the
-    touched place x and y in mm from the map's centre, the turn in rad, and the depth in mm. `drag` (B, 3) mm, mm and rad
-    moves the object over the gel under the whole pressure. `modulus` kPa and `friction` are the object's. `unit` is a device of the sensor
-    (`sensors.draw_unit`), by default the nominal one without markers. All but the pictures can be differentiated with
-    respect to pose and drag, with fidelity "fast". Use it under jit. Raises UserError for a sensor without a camera.
+    touched place x and y in mm from the map's centre, the turn in rad, and the depth in mm. `drag` (B, 3) mm, mm and
+    rad moves the object over the gel under the whole pressure. `modulus` kPa and `friction` are the object's. `unit`
+    is a device of the sensor (`sensors.draw_unit`), by default the nominal one without markers. With fidelity "fast"
+    all but the pictures can be differentiated with respect to pose and drag. Use it under jit. Raises UserError for a
+    sensor without a camera.
     """
     if sensor not in SENSORS or SENSORS[sensor].kind != "image":
         cameras = ", ".join(name for name, one in SENSORS.items() if one.kind == "image")

@@ -165,7 +165,6 @@ NOT_RUN = {
     "compare": "it measures encoders of full size, and test_compare.py runs a small one",
     "docs": "it installs packages from the network",
     "train-stage2": "the tests above read its command, which is that of train-stage1",
-    "probe": "tests/cli/test_probe.py runs its command",
 }  # fmt: skip
 SMALL = " ".join(f"--{name} {value}" for name, value in SIZES.items())
 RUN = {

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -24,7 +25,7 @@ import numpy as np
 import optax
 
 from anytouch_jax.batch import FieldBatch
-from anytouch_jax.config import Config, SimulatedConfig
+from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.nn.fields import FORCE, LENGTH, TORQUE
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
@@ -136,7 +137,9 @@ def finish(loaded: Any, config: Config, out: Path, name: str) -> None:
         name: float(np.quantile(np.abs(values["error"]) / values["deviation"], 0.68)) for name, values in errors.items()
     }
     log(f"deviations are multiplied by {factors}")
-    whole = dataclasses.replace(loaded.config, model=dataclasses.replace(loaded.config.model, fields=CHANNELS))
+    card = parse_json((loaded.path.parent / "config.json").read_text())
+    trained = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings({"run.steps": card["steps"]})
+    whole = dataclasses.replace(trained, model=dataclasses.replace(loaded.config.model, fields=CHANNELS))
     metadata = {**loaded.metadata, "fields": factors}
     full = dataclasses.replace(loaded, config=whole, params={**loaded.params, **params}, metadata=metadata)
     tokenizer = loaded.path.parent / "tokenizer.json"
@@ -222,7 +225,8 @@ def test(model: Path, out: Path) -> None:
     loaded = load_model(locate(str(model)))
     config = loaded.config
     params = {"touch": loaded.params["touch"], "fields": loaded.params["fields"]}
-    factors = loaded.metadata.get("fields", dict.fromkeys(QUANTITIES, 1.0))
+    stored = loaded.metadata.get("fields", "{}")
+    factors = dict.fromkeys(QUANTITIES, 1.0) | (json.loads(stored) if isinstance(stored, str) else stored)
     for sensor in SimulatedConfig().sensors:
         record = {"machine": dataclasses.asdict(machine.describe())} | scores(params, config, sensor, factors)
         write_record(out, sensor, record)

@@ -329,7 +329,7 @@ def test_a_background_of_other_proportions_is_refused_everywhere(tmp_path, encod
     tries = {
         "training": lambda: SampleReader(table, settings(tmp_path / "m.csv", flip=0.5)).touch(np.array([0]), 0),
         "training, plain": lambda: SampleReader(table, settings(tmp_path / "m.csv")).touch(np.array([0]), 0),
-        "evaluation": lambda: embed_rows(encoder, table, np.array([0])),
+        "evaluation": lambda: embed_rows(encoder, table, np.array([0]), log=lambda _: None),
         "Python": lambda: encoder.preprocess(frame, gel),
         "a camera": lambda: Preprocess(encoder, gel)(frame),
     }

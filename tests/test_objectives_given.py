@@ -55,7 +55,7 @@ def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeyp
         match = match._replace(negative=pixels(4, 1), negative_sensor=SENSOR[:4])
     net, args = build(config.model), (Stage2Batch(align, match), jax.random.key(0), np.float32(0.5))
     run = lambda *args: (objectives.stage2_loss({}, *args, net=net, config=config), received)[1]  # noqa: E731
-    ((shown, reported),) = jax.device_get(jax.jit(run)(*args))
+    ((shown, reported, _),) = jax.device_get(jax.jit(run)(*args))
     pairs = [(shown.image, align.image, CLIP), (shown.clip, align.clip, IMAGENET)]
     pairs += [(reported[i], match[i], IMAGENET) for i in ((0, 2, 4) if head == "mlp" else (0, 2))]
     for result, given, (mean, std) in pairs:

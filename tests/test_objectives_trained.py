@@ -28,12 +28,12 @@ def touches(frames: int) -> TouchBatch:
 def aligned(frames: int, images: int, texts: int) -> AlignBatch:
     text = np.ones((texts, 8), np.int32)
     image = np.zeros((images, 28, 28, 3), np.uint8)
-    return AlignBatch(*touches(frames), image, np.arange(images), text, text > 0, np.arange(texts))
+    return AlignBatch(*touches(frames)[:2], image, np.arange(images), text, text > 0, np.arange(texts))
 
 
 def matched(frames: int, head: str) -> MatchBatch:
-    pair = MatchBatch(*touches(frames), *touches(frames), place=np.arange(ROWS))
-    return pair if head == "cosine" else MatchBatch(*pair[:4], *touches(frames))
+    one = touches(frames)[:2]
+    return MatchBatch(*one, *one, place=np.arange(ROWS)) if head == "cosine" else MatchBatch(*one, *one, *one)
 
 
 def batches(config: Config, every: bool) -> list:

@@ -26,9 +26,9 @@ import optax
 
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
-from anytouch_jax.nn.fields import FORCE, LENGTH, TORQUE
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
+from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE
 from anytouch_jax.sim import endless, scene
 from anytouch_jax.simulated import FIELDS, field_batch
 from anytouch_jax.train.mesh import enable_compilation_cache

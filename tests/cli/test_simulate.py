@@ -21,8 +21,8 @@ def _no_physics(monkeypatch):
     ("words", "named"),
     [
         (["--sensors", "nose"], "no simulated sensor 'nose'"),
-        (["--depth", "-1", "1"], "depth is a range of mm"),
-        (["--threads", "0"], "threads must be at least 1"),
+        (["--depth", "1", "0.5"], "depth is a range of mm"),
+        (["--threads", "0"], "--threads must be 1 to 1024"),
         (["--sensors", "tac3d", "--fields", "pressure"], "no sensor has a camera"),
         (["--size", "8"], "size is 16 to 4096"),
         (["--size", "20000"], "size is 16 to 4096"),

@@ -70,8 +70,8 @@ def test_help_all_lists_and_explains_every_field_with_the_defaults_of_the_preset
 @pytest.mark.parametrize(("typed", "meant"), [("--stps", "--steps"), ("--objective.mask-ration", "mask-ratio")])
 def test_a_mistyped_option_is_answered_with_the_nearest(typed, meant, anytouch):
     done = anytouch("train", "--data", "m.csv", "--run", "r", typed, "5")
-    assert done.status == 2 and typed in done.err and meant in done.err.split("Perhaps", 1)[1]
-    assert ("--help-all" if "." in typed else "--help") in done.err
+    assert done.status == 2 and typed in done.err and meant in done.err.replace(typed, "")
+    assert len(done.err.splitlines()) == 1
 
 
 def test_an_option_of_a_section_is_named_in_full(mistake):
@@ -87,7 +87,7 @@ def test_an_option_of_a_section_is_named_in_full(mistake):
         (("--objective.mask-ratio",), "--objective.mask-ratio"), (("--model.patch", 13), "patch"),
         (("--model.patch", 0), "--model.patch"), (("--model.decoder.heads", 0), "heads"),
         (("--model.decoder.width", 18, "--model.decoder.heads", 2), "--model.decoder.width"),
-        (("--steps", 0), "--run.steps"), (("--data.flip", 7), "--data.flip"), (("--stop-after", -1), "--stop-after"),
+        (("--steps", 0), "--steps"), (("--data.flip", 7), "--data.flip"), (("--stop-after", -1), "--stop-after"),
         (("--stage", 2, "--towers", "pretrained"), "--clip-weights"),
         (("--stage", 1, "--towers", "pretrained"), "--clip-weights"),
         (("--stage", 2, "--clip-weights", "c"), "--towers"), (("--init", "gone"), "gone"),

@@ -262,7 +262,7 @@ def test_rows_of_sensors():
     model = preset("tiny").model
     assert [model.sensor_row(name) for name in ("gelsight", "digit", "duragel", "universal")] == [0, 1, 4, 9]
     assert model.universal_row == 9
-    with pytest.raises(ConfigError, match=r"unknown sensor 'gelsigt'. Choose one of gelsight, digit.*--model.sensors"):
+    with pytest.raises(ConfigError, match="'gelsigt' is not known: did you mean gelsight"):
         model.sensor_row("gelsigt")
     with pytest.raises(ConfigError, match="'tac3d' measures a force field"):
         model.sensor_row("tac3d")

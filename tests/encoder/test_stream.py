@@ -312,7 +312,7 @@ def test_what_cannot_be_streamed_is_one_sentence(encoder, tmp_path):
         stream(encoder, Camera(), live=True, sensor=DIGIT, frames=2)
     with pytest.raises(UserError, match="stride of a clip must be at least 1, not 0"):
         stream(encoder, Camera(), live=True, sensor=DIGIT, frames=3, stride=0)
-    with pytest.raises(UserError, match=r"no video .*gone\.avi; give a video file"):
+    with pytest.raises(UserError, match=r"no video and no camera .*gone\.avi"):
         open_source(tmp_path / "gone.avi")
     text = tmp_path / "text.avi"
     text.write_text("no video")
@@ -373,8 +373,8 @@ def embedded_clips(monkeypatch):
     """The clips that reached the encoder."""
     clips, compile_for_one = [], streams.compile_for_one
 
-    def watched(*args):
-        embed = compile_for_one(*args)
+    def watched(*args, **options):
+        embed = compile_for_one(*args, **options)
         return lambda clip: (clips.append(np.asarray(clip)[0]), embed(clip))[1]
 
     monkeypatch.setattr(streams, "compile_for_one", watched)

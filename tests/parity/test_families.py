@@ -14,6 +14,7 @@ from safetensors.numpy import load_file, save_file
 
 from anytouch_jax import load_encoder
 from anytouch_jax.cli.app import main
+from anytouch_jax.data.gels import untouched_gel
 from anytouch_jax.encoder.export import load as load_exported
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights import families
@@ -189,7 +190,8 @@ def test_the_commands_take_a_family(tmp_path, capsys):
     out = tmp_path / "features.npz"
     assert main(["embed", "--model", model, "--data", str(frames), "--frames", "4", "--out", str(out)]) == 0
     encoder = load_encoder(model)
-    clip = np.stack([encoder.preprocess(np.roll(ROLLED, number, axis=0)) for number in range(1, 5)])
+    rolled = [np.roll(ROLLED, number, axis=0) for number in range(5)]
+    clip = np.stack([encoder.preprocess(frame, untouched_gel(rolled)) for frame in rolled[1:]])
     with np.load(out) as features:
         np.testing.assert_allclose(features["features"][1:], encoder.encode_touch(clip[None]), atol=1e-5)
     exported = tmp_path / "encoder.bin"

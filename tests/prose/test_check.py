@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -62,9 +63,12 @@ def test_messages_of_errors_are_checked():
 
 
 def test_the_text_of_a_notebook_is_checked_and_its_code_is_not():
-    text = f"# %% [markdown]\n# # Title?\n#\n# Fine.\n#\n# {LONG}\n\n# %%\n# a; b\nx = 1  # {LONG}\n"
-    found = list(check.notebook_faults(Path("a.py"), text))
-    assert [(fault.line, "31 words" in fault.reason) for fault in found] == [(6, True)]
+    cells = [
+        {"cell_type": "markdown", "source": ["# Title?\n", "\n", "Fine.\n", "\n", f"{LONG}\n"]},
+        {"cell_type": "code", "source": f"# a; b\nx = 1  # {LONG}\n"},
+    ]
+    found = list(check.notebook_faults(Path("a.ipynb"), json.dumps({"cells": cells})))
+    assert [(fault.line, "31 words" in fault.reason) for fault in found] == [(5, True)]
 
 
 def test_the_exit_status_says_whether_there_are_faults(tmp_path, capsys):

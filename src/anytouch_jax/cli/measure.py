@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from anytouch_jax.bars import tracked
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_apart, check_folder, log, refuse_unused
+from anytouch_jax.config.parsing import Above0
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class MeasureOptions(embed.SensorOptions):
 
     data: tuple[Path, ...]  # Manifests (.csv, .parquet), or one folder of frames, picture or video.
     out: Path  # The .npz to write, with maps of every frame. Its numbers go to a .csv of the same name.
-    width_mm: float | None = None
+    width_mm: Above0[float | None] = None
     """What the width of the picture shows, in mm. Known sensors need none. For others lengths are else shares of it."""
     split: str | None = None  # Only this split of a manifest.
     film: Path | None = None  # Film of the frames with depth, shear and force (.mp4, .avi).

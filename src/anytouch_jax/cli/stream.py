@@ -61,7 +61,7 @@ class StreamOptions(CameraOptions, embed.FrameOptions):
     fields: bool = False
     """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with deviations. Shear and
     slip need --frames 3."""
-    width_mm: float | None = None  # --fields: mm that the picture's width shows. Known sensors need none.
+    width_mm: Above0[float | None] = None  # --fields: mm that the picture's width shows. Known sensors need none.
 
 
 def run(options: StreamOptions) -> int:

@@ -40,9 +40,7 @@ class LossConfig:
     match_weight: NotNegative[float] = 0.1  # Weight of cross-sensor matching relative to alignment (lambda, Eq. 9).
     match_keep: Annotated[float, Range(math.ulp(0.0), 1, "above 0, and 1 at most")] = 1.0
     """Share of the patches that matching encodes. Not in the paper (after FLIP)."""
-    field_weight: NotNegative[float] = (
-        0.1  # Weight of depth, shear, contact and force (--model.fields). Not in the paper.
-    )
+    field_weight: NotNegative[float] = 0.1  # Weight of depth, shear and force (--model.fields). Not in the paper.
     groups: Count[int] = 1  # Parts of the batch within which negatives stay. 1 uses the whole batch.
     center_embeddings: bool = False  # Subtract the batch mean from embeddings, against collapse of untrained towers.
     universal_start: Share = 0.0  # Probability of the universal tokens at the first step (p_u, Sec. 3.5).
@@ -88,9 +86,8 @@ class DataConfig:
     batch_size: Count[int] = 64  # Samples of a step (--batch).
     clip_share: Share = 0.5  # Share of clips. The rest are stills.
     order: Literal["alternate", "random"] = "alternate"  # Batches of stills and clips: in turn, or mixed (release).
-    weights: NotNegative[tuple[tuple[str, float], ...] | None] = (
-        None  # Dataset and how often an epoch draws it. 0: never.
-    )
+    weights: NotNegative[tuple[tuple[str, float], ...] | None] = None
+    """Dataset and how often an epoch draws it. 0: never."""
     negatives: Literal["any", "same_sensor"] = "any"  # Sensors of the negatives of matching: any, or the positive's.
     parts: NotNegative[int] = 0
     """Cut large data into this many parts of whole shards. A slot of a batch draws from its own part, so that a host

@@ -15,6 +15,7 @@ Pooling = Literal["class", "mean", "both"]
 Join = Literal["mean", "sum", "concat"]
 Log = Callable[[str], None]
 BATCH = 64
+METADATA = "fields"  # of weights: factors on the deviations by name, and the modulus of sensors
 SPREAD_ROWS, SPREAD_LEAST = 2000, 0.99  # rows that are compared, and the mean cosine of nearly constant features
 
 

@@ -32,17 +32,16 @@ from anytouch_jax.encoder.arrays import (
     filled,
     rows_of_sensors,
     run_in_batches,
-    unit_rows,
     warn,
 )
 from anytouch_jax.encoder.fields import Fields, Measure, missing, output_of, scale_of
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.attention import usable
-from anytouch_jax.nn.fields import FieldOutput
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_image, normalise_touch
 from anytouch_jax.ops import losses
+from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import count_of, described, leaves
 
 Params = dict[str, Any]
@@ -363,7 +362,7 @@ class Encoder:
         if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
             width = z_text.shape[-1]
             raise UserError(f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}")
-        cosine = unit_rows(z_touch) @ unit_rows(z_text).T
+        cosine = _unit(z_touch) @ _unit(z_text).T
         if not probabilities:
             return np.asarray(np.clip(cosine, -1, 1))
         scale = self._part("scale", lambda net, params: net.scale(params), "logit_scale")
@@ -475,6 +474,12 @@ class Preprocess:
         if self._gel[0] is not gel:
             self._gel = gel, np.ascontiguousarray(self._orient(gel))
         return self._prepare(frame, self._gel[1])
+
+
+def _unit(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """Return rows divided by their length, or by 1e-12 if that is larger, as `losses.normalise`."""
+    wide = np.asarray(values, np.float64)
+    return np.asarray(wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-12), np.float32)
 
 
 def precision(config: Config) -> AbstractContextManager[Any]:

@@ -21,15 +21,15 @@ import numpy as np
 from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import export
-from anytouch_jax.encoder.arrays import Join, Pooling, rows_of_sensors
+from anytouch_jax.encoder.arrays import METADATA, Join, Pooling, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips, check_frames, random_encoder, touch_features, touch_only
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
-from anytouch_jax.encoder.fields import METADATA, missing
+from anytouch_jax.encoder.fields import missing
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
-from anytouch_jax.nn.fields import FieldOutput
+from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import load, registry
 from anytouch_jax.weights.families import Size, load_family

@@ -22,7 +22,7 @@ import numpy as np
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
 from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.errors import UserError
-from anytouch_jax.nn.fields import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE, FieldOutput
+from anytouch_jax.ops.fields import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE, FieldOutput
 
 Engine = Literal["xla", "onnxruntime", "openvino"]
 CALIBRATION = 200  # touches that the ranges of int8 are measured on

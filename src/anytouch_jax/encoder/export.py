@@ -24,13 +24,21 @@ from jax import export as jax_export
 from anytouch_jax.config import UNIVERSAL, parse_json, to_json
 from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.encoder import engines
-from anytouch_jax.encoder.arrays import Join, Pooling, as_array, filled, rows_of_sensors, run_in_batches, unit_rows
+from anytouch_jax.encoder.arrays import (
+    METADATA,
+    Join,
+    Pooling,
+    as_array,
+    filled,
+    rows_of_sensors,
+    run_in_batches,
+    unit_rows,
+)
 from anytouch_jax.encoder.engines import Engine
-from anytouch_jax.encoder.fields import METADATA
 from anytouch_jax.encoder.forks import refuse_forked
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write
-from anytouch_jax.nn.fields import FieldOutput
+from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import described
 
 if TYPE_CHECKING:

@@ -14,10 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.data.transforms import Flip, orient_frame
+from anytouch_jax.encoder.arrays import METADATA
 from anytouch_jax.encoder.health import UnitFrames, check_layout, known_gels
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-from anytouch_jax.nn.fields import FORCE, LENGTH, TORQUE, FieldOutput
+from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
 
 Array = npt.NDArray[Any]
 
@@ -37,7 +38,6 @@ GELS = {
 }  # fmt: skip
 OTHER_MODULUS, OTHER_SPREAD = 170.0, 0.4  # kPa of an unknown gel, and its deviation as a share
 LEAST_FORCE = 1e-3  # over modulus times width squared: the deviation of a smaller normal force is that of this one
-METADATA = "fields"  # of weights: factors on the deviations by name, and the modulus of sensors
 SHAPE_LIMIT = 0.1  # difference of proportions that shows a turned or cropped picture
 _NAMES = ("depth", "shear", "normal", "tangential", "torque", "slip")
 _SIDE = 40  # pixels of a picture's width, when compared with its background

@@ -65,8 +65,8 @@ def test_strata_follow_the_weights(make, settings):
     ("weights", "message"),
     [
         ((("c", 2.0),), r"names the dataset 'c', but split 'train' has a, b"),
-        ((("a", -1.0),), r"--data\.weights of 'a'"),
-        ((("a", float("nan")),), r"--data\.weights of 'a'"),
+        ((("a", -1.0),), "--data.weights must be 0 or more"),
+        ((("a", float("nan")),), "--data.weights must be 0 or more"),
         ((("a", 1.0), ("a", 2.0)), "a dataset twice"),
         ((("a", 0.0), ("b", 0.0)), "leaves out every row"),
     ],

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from experiments.pages.studies import backgrounds, real
 
-from anytouch_jax.errors import UserError
-from experiments.real import features, run, scores, training
+from experiments.real import features, scores, training
 from experiments.real.recordings import Recordings
-from experiments.records import write_record
 
 RNG = np.random.default_rng(0)
 
@@ -81,28 +78,6 @@ def test_binary_patterns_count_corners_and_flat_places():
     assert flat[features._UNIFORM[255]] == 1.0 and flat.sum() == 1.0
 
 
-def test_the_page_has_every_row_and_refuses_mixed_data(data, tmp_path):
-    file = tmp_path / "real.jsonl"
-    with pytest.raises(UserError, match="no record"):
-        real(tmp_path)
-    for name in ("pixels", "untrained:a", "a"):
-        about = {"data": data.content_hash}
-        about |= {"milliseconds": 3.0, "kind": "encoder"} if name != "pixels" else {"kind": "baseline"}
-        write_record(file, name, run.record_of(planted(data, 1.0 if name == "a" else 5.0), data, about))
-    made = real(tmp_path)
-    assert [row[2] for row in made.rows].count("a") == 6 + 3 and "`a` takes 3 ms a frame on a CPU." in made.findings
-    best = next(row for row in made.rows if row[:3] == ("object", "linear", "a"))
-    assert best[4].low > 0 and any(one.startswith("object, linear head: `a` is") for one in made.findings)
-    task = run.task_record(scores.object_score(planted(data, 0.1), data))
-    write_record(
-        file, "a CNN", {"data": data.content_hash, "kind": "baseline", "tasks": {"object, trained with labels": task}}
-    )
-    assert [row[2] for row in real(tmp_path).rows].count("a CNN") == 1
-    write_record(file, "b", {"data": "other"})
-    with pytest.raises(UserError, match="different data"):
-        real(tmp_path)
-
-
 @pytest.mark.slow
 def test_a_small_network_learns_what_the_pictures_show(data, monkeypatch):
     """Objects differ by their colour. A shift moves no colour."""
@@ -119,12 +94,3 @@ def test_shifted_pictures_keep_their_size_and_values():
     assert moved.shape == pictures.shape
     assert all(np.isin(one, other).all() for one, other in zip(moved, pictures, strict=True))
     assert not np.array_equal(moved, pictures)
-
-
-def test_the_page_of_backgrounds_pairs_each_with_the_own_picture(data, tmp_path):
-    for kind, noise in (("own", 0.1), ("estimated", 0.1), ("first", 50.0)):
-        write_record(tmp_path / "backgrounds.jsonl", kind, run.record_of(planted(data, noise), data, {"encoder": "a"}))
-    made = backgrounds(tmp_path)
-    changes = {row[2]: row[4] for row in made.rows if row[:2] == ("object", "linear")}
-    assert changes["the unit's own picture"] is None and changes["the first frame of the recording"].high < 0
-    assert changes["an estimate by `anytouch data contact`"].mean == 0.0

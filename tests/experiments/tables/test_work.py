@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from anytouch_jax.data.manifest import manifest as manifests
-from experiments.tables import plan, scores
+from experiments.tables import plan
 from experiments.tables import work as works
 from experiments.tables.work import DONE, Work
 
@@ -103,27 +102,3 @@ def test_a_record_names_the_data_that_were_learned_from(work, trainer, monkeypat
     result = work.score(LEAF)
     assert {name: result["data"][name] for name in learned} == learned and "own/digit" in result["data"]
     assert all("of" not in one and one["seconds"] == 10.0 for one in result["trained"])
-
-
-def test_adapted_runs_are_made_again_for_other_data_or_weights(tmp_path, monkeypatch):
-    made, weights = [], ["first"]
-    monkeypatch.setattr(scores, "load_encoder", lambda run: weights[0])
-    monkeypatch.setattr(scores, "encoder_digest", str)
-    monkeypatch.setattr(scores.cuts, "content_hash", lambda path: path.read_text())
-
-    def command(words):
-        (tmp_path / "work" / "trained" / "run-adapted2").mkdir(parents=True)
-        made.append(words)
-        return 0
-
-    monkeypatch.setattr(scores, "main", command)
-    table = SimpleNamespace(text_column=lambda name: np.array(["train" if name == "split" else plan.UNSEEN] * 3))
-    monkeypatch.setattr(scores.manifests, "read", lambda path: table)
-    data, here = tmp_path / "new2.parquet", SimpleNamespace(folder=tmp_path / "work")
-    counts = []
-    for text, weight in (("a", "first"), ("a", "first"), ("b", "first"), ("b", "second")):
-        data.write_text(text)
-        weights[0] = weight
-        out = scores.adapted(here, tmp_path / "run", data, 2)
-        counts.append(len(made))
-    assert counts == [1, 1, 2, 3] and out == tmp_path / "work" / "trained" / "run-adapted2"

@@ -19,6 +19,7 @@ from anytouch_jax.encoder.health import UnitFrames, check_layout, known_gels
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
+from anytouch_jax.shown import shown_short
 
 Array = npt.NDArray[Any]
 
@@ -80,6 +81,7 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
     return Scale(width_mm or gel.width, moduli.get(sensor, gel.modulus), 0.0, shape, factors)
 
 
+@shown_short
 @dataclass(frozen=True, eq=False)
 class Fields:
     """What B frames measure, each value with its standard deviation, as maps (B, h, w) over the whole picture.

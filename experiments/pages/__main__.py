@@ -26,6 +26,7 @@ PAGES: Mapping[str, tuple[str, Callable[[Path], Page]]] = {
     "real": ("real.jsonl", encoders.real),
     "lookalikes": ("lookalikes.jsonl", encoders.lookalikes),
     "motion": ("motion.jsonl", encoders.motion),
+    "measure": ("measure.jsonl", encoders.measure),
     "backgrounds": ("backgrounds.jsonl", encoders.backgrounds),
     "trust": ("trust.jsonl", encoders.trust),
     "sensors": ("matrix.jsonl/q1", paper.sensors),

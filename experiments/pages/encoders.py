@@ -107,6 +107,23 @@ def motion(folder: Path) -> Page:
     return Page("motion", [rows], findings, (answer, f"{rows[0][2].shown()} %"))
 
 
+def measure(folder: Path) -> Page:
+    """Errors of depth, contact and force, simulated and on real balls."""
+    sensors = read_records(folder / "measure.jsonl")
+    names = ("depth", "iou", "force", "shear", "inside")
+    rows = [(name, one["depth"], *(100 * one[part] for part in names[1:])) for name, one in sensors.items()]
+    balls = {name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one}
+    real = [(name, *(percent(one["radius"]) if part == "radius" else Value(*one[part]) for part in
+                     ("radius", "centre", "profile"))) for name, one in balls.items()]  # fmt: skip
+    low, high = (bound(row[1] for row in rows) for bound in (min, max))
+    findings = [
+        f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
+        "Real balls: a calibration of the unit is better. The network reads half of the depth.",
+    ]
+    answer = "On new simulated units the depth in contact is off by this much."
+    return Page("measure", [real, rows], findings, (answer, f"{low:.2f} to {high:.2f} mm"))
+
+
 def lookalikes(folder: Path) -> Page:
     """The same touch by another sensor, among 50 that resemble it."""
     rows, findings, readme = [], [], dict[str, Value]()

@@ -48,21 +48,21 @@ class Export:
 
 @contextmanager
 def exported(
-    index: DatasetIndex, folder: str, stream: str, sources: Sequence[Path], part: object = None
+    index: DatasetIndex, folder: str, stream: str, sources: Sequence[Path], which: object = None
 ) -> Iterator[Export]:
     """Give the pictures of `stream` in `folder`, or in a folder of a name like it if that holds something else.
 
-    `sources` are the files that they come from, and `part` what else decides them. New pictures come to be as a whole
+    `sources` are the files that they come from, and `which` what else decides them. New pictures come to be as a whole
     when the block ends. After an error nothing has changed. Raises DatasetError if nothing can be written.
     """
     place, record = find_export(index.root, folder, stream)
-    is_new = record is None or not _is_same(record, sources, part)
+    is_new = record is None or not _is_same(record, sources, which)
     part = part_path(index.root / f"{folder}.{zlib.crc32(stream.encode()):08x}")  # two may be open at once
     export = Export(place or folder, is_new, part if is_new else index.root / str(place))
     try:
         yield export
         if is_new and export.names:
-            state = {"stream": stream, "part": part, "sources": _state(sources), "pictures": export.names}
+            state = {"stream": stream, "part": which, "sources": _state(sources), "pictures": export.names}
             part.joinpath(EXPORT_RECORD).write_text(json.dumps(state), encoding="utf-8")
             export.folder = _move(index, part, folder, place, record, export.names)
             index.written += len(export.names)

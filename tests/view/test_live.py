@@ -80,6 +80,7 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
         assert until(lambda about: about["gel"] == "estimated")  # another orientation, another background
     finally:
         live.stop()
+        runner.close()
     table = manifests.read(tmp_path / "recorded" / "manifest.parquet")
     assert set(table.text_column("object")) == {"cup", "../../cup"} and set(table.text_column("sensor")) == {"digit"}
     assert len({file.parent for file in map(table.file, range(len(table)))}) == 2 and len(table) >= 6

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import jax
 
-from anytouch_jax.config import Config, Stack, preset
+from anytouch_jax.config import Config, preset
 from anytouch_jax.pretrain import CHECKPOINTS, pretrain
 from anytouch_jax.simulated import SIMULATED
 from anytouch_jax.train.mesh import enable_compilation_cache
@@ -32,6 +32,7 @@ SETTINGS: dict[str, Any] = {
     "model.embed": 192, "model.fields": 32, "data.background": "either", "data.jitter": (0.0, 0.0, 0.0, 0.0),
     "data.affine": (10.0, 0.05, 0.15), "run.figure_every": 0, "run.save_every": 2000, "run.keep": 1,
     "run.steps": 10_000, "optim.warmup": 400, "optim.grad_clip": 10.0, "simulated.wild": 0.25, "simulated.variants": 3,
+    "simulated.vision": 0.0,
 }  # fmt: skip
 STAGES: dict[int, dict[str, Any]] = {
     1: {"optim.learning_rate": 1e-3, "objective.norm_pix_loss": True, "objective.field_weight": 0.1},
@@ -40,7 +41,6 @@ STAGES: dict[int, dict[str, Any]] = {
         "objective.field_weight": 0.2, "data.clip_share": 0.34,
     },
 }  # fmt: skip
-IMAGE = Stack(width=128, depth=2, heads=4, mlp=512)  # photographs are few and simple
 # Device: touches of a batch of stage 1, pairs of stage 2, share of the patches that matching encodes, more settings.
 DEVICES: dict[str, tuple[int, int, float, dict[str, Any]]] = {
     "gpu": (1024, 640, 0.6, {"model.dtype": "bfloat16"}),
@@ -61,7 +61,7 @@ def configure(stage: Literal[1, 2], real: Sequence[str], cycle: int, changes: Ma
     if stage == 2:
         assert config.model.text is not None
         text = replace(config.model.text, stack=replace(config.model.text.stack, depth=2))
-        settings |= {"objective.match_keep": keep, "model.image": IMAGE, "model.text": text}
+        settings |= {"objective.match_keep": keep, "model.image": None, "model.text": text}
     return config.with_settings({**settings, **changes})
 
 

@@ -26,7 +26,7 @@ from anytouch_jax.data.transforms import UNTOUCHED, touch_evaluation
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import endless, scene
 from anytouch_jax.sim.contact.mechanics import KPA_MM2
-from anytouch_jax.sim.endless import Sampling, SimulatedTouches
+from anytouch_jax.sim.endless import Sampling, SimulatedTouches, World
 from anytouch_jax.sim.sensing.photo import seeded_photograph
 from anytouch_jax.sim.world import captions
 from anytouch_jax.sim.world.objects import Object
@@ -107,7 +107,7 @@ class SimulatedLoader:
         if config.stage == 2 and model.text is not None:
             self._texts = jax.device_put(self._encode(manifest))
         self._world, self._key = jax.device_put(world), jax.random.key(config.run.seed)
-        self._pool: tuple[int, int, SimulatedTouches] | None = None
+        self._pool: tuple[tuple[int, int], SimulatedTouches] | None = None
         kinds = sum(1 for part in self._real.windows if part is not None) if self._real else 2
         self._has_clips = kinds > 1 and config.data.clip_share > 0
         self._assemble = jax.jit(partial(_assemble, config=config, rows=self._rows, devices=devices))
@@ -139,31 +139,42 @@ class SimulatedLoader:
         is_clip = np.floor((step + 1) * share) > np.floor(step * share)
         return (self.config.model.frames + self.config.reconstructs) if is_clip else 1
 
+    def _sampled(self, step: int) -> tuple[Array, World, Sampling, int, Array]:
+        """Return what the simulated touches of a step are sampled from."""
+        config, simulated = self.config, self.config.simulated
+        sampling = Sampling(
+            frames=self.frames(step), takes=config.stage, size=config.model.image_size, coarse=simulated.coarse,
+            free=FREE[config.stage - 1] if config.model.fields else 0.0,
+            vision=simulated.vision if self._photos is not None else 0.0, wild=simulated.wild,
+            depth=simulated.depth, fields=FIELDS if config.model.fields else (),
+            field_size=config.model.image_size // 2,
+        )  # fmt: skip
+        key = jax.random.fold_in(jax.random.fold_in(self._key, 1), step // simulated.reuse)
+        gallery = jax.random.randint(jax.random.fold_in(key, sampling.frames), (), 0, len(simulated.sensors))
+        return key, self._world, sampling, self._count, gallery
+
     def touches(self, step: int) -> SimulatedTouches:
         """Return the simulated touches that a step draws from, on the device."""
-        config, frames = self.config, self.frames(step)
-        number = step // config.simulated.reuse
+        name = (step // self.config.simulated.reuse, self.frames(step))
         pool = self._pool
-        if pool is None or pool[:2] != (number, frames):
-            simulated = config.simulated
-            sampling = Sampling(
-                frames=frames, takes=config.stage, size=config.model.image_size, coarse=simulated.coarse,
-                free=FREE[config.stage - 1] if config.model.fields else 0.0,
-                vision=simulated.vision if self._photos is not None else 0.0, wild=simulated.wild,
-                depth=simulated.depth, fields=FIELDS if config.model.fields else (),
-                field_size=config.model.image_size // 2,
-            )  # fmt: skip
-            key = jax.random.fold_in(jax.random.fold_in(self._key, 1), number)
-            gallery = jax.random.randint(jax.random.fold_in(key, frames), (), 0, len(simulated.sensors))
-            touches = _sample(key, self._world, sampling, self._count, gallery)
-            pool = self._pool = (number, frames, touches)
-        return pool[2]
+        if pool is None or pool[0] != name:
+            pool = self._pool = (name, _sample(*self._sampled(step)))
+        return pool[1]
 
     @property
-    def examples(self) -> list[Callable[[], Batch]]:
-        """Functions that make a batch of stills and one of clips, if the run has both."""
+    def examples(self) -> list[tuple[Batch, Callable[[], Batch]]]:
+        """A batch of stills and one of clips, if the run has both: its shapes, and a function that makes it."""
+
+        def shapes(step: int) -> Batch:
+            key, world, sampling, count, gallery = self._sampled(step)
+            touches = jax.eval_shape(
+                partial(endless.sample_touches, sampling=sampling, count=count), key, world, gallery=gallery
+            )
+            batch: Batch = jax.eval_shape(self._assemble, key, touches, self._real, self._photos, self._texts)
+            return batch
+
         first = {self.frames(step): step for step in range(20, -1, -1)}
-        return [partial(self.batch, step) for step in first.values()]
+        return [(shapes(step), partial(self.batch, step)) for step in first.values()]
 
     def stream(self, start: int, stop: int) -> Iterator[tuple[int, Batch, Info]]:
         """Yield (step, batch on the device, info) for steps start .. stop - 1."""

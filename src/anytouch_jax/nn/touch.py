@@ -22,6 +22,7 @@ from anytouch_jax.nn.layers import (
     stacked_blocks,
     stored,
     table,
+    windows,
 )
 from anytouch_jax.ops import tokens
 
@@ -78,16 +79,6 @@ class ConvolutionalPatch(nnx.Module):
         x = self.second(windows(gelu(self.norm1(x)), 3))
         x = gelu(self.norm2(x))
         return self.last(x.reshape(b, k, -1))
-
-
-def windows(x: Array, side: int) -> Array:
-    """Every second window of `side` x `side` pixels (odd) of x (B, H, W, C), zeros around it: (B, ceil(H / 2),
-    ceil(W / 2), side * side * C), in the order (row, col, channel)."""
-    around = side // 2
-    x = jnp.pad(x, ((0, 0), (around, around), (around, around), (0, 0)))
-    ends = [size - side + 1 for size in x.shape[1:3]]
-    cut = [x[:, i : i + ends[0] : 2, j : j + ends[1] : 2] for i in range(side) for j in range(side)]
-    return jnp.concatenate(cut, axis=-1)
 
 
 class TouchEncoder(nnx.Module):

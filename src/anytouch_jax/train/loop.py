@@ -38,6 +38,7 @@ from anytouch_jax.train.step import LossFn, TrainedFn, TrainState, init_state, m
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
 Tree = Any
+Example = tuple[Any, Callable[[], Any]]  # the shapes of a batch, and a function that makes it
 _SIGNAL, _SKIPPED = "signal", "skipped_samples"  # the metrics of a step that its ballot adds
 # batches(start, stop) -> (step, batch, numbers of the loader for the log) for each step of the range
 Item = tuple[int, Any, Mapping[str, Any]]
@@ -78,7 +79,7 @@ def fit(
     mesh: Mesh | None = None,
     curve: bool = False,
     until: float | None = None,
-    examples: Sequence[Callable[[], Any]] = (),
+    examples: Sequence[Example] = (),
 ) -> FitResult:
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
@@ -86,8 +87,9 @@ def fit(
     of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
     `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
     `until` ends the run at that time of `time.monotonic`: the schedule then follows the time that has passed since the
-    first step, in place of `run.steps`. `examples` make a batch of each structure, for which the step is compiled
-    before the first one, side by side. SIGTERM and Ctrl-C finish the step, save and return. If one of several processes
+    first step, in place of `run.steps`. `examples` are a batch of each structure, as shapes and
+    as a function that makes it: what makes them and their steps are compiled before the first step, side by side.
+    SIGTERM and Ctrl-C finish the step, save and return. If one of several processes
     gets the signal, all stop a step later. Raises UserError for settings that changed since the start, too many skipped
     steps in a row, a full disk, an unreadable checkpoint, and a folder that some process cannot see.
     """
@@ -155,7 +157,7 @@ class _Loop:
         loss_fn: LossFn,
         trained: TrainedFn | None,
         interrupt: list[signal.Signals],
-        examples: Sequence[Callable[[], Any]] = (),
+        examples: Sequence[Example] = (),
     ) -> FitResult:
         """Run steps `start` to `stop`, or until a signal arrives."""
         every, figures = self.config.run.save_every, self.config.run.figure_every
@@ -198,21 +200,26 @@ class _Loop:
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
     def ahead(
-        self, step_fn: Any, state: TrainState, seed_key: jax.Array, examples: Sequence[Callable[[], Any]]
+        self, step_fn: Any, state: TrainState, seed_key: jax.Array, examples: Sequence[Example]
     ) -> Callable[..., Any]:
         """Return the step, compiled for the batch of each example side by side. Others compile when they come."""
 
         def form(batch: Any) -> Any:
             return jax.tree.structure(batch), tuple((x.shape, x.dtype) for x in jax.tree.leaves(batch))
 
-        def build(example: Callable[[], Any]) -> tuple[Any, Any]:
-            batch = put_batch(example(), batch_sharding(self.mesh))
+        sharding = batch_sharding(self.mesh)
+
+        def build(shapes: Any) -> tuple[Any, Any]:
+            batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
             return form(batch), step_fn.lower(state, batch, seed_key, *self.progress()).compile()
 
         if len(examples) < 2:
             return step_fn
-        with ThreadPoolExecutor(len(examples)) as pool:
-            programs = dict(pool.map(build, examples))
+        with ThreadPoolExecutor(2 * len(examples)) as pool:
+            made = [pool.submit(make) for _, make in examples]
+            programs = dict(pool.map(build, [shapes for shapes, _ in examples]))
+            for one in made:
+                one.result()
         return lambda state, batch, *rest: programs.get(form(batch), step_fn)(state, batch, *rest)
 
     def progress(self) -> tuple[np.float32, ...]:

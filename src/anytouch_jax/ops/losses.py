@@ -13,6 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 Metrics = dict[str, Array]
+MOST_SCALE = 100.0  # 1 / tau, as CLIP (Radford et al., 2021, Sec. 2.5)
 
 
 def _wide(*values: ArrayLike) -> list[Array]:
@@ -87,8 +88,8 @@ def info_nce(
 ) -> Array:
     """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
-    `scale` is 1 / tau. A row is present where `present` is not 0. Absent rows are neither anchors nor negatives and may
-    hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that many shares, as by the devices
+    `scale` is 1 / tau, and counts as 100 beyond 100. A row is present where `present` is not 0. Absent rows are neither
+    anchors nor negatives and may hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that many shares, as by the devices
     of the release. Negatives come from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,) are
     no negatives of each other. Raises ValueError for shapes that do not fit, and for groups of unequal size.
     """
@@ -99,6 +100,8 @@ def info_nce(
     rows, width = a.shape
     if groups < 1 or rows % groups:
         raise ValueError(f"{rows} rows cannot be cut into {groups} groups of equal size")
+    scale = jnp.minimum(scale, jnp.finfo(scale.dtype).max)
+    scale = scale * jax.lax.stop_gradient(jnp.where(scale > MOST_SCALE, MOST_SCALE / scale, 1.0))  # it can fall again
     present = present.reshape(groups, rows // groups)
     a, b = (jnp.where(present[..., None], x.reshape(*present.shape, width), 0.0) for x in (a, b))
     # The factor is up to 100: the reduced precision that accelerators use by default would show in the loss.

@@ -89,9 +89,10 @@ def info_nce(
     """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
     `scale` is 1 / tau, and counts as 100 beyond 100. A row is present where `present` is not 0. Absent rows are neither
-    anchors nor negatives and may hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that many shares, as by the devices
-    of the release. Negatives come from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,) are
-    no negatives of each other. Raises ValueError for shapes that do not fit, and for groups of unequal size.
+    anchors nor negatives and may hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that
+    many shares, as by the devices of the release. Negatives come from a row's share, and the mean is over all shares.
+    Rows of one `place` i32 (B,) are no negatives of each other. Raises ValueError for shapes that do not fit, and for
+    groups of unequal size.
     """
     (a, b, scale), present = _wide(a, b, scale), jnp.asarray(present, bool)
     _equal_shapes(a=a, b=b)

@@ -63,7 +63,7 @@ def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeyp
         np.testing.assert_allclose(result, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5)
 
 
-def test_objectives_take_lists():
+def test_objectives_take_lists_under_strict_types():
     def lists(x):
         return type(x)(*map(lists, x)) if hasattr(x, "_fields") else x if x is None else np.asarray(x).tolist()
 
@@ -79,7 +79,8 @@ def test_objectives_take_lists():
         net = build(config.model)
         for given, progress in ((batch, jnp.float32(0.5)), (lists(batch), 0.5)):
             run = partial(loss, batch=given, key=jax.random.key(0), progress=progress, net=net, config=config)
-            value, metrics = jax.eval_shape(run, net.abstract())
+            with jax.numpy_dtype_promotion("strict"):
+                (value, metrics), _ = jax.eval_shape(jax.value_and_grad(run, has_aux=True), net.abstract())
             assert value.shape == () and value.dtype == jnp.float32 and metrics
             assert objectives.trained_by(given, config=config) == objectives.trained_by(batch, config=config)
 

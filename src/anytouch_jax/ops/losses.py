@@ -24,7 +24,7 @@ def _wide(*values: ArrayLike) -> list[Array]:
     return [x.astype(jnp.float64 if is_double else jnp.float32) for x in arrays]
 
 
-def _mean(values: Array, count: Array | int | None = None) -> Array:
+def mean(values: Array, count: Array | int | None = None) -> Array:
     """Return the sum of `values` over their number or `count`. That of nothing is 0."""
     count = values.size if count is None else count
     return jnp.sum(values) / jnp.maximum(jnp.asarray(count, values.dtype), 1)
@@ -75,10 +75,10 @@ def reconstruction_loss(
     frames = pred.shape[2] - next_frame
     counts = hidden[..., None] | (jnp.arange(pred.shape[2]) >= frames)[None, None]  # (B, N, T)
     error = jnp.mean(jnp.where(counts[..., None], pred - target, 0.0) ** 2, axis=-1)
-    loss = _mean(jnp.mean(error[..., :frames], axis=-1), jnp.sum(hidden))
+    loss = mean(jnp.mean(error[..., :frames], axis=-1), jnp.sum(hidden))
     metrics = {"reconstruction": loss}
     if next_frame:
-        metrics["next_frame"] = _mean(error[..., -1])
+        metrics["next_frame"] = mean(error[..., -1])
         loss = loss + metrics["next_frame"]
     return loss, metrics
 
@@ -193,7 +193,7 @@ def contrast_loss(
     back = info_nce(second, first, scale, everyone, groups=groups, place=place)
     place = jnp.arange(len(first)) if place is None else jnp.asarray(place)
     nearest = jnp.argmax(first @ second.T, axis=1) if len(first) else place  # there is no largest of nothing
-    return (forth + back) / 2, _mean((place[nearest] == place).astype(jnp.float32))
+    return (forth + back) / 2, mean((place[nearest] == place).astype(jnp.float32))
 
 
 def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array:
@@ -202,7 +202,7 @@ def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array
     Without pairs it is 0.
     """
     positive, negative = _wide(positive_logit, negative_logit)
-    return _mean(jax.nn.softplus(-positive)) + _mean(jax.nn.softplus(negative))
+    return mean(jax.nn.softplus(-positive)) + mean(jax.nn.softplus(negative))
 
 
 def laplace_loss(error: ArrayLike, log_scale: ArrayLike) -> Array:

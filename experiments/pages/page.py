@@ -122,7 +122,7 @@ def text(page: Page) -> str:
     tables = "\n".join(f"## {without_html(table.title)}\n\n{markdown(table)}\n" for table in page.whole)
     files = ", ".join(f"[`{name}`]({name})" for name in one["data"])
     return (
-        f"# {one['question']}\n\n{one['about'].format(**{name: without_html(word) for name, word in page.words.items()})}\n\n## Findings\n\n{found}\n\n{tables}\n"
+        f"# {one['question']}\n\n{without_html(one['about'].format(**page.words))}\n\n## Findings\n\n{found}\n\n{tables}\n"
         f"![{one.get('caption', CAPTION)}](figures/{page.name}.png)\n\nData: {files}. Command: `{one['command']}`.\n"
     )
 

@@ -117,12 +117,12 @@ def answer(page: Page) -> tuple[str, str]:
 
 def text(page: Page) -> str:
     """Return a page as Markdown."""
-    one = page.record
+    one, about = page.record, without_html(page.record["about"].format(**page.words))
     found = "\n".join(f"* {without_html(sentence)}" for sentence in sentences(page))
     tables = "\n".join(f"## {without_html(table.title)}\n\n{markdown(table)}\n" for table in page.whole)
     files = ", ".join(f"[`{name}`]({name})" for name in one["data"])
     return (
-        f"# {one['question']}\n\n{without_html(one['about'].format(**page.words))}\n\n## Findings\n\n{found}\n\n{tables}\n"
+        f"# {one['question']}\n\n{about}\n\n## Findings\n\n{found}\n\n{tables}\n"
         f"![{one.get('caption', CAPTION)}](figures/{page.name}.png)\n\nData: {files}. Command: `{one['command']}`.\n"
     )
 

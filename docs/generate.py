@@ -80,7 +80,8 @@ def tutorial(notebook: Path, folder: Path) -> str:
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
         for place, output in enumerate(cell.get("outputs", ())):
             if printed := "".join(output.get("text", ())).strip():
-                parts.append(f"```text\n{printed}\n```")
+                fence = max(["``", *re.findall("`+", printed)], key=len) + "`"  # printed text does not end it
+                parts.append(f"{fence}text\n{printed}\n{fence}")
             if picture := output.get("data", {}).get("image/png"):
                 name = f"{notebook.stem}-{number}-{place}.png"
                 (folder / name).write_bytes(base64.b64decode("".join(picture)))

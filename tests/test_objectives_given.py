@@ -11,7 +11,7 @@ import pytest
 from tiny_models import compiled, tiny_config
 
 from anytouch_jax import objectives
-from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.batch import AlignBatch, FieldBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.step import init_state, make_step
 
@@ -63,7 +63,7 @@ def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeyp
         np.testing.assert_allclose(result, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5)
 
 
-def test_objectives_take_lists():
+def test_objectives_take_lists_under_strict_types():
     def lists(x):
         return type(x)(*map(lists, x)) if hasattr(x, "_fields") else x if x is None else np.asarray(x).tolist()
 
@@ -79,9 +79,29 @@ def test_objectives_take_lists():
         net = build(config.model)
         for given, progress in ((batch, jnp.float32(0.5)), (lists(batch), 0.5)):
             run = partial(loss, batch=given, key=jax.random.key(0), progress=progress, net=net, config=config)
-            value, metrics = jax.eval_shape(run, net.abstract())
+            with jax.numpy_dtype_promotion("strict"):
+                (value, metrics), _ = jax.eval_shape(jax.value_and_grad(run, has_aux=True), net.abstract())
             assert value.shape == () and value.dtype == jnp.float32 and metrics
             assert objectives.trained_by(given, config=config) == objectives.trained_by(batch, config=config)
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_an_empty_batch_has_a_loss_of_0(stage):
+    fields = FieldBatch(
+        pixels(0, 1),
+        SENSOR[:0],
+        *(np.zeros((0, *one), "f4") for one in ((), (14, 14), (14, 14, 2), (14, 14), (3,), (), ())),
+    )
+    text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), SENSOR[:0]
+    align = AlignBatch(pixels(0, 3), SENSOR[:0], pixels(0), SENSOR[:0], *text)
+    match = MatchBatch(*(pixels(0, 1), SENSOR[:0]) * 3)
+    batch = TouchBatch(pixels(0, 4), SENSOR[:0], fields) if stage == 1 else Stage2Batch(align, match)
+    config = tiny_config(stage, **({"fields": 8} if stage == 1 else {}))
+    config = replace(config, model=replace(config.model, attention="mapped"))
+    net, loss = build(config.model), (objectives.stage1_loss, objectives.stage2_loss)[stage - 1]
+    run = lambda p: loss(p, batch, jax.random.key(0), 0.5, net=net, config=config)[0]  # noqa: E731
+    value, slopes = jax.jit(jax.value_and_grad(run))(net.init(jax.random.key(0)))
+    assert float(value) == 0 and all(np.isfinite(one).all() for one in jax.tree.leaves(slopes))
 
 
 # Stage 2 ------------------------------------------------------------------------------------------------------------

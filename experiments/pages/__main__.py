@@ -52,7 +52,8 @@ def pages(folder: Path) -> list[Page]:
 def index(several: list[Page]) -> str:
     """Return the front page: a row a page."""
     rows = [(one.record["question"], *page.answer(one), f"[{one.name}]({one.name}.md)") for one in several]
-    table = page.markdown(Table("", ("question", "answer", "figure", "page"), rows)).replace("]\\(", "](")
+    table = page.markdown(Table("", ("question", "answer", "figure", "page"), rows))
+    table = re.sub(r"\[(\w+)]\\\(\1\.md\)", r"[\1](\1.md)", table)
     return (
         "# Results\n\nEach page answers one question. It is made from its data alone, by `make results`. An interval "
         f"is one of 95 %.\n\n{table}\n\n[What was tried](tried.md) lists studies that have left.\n"

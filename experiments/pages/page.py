@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import markdown_table
+from anytouch_jax.evaluate.statistics import markdown_table, without_html
 from experiments.values import Value
 
 RECORDS = tomllib.loads(Path(__file__).with_name("pages.toml").read_text(encoding="utf-8"))
@@ -117,12 +117,12 @@ def answer(page: Page) -> tuple[str, str]:
 
 def text(page: Page) -> str:
     """Return a page as Markdown."""
-    one = page.record
-    found = "\n".join(f"* {sentence}" for sentence in sentences(page))
-    tables = "\n".join(f"## {table.title}\n\n{markdown(table)}\n" for table in page.whole)
+    one, about = page.record, without_html(page.record["about"].format(**page.words))
+    found = "\n".join(f"* {without_html(sentence)}" for sentence in sentences(page))
+    tables = "\n".join(f"## {without_html(table.title)}\n\n{markdown(table)}\n" for table in page.whole)
     files = ", ".join(f"[`{name}`]({name})" for name in one["data"])
     return (
-        f"# {one['question']}\n\n{one['about'].format(**page.words)}\n\n## Findings\n\n{found}\n\n{tables}\n"
+        f"# {one['question']}\n\n{about}\n\n## Findings\n\n{found}\n\n{tables}\n"
         f"![{one.get('caption', CAPTION)}](figures/{page.name}.png)\n\nData: {files}. Command: `{one['command']}`.\n"
     )
 

@@ -1,5 +1,8 @@
 """Errors that a user can mend."""
 
+import os
+import sys
+
 _LETTERS = 500  # of a message
 
 
@@ -34,3 +37,29 @@ class ConfigError(UserError):
 
 class CheckError(UserError):
     """A check that failed, such as an export that differs from its model. The command line exits with 1."""
+
+
+_inherited = False  # whether this process was forked from one whose jax was running
+
+
+def _look() -> None:
+    """After a fork: what jax is asked for would hang, so it raises. A change of settings makes it look."""
+    global _inherited
+    bridge = sys.modules.get("jax._src.xla_bridge")  # jax has no public question for it
+    if _inherited or getattr(bridge, "backends_are_initialized", lambda: bridge is not None)():
+        _inherited = True
+        for setting in ("jax_no_execution", "jax_no_tracing"):
+            sys.modules["jax"].config.update(setting, True)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_look)
+
+
+def refuse_forked() -> None:
+    """Raise UserError in a process that was forked after its parent had used jax."""
+    if _inherited:
+        raise UserError(
+            "This process was forked from one that has used jax, so it cannot compute. Start workers with "
+            'multiprocessing.get_context("spawn"), or load the encoder in the workers alone.'
+        )

@@ -130,30 +130,30 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
     batch = _arrays(batch)
     out = net.measure(params, batch.clip, batch.sensor, batch.aspect)
     touched = (batch.pressure > TOUCHED).astype(jnp.float32)
-    share = jnp.mean(touched)
+    share = losses.mean(touched)
     weight = 0.5 * touched / jnp.maximum(share, 1e-2) + 0.5 * (1 - touched) / jnp.maximum(1 - share, 1e-2)
 
     def over_pixels(values: Array) -> Array:
-        return jnp.mean(weight * values)
+        return losses.mean(weight * values)
 
     depth = (out.depth - batch.depth) / LENGTH
     shear = (out.shear - batch.shear) / LENGTH
-    slopes = jnp.mean(jnp.abs(jnp.diff(depth, axis=1))) + jnp.mean(jnp.abs(jnp.diff(depth, axis=2)))
+    slopes = losses.mean(jnp.abs(jnp.diff(depth, axis=1))) + losses.mean(jnp.abs(jnp.diff(depth, axis=2)))
     pressure = jnp.abs(out.pressure - batch.pressure) / STRESS
     ratio = jnp.log((out.force[:, 2] + LEAST_FORCE) / (batch.force[:, 2] + LEAST_FORCE))
     sideways = (out.force[:, :2] - batch.force[:, :2]) / FORCE
     pressed = (jnp.max(touched, (1, 2)) > 0).astype(jnp.float32)
-    slip = pressed * (jax.nn.sigmoid(out.slip) - batch.slip)
+    slip = jnp.where(pressed > 0, jax.nn.sigmoid(out.slip) - batch.slip, 0.0)  # none without contact
     terms = {
         "depth": over_pixels(losses.laplace_loss(depth, out.depth_log)),
         "slopes": slopes,
         "shear": over_pixels(jnp.mean(losses.laplace_loss(shear, out.shear_log[..., None]), -1)),
         "contact": over_pixels(losses.binary_loss(out.contact, touched)),
         "pressure": over_pixels(pressure),
-        "normal": jnp.mean(losses.laplace_loss(ratio, out.force_log[:, 1])),
-        "tangential": jnp.mean(losses.laplace_loss(sideways, out.force_log[:, :1])),
-        "torque": jnp.mean(losses.laplace_loss((out.torque - batch.torque) / TORQUE, out.torque_log)),
-        "slip": jnp.mean(losses.laplace_loss(slip, out.slip_log)),
+        "normal": losses.mean(losses.laplace_loss(ratio, out.force_log[:, 1])),
+        "tangential": losses.mean(losses.laplace_loss(sideways, out.force_log[:, :1])),
+        "torque": losses.mean(losses.laplace_loss((out.torque - batch.torque) / TORQUE, out.torque_log)),
+        "slip": losses.mean(losses.laplace_loss(slip, out.slip_log)),
     }
     seen = (out.contact > 0).astype(jnp.float32)
     both, either = jnp.sum(seen * touched), jnp.sum(jnp.maximum(seen, touched))
@@ -222,7 +222,7 @@ def touch_embeddings(
         else:
             ids = jnp.stack([keep_ids[i] for i in members], axis=1)
             flat = net.encode_touch(params, *rows, keep_ids=ids.reshape(-1, ids.shape[-1]))
-        each = losses.normalise(flat).reshape(shape[0], len(members), -1)
+        each = losses.normalise(flat).reshape(shape[0], len(members), flat.shape[1])
         for j, i in enumerate(members):
             z[i] = each[:, j]
     return z

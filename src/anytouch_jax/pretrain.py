@@ -23,7 +23,7 @@ from anytouch_jax.data.loading import pools
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.tokenizer import load_tokenizer
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.evaluate import reconstruction
 from anytouch_jax.files import atomic_write
 from anytouch_jax.nn.functional import Net, build
@@ -54,6 +54,7 @@ def pretrain(
     steps on a terminal. `until` is as in `fit`. Raises UserError for a mistake in the settings, the data or the
     folder.
     """
+    refuse_forked()
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
     report, log = log, log if jax.process_index() == 0 else silent  # every process reads other samples
     resumes = bool(steps(run / CHECKPOINTS))

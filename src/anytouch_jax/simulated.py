@@ -23,7 +23,7 @@ from anytouch_jax.data.loading.samples import SampleReader, read_image
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
 from anytouch_jax.data.transforms import UNTOUCHED, touch_evaluation
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.sim import endless, scene
 from anytouch_jax.sim.contact.mechanics import KPA_MM2
 from anytouch_jax.sim.endless import Sampling, SimulatedTouches, World
@@ -155,6 +155,7 @@ class SimulatedLoader:
 
     def touches(self, step: int) -> SimulatedTouches:
         """Return the simulated touches that a step draws from, on the device."""
+        refuse_forked()
         name = (step // self.config.simulated.reuse, self.frames(step))
         pool = self._pool
         if pool is None or pool[0] != name:

@@ -363,6 +363,8 @@ _TIMES = [1731000000.0 + i / 30 for i in range(20)]
         [f"{('free', 'contact')[i % 3 == 0]}_{i}.png" for i in range(12)],
         [f"{i * 7919 % 1013}_{i}.png" for i in range(12)],  # a value, then a counter
         [f"{i * 7919 % 4096:x}x_{i:03d}.png" for i in range(12)],  # a hash, then a counter
+        [f"gel_{time}.png".replace(".", ",", 1) for time in _TIMES],
+        [f"24-1-5_{10 + (i > 7)}-{59 * (i < 8):02d}-{(52 + i) % 60:02d}.png" for i in range(16)],  # seconds begin again
         [f"1.{i}.png" for i in range(1, 13)],  # frame 10 of touch 1
         [f"2024.5.{i}.png" for i in range(1, 13)], [f"take{i // 3}_frame{i % 3}.png" for i in range(12)],
     ],

@@ -6,13 +6,15 @@ import multiprocessing
 import pickle
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_models import full_model
+from tiny_models import full_model, tiny_config
 
 from anytouch_jax.config import Config
 from anytouch_jax.encoder import base
@@ -20,7 +22,14 @@ from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.encoder.export import export, load
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead, fit_head
+from anytouch_jax.evaluate.reconstruction import reconstruction_panels
 from anytouch_jax.nn.functional import build
+from anytouch_jax.pretrain import pretrain
+from anytouch_jax.sim.touch import simulate_touch
+from anytouch_jax.train.loop import fit
+from anytouch_jax.train.optim import optimizer
+from anytouch_jax.train.step import init_state, make_step
 
 RNG = np.random.default_rng(0)
 FRAMES = RNG.integers(0, 256, (70, 1, 28, 28, 3), np.uint8)
@@ -52,6 +61,25 @@ def workers(tmp_path_factory):
     }
 
 
+def programs():
+    """What else computes, by name."""
+    config = tiny_config(1)
+    params = build(config.model).init(jax.random.key(0))
+    x, y = RNG.standard_normal((20, 4)).astype("f4"), np.arange(20) % 3
+    state, tx, key, jitted = init_state(params, config), optimizer(config), jax.random.key(0), jax.jit(lambda x: x + 1)
+    step = make_step(lambda *_: (jnp.zeros(()), {}), tx, total_steps=2)
+    return {
+        "head by gradients": lambda: fit_head(ProbeHead("gradient", (1,), recipe=GradientRecipe(1)), x, y, 3),
+        "first state": lambda: init_state(params, config),
+        "step": lambda: step(state, (), key),
+        "fit": lambda: fit(config, params=params, loss_fn=None, batches=None, run_dir="."),
+        "pretrain": lambda: pretrain(config, "."),
+        "simulated touch": lambda: simulate_touch(np.zeros((9, 9)), np.zeros(4)),
+        "panels": lambda: reconstruction_panels(params, None, None, net=build(config.model), config=config),
+        "your own program": lambda: jitted(np.ones(3)),
+    }
+
+
 NAMES = ("encoder", "towers", "match", "family", "preprocess", "preprocess of a family", "preprocess of an engine",
          "exported", "engine")  # fmt: skip
 
@@ -68,17 +96,20 @@ def test_pickle_holds_the_same_before_and_after_the_first_call(workers, name):
 
 
 def test_a_forked_process_computes_or_says_why_it_cannot(workers):
+    calls = {name: partial(use, one) for name, (one, use) in workers.items()}
+    for call in calls.values():
+        call()  # jax runs in this process
+    calls |= programs()
+
     def answers(pipe) -> None:
-        for one, use in workers.values():
+        for call in calls.values():
             begin = time.monotonic()
             try:
-                answer = str(use(one).shape)
-            except UserError as error:
+                answer = str(call().shape)
+            except (UserError, RuntimeError) as error:
                 answer = str(error)
             pipe.send((answer, time.monotonic() - begin))
 
-    for one, use in workers.values():
-        use(one)  # jax runs in this process
     fork = multiprocessing.get_context("fork")
     ours, theirs = fork.Pipe()
     with warnings.catch_warnings():
@@ -86,13 +117,15 @@ def test_a_forked_process_computes_or_says_why_it_cannot(workers):
         child = fork.Process(target=answers, args=(theirs,))
         child.start()
     try:
-        for name in workers:
+        for name in calls:
             assert ours.poll(30), f"{name} hangs"
             answer, seconds = ours.recv()
             if name == "engine" or "preprocess" in name:
                 assert answer.startswith("("), name
+            elif name == "your own program":
+                assert "tracing" in answer and seconds < 1  # jax's word: it does not hang
             else:
-                assert "forked" in answer and "spawn" in answer and seconds < 1, name
+                assert "forked" in answer and "spawn" in answer and seconds < 1, (name, answer)
     finally:
         child.kill()
         child.join()

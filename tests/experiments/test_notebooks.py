@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import nbformat
 import pytest
+from markdown_it import MarkdownIt
 
+import anytouch_jax as at
 from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
+from docs.generate import tutorial
 from experiments.notebooks.execute import notebooks
 
 FILES = notebooks([])
@@ -17,10 +20,23 @@ def test_a_committed_notebook_has_its_outputs(file):
     cells = nbformat.read(file, as_version=4).cells
     outputs = [out for one in cells if one.cell_type == "code" for out in one.outputs]
     assert any("image/png" in out.get("data", {}) for out in outputs), "make notebooks"
+    assert {kind for out in outputs for kind in out.get("data", {})} <= {"image/png", "text/plain"}  # no HTML
     assert not any(out.output_type == "error" or out.get("name") == "stderr" for out in outputs)
     assert file.stat().st_size < 1e6
     assert cells[0].source.startswith("# ") and cells[0].source.splitlines()[0].endswith("?")
     assert cells[-2].source == "## Finding" and cells[-1].outputs[0].text.strip()
+
+
+@pytest.mark.parametrize("name", ["<img src=x onerror=alert(1)>", "```\n<img src=x onerror=alert(1)>\n```"])
+def test_what_a_notebook_shows_of_a_name_is_text(name, tmp_path):
+    html = nbformat.v4.new_output("display_data", {"text/html": name})
+    printed = nbformat.v4.new_output("stream", text=name)
+    cell = nbformat.v4.new_code_cell("print(name)", outputs=[printed, html])
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "mine.ipynb")
+    page = MarkdownIt("commonmark", {"html": True}).render(tutorial(tmp_path / "mine.ipynb", tmp_path))
+    assert "&lt;img src=x" in page and "<img" not in page
+    for one in (at.Manifest, at.Encoder, at.Preprocess, at.FamilyEncoder, at.Config):  # a notebook shows their `repr`
+        assert not {"_repr_html_", "_repr_markdown_", "_repr_svg_", "_repr_javascript_"} & {*dir(one)}
 
 
 def test_there_are_seven():

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import synthetic
+from markdown_it import MarkdownIt
 from PIL import Image
 from places import EXPERIMENTS
 
@@ -49,6 +50,18 @@ def test_every_page_has_one_figure_and_every_file_of_data_a_page(committed):
     assert figures == {one.name for one in committed}
     data = {file.name for file in RESULTS.iterdir() if file.suffix in (".json", ".jsonl")}
     assert data == {name for one in committed for name in one.record["data"]}
+
+
+@pytest.mark.parametrize("name", ["<img src=x onerror=alert(1)>", "[x](javascript:alert(1))", "x { onclick=alert(1) }"])
+def test_a_name_of_the_data_is_text_on_a_page(name):
+    value = Value(2.0, 1.0, 3.0)
+    findings = [Finding(name, name, value, name), f"{name} is best."]
+    table = page.Table(name, (name, page.Measure("score")), [(name, value)])
+    made = Page("backgrounds", [table], findings, answer=(name, "2"), words={"encoder": name})
+    trusting = MarkdownIt("commonmark", {"html": True}).enable("table")  # as pages of the documentation are made
+    for text in (page.text(made), results.index([made])):
+        shown = trusting.render(text)
+        assert "<img src=x" not in shown and 'href="javascript' not in shown and "{" not in text and "alert(1)" in shown
 
 
 def test_a_study_starts_only_as_a_script():

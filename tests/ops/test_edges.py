@@ -6,11 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny_models import full_model
 
 from anytouch_jax import objectives
+from anytouch_jax.nn.functional import build
 from anytouch_jax.ops import losses, tokens
 
-RNG = np.random.default_rng(0)
+RNG, NET = np.random.default_rng(0), build(full_model())
 Z, OTHER = RNG.standard_normal((2, 6, 4)).astype("f4")
 PRESENT = np.array([1, 0, 1, 1, 0, 1], bool)
 PRED, TARGET = RNG.standard_normal((2, 6, 5, 4, 3)).astype("f4")
@@ -32,6 +34,8 @@ CALLS = {
         Z, OTHER, Z[::-1], PRESENT, ~PRESENT,
     ),
     "contrast_loss": (lambda a, b, at: losses.contrast_loss(a, b, 14.0, place=at), Z, OTHER, np.arange(6) // 2),
+    "laplace_loss": (lambda x, y: losses.laplace_loss(x, y).sum(), Z, OTHER),
+    "binary_loss": (lambda x, y: losses.binary_loss(x, y).sum(), Z, NOISE[:, :4]),
     "matching_loss": (losses.matching_loss, Z[:, 0], OTHER[:, 0]),
     "patchify": (lambda x: tokens.patchify(x, 4), CLIP),
     "unpatchify": (lambda x: tokens.unpatchify(x, 4, 8), RNG.standard_normal((6, 2, 2, 48)).astype("f4")),
@@ -66,6 +70,19 @@ def test_a_mask_is_what_is_not_zero(name, factor):
     call, *arrays = CALLS[name]
     masks = [x * factor if x.dtype == bool else x for x in arrays]
     jax.tree.map(np.testing.assert_array_equal, call(*masks), call(*arrays))
+
+
+@pytest.mark.parametrize("log", [90.0, 88.0, 20.0])
+def test_an_absurd_temperature_gives_no_nan_and_can_fall_again(log):
+    def loss(log, a):
+        return losses.info_nce(a, OTHER, NET.scale({"logit_scale": log}), PRESENT)
+
+    value, (slope, rows) = jax.value_and_grad(loss, (0, 1))(np.float32(log), Z)
+    np.testing.assert_allclose(value, losses.info_nce(Z, OTHER, 100.0, PRESENT), rtol=1e-4)
+    assert np.isfinite(slope) and slope and np.isfinite(rows).all()
+    for scale in (np.float32(1e38), np.inf):
+        value, rows = jax.value_and_grad(losses.info_nce)(Z, OTHER, scale, PRESENT)
+        assert np.isfinite(value) and np.isfinite(rows).all()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e38])

@@ -32,14 +32,20 @@ def frame_order(names: Sequence[str]) -> tuple[list[str], bool]:
         forms = Counter("0".join(one[::2]) for one in parts)
         values = [tuple(map(_value, one[1::2])) for one in parts]
         widths = set(map(len, values))
-        columns = list(zip(*(one[len(one) - min(widths) :] for one in values), strict=True))  # counters stand behind
+        texts = list(zip(*(one[1::2][len(one) // 2 - min(widths) :] for one in parts), strict=True))
+        columns = [tuple(map(_value, column)) for column in texts]  # counters stand behind
         keys: list[Any] = list(map(_natural, parts))
         if is_shown := len(widths) == 1 and len(set(values)) == len(values) and not _is_random(forms):
             keys = list(values)
         order = sorted(range(len(series)), key=lambda i: (keys[i], series[i]))
-        for column in (column for column in reversed(columns) if _counts_all(column)):
+        for at, column in reversed([(at, column) for at, column in enumerate(columns) if _counts_all(column)]):
+            counted = sorted(order, key=lambda i: column[i])
+            is_clock = at > 0 and all(len(one) == 2 and one < "60" for two in texts[at - 1 : at + 1] for one in two)
+            blocks = len(list(itertools.groupby(columns[at - 1][i] for i in counted)))
+            if is_clock and 4 * blocks < len(series):
+                break  # its seconds begin again
             if _is_random(forms) or not _is_rising([column[i] for i in order]):
-                is_shown, order = True, sorted(order, key=lambda i: column[i])
+                is_shown, order = True, counted
             break
         ordered += [series[i] for i in order]
         is_clear &= is_shown or len(series) == 1
@@ -166,9 +172,9 @@ def _counters(alike: list[list[str]]) -> list[int]:
 def _number_parts(names: Sequence[str]) -> list[list[str]]:
     """Return the words and numbers of each name in turn, without its ending. The words are at even places.
 
-    1.5 is one number. In names that have 1.1 and 1.10 the point separates two.
+    1.5 and 1,5 are one number. In names that have 1.1 and 1.10 the point separates two.
     """
-    stems = [Path(name).stem for name in names]
+    stems = [re.sub(r"(?<=\d),(?=\d)", ".", Path(name).stem) for name in names]
     fractions = [number.partition(".")[2] for stem in stems for number in _DECIMAL.findall(stem)]
     is_dotted = len(set(map(len, fractions))) > 1 and any(len(one) > 1 and one[-1] == "0" for one in fractions)
     pattern = re.compile(r"(\d+)") if is_dotted else _DECIMAL

@@ -35,8 +35,7 @@ from anytouch_jax.encoder.arrays import (
     warn,
 )
 from anytouch_jax.encoder.fields import Fields, Measure, missing, output_of, scale_of
-from anytouch_jax.encoder.forks import refuse_forked
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_image, normalise_touch

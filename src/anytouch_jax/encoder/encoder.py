@@ -26,8 +26,7 @@ from anytouch_jax.encoder.base import Encoder, as_clips, check_frames, random_en
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.encoder.fields import missing
-from anytouch_jax.encoder.forks import refuse_forked
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.files import read_arrays
 from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import shown_short

@@ -35,8 +35,7 @@ from anytouch_jax.encoder.arrays import (
     unit_rows,
 )
 from anytouch_jax.encoder.engines import Engine
-from anytouch_jax.encoder.forks import refuse_forked
-from anytouch_jax.errors import CheckError, UserError
+from anytouch_jax.errors import CheckError, UserError, refuse_forked
 from anytouch_jax.files import atomic_write
 from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import described

@@ -21,7 +21,7 @@ from anytouch_jax.bars import tracked
 from anytouch_jax.encoder.arrays import binary_scale, unit_rows
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.search import nearest
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.shown import shown_short
 
@@ -194,6 +194,7 @@ def _fit_gradient(
     x: Array, y: Array, classes: int, options: Sequence[float], recipe: GradientRecipe, seed: int
 ) -> Predict:
     """Fit the authors' layer; numbers are fitted in standard deviations. An option is an epoch, counted from 1."""
+    refuse_forked()
     rng = np.random.default_rng(seed)
     x, (n, d), columns = np.asarray(x, np.float32), x.shape, classes if classes > 2 else 1
     middle, spread = (0.0, 1.0) if classes else (float(y.mean()), float(y.std()) or 1.0)

@@ -14,6 +14,7 @@ from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import UNTOUCHED
+from anytouch_jax.errors import refuse_forked
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import losses, tokens
 
@@ -33,6 +34,7 @@ def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net,
     """
     if config.objective.norm_pix_loss or not len(ends):
         raise ValueError("pixels are scored on at least one clip, and not with norm_pix_loss")
+    refuse_forked()
     sums, count = dict[str, float](), 0
     frames = config.model.frames + config.objective.next_frame
     for ids, batch in evaluation(manifest, ends, config, "clip", frames=frames, unknown="universal"):
@@ -81,6 +83,7 @@ def reconstruction_panels(
     `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). Visible patches are copied from the input. With `norm_pix_loss` the
     prediction is scaled back by the true mean and spread of each patch.
     """
+    refuse_forked()
     patch, size, frames = net.model.patch, net.model.image_size, net.model.frames
     noise = jax.random.uniform(jax.random.key(seed), (len(sensor), net.model.patches), jnp.float32)
     pixels, hidden = _predict(params, clip, sensor, noise, net=net, config=config)

@@ -144,16 +144,16 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]], align: 
     """
     marks = {"l": ":---", "r": "---:"}
     rule = [marks[letter] for letter in align] if align else ["---"] * len(header)
-    lines = [[_without_html(cell).replace("|", "\\|") for cell in line] for line in (header, rule, *rows)]
+    lines = [[without_html(cell).replace("|", "\\|") for cell in line] for line in (header, rule, *rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _without_html(value: Any) -> str:
-    """Return one line of Markdown without HTML and links, whatever the value says."""
+def without_html(value: Any) -> str:
+    """Return one line of Markdown without HTML, links and attributes of elements, whatever the value says."""
     text = re.sub(r"&(?=#?\w+;)", "&amp;", " ".join(str(value).split()))
-    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(")
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(").replace("{", "&#123;")
 
 
 def as_text(value: Any) -> str:
     """Return one line of Markdown that a reader sees as the value is written: for names and captions of a user."""
-    return re.sub(r"[\\`*\[\]~]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", _without_html(value).replace("]\\(", "]("))
+    return re.sub(r"[\\`*\[\]~]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", without_html(value).replace("]\\(", "]("))

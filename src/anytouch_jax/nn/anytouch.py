@@ -71,9 +71,13 @@ class AnyTouch(nnx.Module):
             return features(clip, sensor)
         parts = tokens.segments(clip, self.frames)
         b, s = parts.shape[:2]
-        joins = {"mean": lambda z: z.mean(1), "sum": lambda z: z.sum(1), "concat": lambda z: z.reshape(b, -1)}
+        joins = {
+            "mean": lambda z: z.mean(1),
+            "sum": lambda z: z.sum(1),
+            "concat": lambda z: z.reshape(b, s * z.shape[2]),
+        }
         values = features(parts.reshape(b * s, *parts.shape[2:]), jnp.repeat(sensor, s))
-        return jax.tree.map(lambda z: joins[join](z.reshape(b, s, -1)), values)
+        return jax.tree.map(lambda z: joins[join](z.reshape(b, s, z.shape[-1])), values)
 
     def encode_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the projected sequence (B, 1 + S + K, E) of [class, sensor tokens, patches]: the decoder's input."""

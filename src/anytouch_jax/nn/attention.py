@@ -26,7 +26,7 @@ def attention(
     free = mask is None and not causal and q.shape == k.shape
     if implementation == "auto":
         implementation = "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
-    if implementation == "mapped" and free:
+    if implementation == "mapped" and free and q.size:
         return mapped(q, k, v)
     keys = None if mask is None else mask[:, None, None, :]
     fit = mask is None and q.shape[1] % 2 == 0 and q.dtype in (jnp.bfloat16, jnp.float16)

@@ -60,7 +60,7 @@ class FieldDecoder(nnx.Module):
         pixels = jnp.concatenate([clip[:, -1], clip[:, -1] - clip[:, 0]], -1)
         sharp = self.stem(pixels)
         x = self.down(sharp)
-        coarse = tokens.reshape(batch, self.grid, self.grid, -1)
+        coarse = tokens.reshape(batch, self.grid, self.grid, tokens.shape[-1])
         coarse = jax.image.resize(coarse, (*x.shape[:3], coarse.shape[-1]), "linear")
         x = self.middle1(jnp.concatenate([coarse, x], -1))
         x = x + self.middle2(x)

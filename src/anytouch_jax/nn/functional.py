@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.nn.fields import FieldOutput
-from anytouch_jax.ops import tokens
+from anytouch_jax.ops import losses, tokens
 from anytouch_jax.shown import shown_short
 
 Params = dict[str, Any]
@@ -104,8 +105,9 @@ class Net:
         return self.bind(params).match(z_first, z_second)
 
     def scale(self, params: Params) -> Array:
-        """Return 1 / tau f32 (), the learned factor on cosine similarities (Eq. 3)."""
-        return jnp.exp(self.bind(params).logit_scale[...])
+        """Return 1 / tau f32 (), the learned factor on cosine similarities (Eq. 3): 100 at most."""
+        log = self.bind(params).logit_scale[...]
+        return jnp.exp(log + jax.lax.stop_gradient(jnp.minimum(log, math.log(losses.MOST_SCALE)) - log))
 
 
 def build(model: ModelConfig) -> Net:

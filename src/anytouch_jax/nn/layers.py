@@ -177,7 +177,7 @@ class Attention(nnx.Module):
     def project(self, asks: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return q (B, Q, H, D / H) and k, v (B, S, H, D / H)."""
         parts = (self.query(asks), self.key(x), self.value(x))
-        q, k, v = (part.reshape(*part.shape[:2], self.heads, -1) for part in parts)
+        q, k, v = (part.reshape(*part.shape[:2], self.heads, part.shape[2] // self.heads) for part in parts)
         return q, k, v
 
     def attend(self, q: Array, k: Array, v: Array, *, causal: bool, mask: Array | None) -> Array:

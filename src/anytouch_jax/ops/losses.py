@@ -13,6 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 Metrics = dict[str, Array]
+MOST_SCALE = 100.0  # 1 / tau, as CLIP (Radford et al., 2021, Sec. 2.5)
 
 
 def _wide(*values: ArrayLike) -> list[Array]:
@@ -23,7 +24,7 @@ def _wide(*values: ArrayLike) -> list[Array]:
     return [x.astype(jnp.float64 if is_double else jnp.float32) for x in arrays]
 
 
-def _mean(values: Array, count: Array | int | None = None) -> Array:
+def mean(values: Array, count: Array | int | None = None) -> Array:
     """Return the sum of `values` over their number or `count`. That of nothing is 0."""
     count = values.size if count is None else count
     return jnp.sum(values) / jnp.maximum(jnp.asarray(count, values.dtype), 1)
@@ -74,10 +75,10 @@ def reconstruction_loss(
     frames = pred.shape[2] - next_frame
     counts = hidden[..., None] | (jnp.arange(pred.shape[2]) >= frames)[None, None]  # (B, N, T)
     error = jnp.mean(jnp.where(counts[..., None], pred - target, 0.0) ** 2, axis=-1)
-    loss = _mean(jnp.mean(error[..., :frames], axis=-1), jnp.sum(hidden))
+    loss = mean(jnp.mean(error[..., :frames], axis=-1), jnp.sum(hidden))
     metrics = {"reconstruction": loss}
     if next_frame:
-        metrics["next_frame"] = _mean(error[..., -1])
+        metrics["next_frame"] = mean(error[..., -1])
         loss = loss + metrics["next_frame"]
     return loss, metrics
 
@@ -87,10 +88,11 @@ def info_nce(
 ) -> Array:
     """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
-    `scale` is 1 / tau. A row is present where `present` is not 0. Absent rows are neither anchors nor negatives and may
-    hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that many shares, as by the devices
-    of the release. Negatives come from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,) are
-    no negatives of each other. Raises ValueError for shapes that do not fit, and for groups of unequal size.
+    `scale` is 1 / tau, and counts as 100 beyond 100. A row is present where `present` is not 0. Absent rows are neither
+    anchors nor negatives and may hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that
+    many shares, as by the devices of the release. Negatives come from a row's share, and the mean is over all shares.
+    Rows of one `place` i32 (B,) are no negatives of each other. Raises ValueError for shapes that do not fit, and for
+    groups of unequal size.
     """
     (a, b, scale), present = _wide(a, b, scale), jnp.asarray(present, bool)
     _equal_shapes(a=a, b=b)
@@ -99,6 +101,8 @@ def info_nce(
     rows, width = a.shape
     if groups < 1 or rows % groups:
         raise ValueError(f"{rows} rows cannot be cut into {groups} groups of equal size")
+    scale = jnp.minimum(scale, jnp.finfo(scale.dtype).max)
+    scale = scale * jax.lax.stop_gradient(jnp.where(scale > MOST_SCALE, MOST_SCALE / scale, 1.0))  # it can fall again
     present = present.reshape(groups, rows // groups)
     a, b = (jnp.where(present[..., None], x.reshape(*present.shape, width), 0.0) for x in (a, b))
     # The factor is up to 100: the reduced precision that accelerators use by default would show in the loss.
@@ -189,7 +193,7 @@ def contrast_loss(
     back = info_nce(second, first, scale, everyone, groups=groups, place=place)
     place = jnp.arange(len(first)) if place is None else jnp.asarray(place)
     nearest = jnp.argmax(first @ second.T, axis=1) if len(first) else place  # there is no largest of nothing
-    return (forth + back) / 2, _mean((place[nearest] == place).astype(jnp.float32))
+    return (forth + back) / 2, mean((place[nearest] == place).astype(jnp.float32))
 
 
 def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array:
@@ -198,7 +202,7 @@ def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array
     Without pairs it is 0.
     """
     positive, negative = _wide(positive_logit, negative_logit)
-    return _mean(jax.nn.softplus(-positive)) + _mean(jax.nn.softplus(negative))
+    return mean(jax.nn.softplus(-positive)) + mean(jax.nn.softplus(negative))
 
 
 def laplace_loss(error: ArrayLike, log_scale: ArrayLike) -> Array:

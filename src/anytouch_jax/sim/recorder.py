@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from anytouch_jax.errors import refuse_forked
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
@@ -225,6 +226,7 @@ class Recorder:
 
     def record(self, recordings: Sequence[Recording]) -> list[ClipOutput]:
         """Return the clips of at most `batch` recordings of one sensor, as numpy. Raises ValueError for more."""
+        refuse_forked()
         count = len(recordings)
         if not 0 < count <= self._batch or len({r.sensor for r in recordings}) > 1:
             raise ValueError(f"record takes 1 to {self._batch} recordings of one sensor")

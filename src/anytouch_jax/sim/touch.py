@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.sim.contact.mechanics import Fidelity
 from anytouch_jax.sim.recorder import SPACING, ClipInput, simulate_clip
 from anytouch_jax.sim.sensing.sensors import SENSORS, Unit, identity_unit
@@ -48,6 +48,7 @@ def simulate_touch(
     if sensor not in SENSORS or SENSORS[sensor].kind != "image":
         cameras = ", ".join(name for name, one in SENSORS.items() if one.kind == "image")
         raise UserError(f"there is no simulated camera sensor {sensor!r}; choose among {cameras}")
+    refuse_forked()
     kind = SENSORS[sensor]
     pose, relief = jnp.atleast_2d(jnp.asarray(pose, jnp.float32)), jnp.asarray(height_map, jnp.float32)
     if relief.ndim != 2 or pose.shape[1] != 4:

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from anytouch_jax.config import Config, to_json
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.shown import shown_short
 from anytouch_jax.train.distributed import Ballot, broadcast, check_shared, gather
 from anytouch_jax.train.mesh import (
@@ -93,6 +93,7 @@ def fit(
     gets the signal, all stop a step later. Raises UserError for settings that changed since the start, too many skipped
     steps in a row, a full disk, an unreadable checkpoint, and a folder that some process cannot see.
     """
+    refuse_forked()
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
     log, lead = log or to_stderr, jax.process_index() == 0
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)

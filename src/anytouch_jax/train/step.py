@@ -11,7 +11,7 @@ import optax
 
 from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import Config
-from anytouch_jax.errors import ConfigError
+from anytouch_jax.errors import ConfigError, refuse_forked
 from anytouch_jax.shown import shown_short
 from anytouch_jax.train.optim import global_norm, match_rules, optimizer, packing
 from anytouch_jax.weights.tree import flatten, nest
@@ -60,6 +60,7 @@ def merge(trainable: Tree, frozen: Tree) -> Tree:
 
 def init_state(params: Tree, config: Config) -> TrainState:
     """Return the state before the first step: parameters split by `config.frozen`, moments zero."""
+    refuse_forked()
     trainable, frozen = split(params, config.frozen)
     return TrainState(jnp.zeros((), jnp.int32), trainable, frozen, optimizer(config).init(trainable))
 
@@ -90,6 +91,7 @@ def make_step(
     def step(
         state: TrainState, batch: Any, seed_key: Array, progress: Array | None = None
     ) -> tuple[TrainState, dict[str, Array]]:
+        refuse_forked()
         key = jax.random.fold_in(seed_key, state.step)
         at = state.step if progress is None else progress * total_steps
         if progress is None:

@@ -1,9 +1,11 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pytest
 from checked_world import finding_rows, image_pairs, patterned, plain_rows, with_patterns
 
@@ -260,6 +262,16 @@ def test_words_among_numbers_are_named(make):
     report = verify(make([{"sequence": f"s{i}", **{k: v[i] for k, v in columns.items()}} for i in range(4)]))
     (found,) = [one for one in report.findings if one.kind == "words_among_numbers"]
     assert found.rows.tolist() == [2] and found.column == "label.force" and "'N/K'" in found.examples[0] and report.ok
+
+
+def test_values_of_labels_are_counted_and_lists_are_named(make):
+    manifest = make([{"sequence": f"s{i}", "label.force": [None, "2.5"][i % 2]} for i in range(4)])
+    window = pa.array([[1.0], None, [2.0, 3.0], [4.0]])
+    report = verify(replace(manifest, table=manifest.table.append_column("label.window", window)))
+    assert report.labels == {"label.force": 2, "label.window": 3}
+    assert "label.force 2, label.window 3" in report.to_markdown()
+    (found,) = [one for one in report.findings if one.kind == "list_label"]
+    assert found.rows.tolist() == [0, 2, 3] and "label.window" in found.sentence
 
 
 def test_frames_out_of_order_and_frames_twice(make):

@@ -229,6 +229,7 @@ def test_videos_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, m
         ("{split}/{kind}", ("train", "val", "test")), ("{kind}/{split}", ("Training", "valid", "TEST")),
         ("data/{split}/{kind}", ("train_set", "dev", "testing")),
         ("{kind}/{split}/take", ("trn", "Validation", "eval")),
+        ("{split}/{kind}", ("train2017", "val2017", "test_unseen")),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("count", [1, 4])

@@ -53,7 +53,7 @@ _CERTAIN = 0.95  # share of the rows that must resemble the background images to
 @shown_short
 @dataclass(frozen=True)
 class VerifyReport:
-    """The result of `verify`. `shares` holds, for each dataset and column, the share of rows that have a value."""
+    """The result of `verify`. `shares` has, by dataset and column, the share of rows with a value; `labels` counts."""
 
     rows: int
     files: int
@@ -62,6 +62,7 @@ class VerifyReport:
     licences: tuple[Licence, ...]
     shares: dict[str, dict[str, float]]
     splits: dict[str, int]
+    labels: dict[str, int]
     split_hash: str
     content_hash: str
     scan: Scan
@@ -73,7 +74,7 @@ class VerifyReport:
 
     def to_json(self) -> str:
         """Return the report as JSON, with the row numbers and files of the first thousand rows of each finding."""
-        names = ("rows", "files", "decoded", "ok", "content_hash", "split_hash", "splits", "shares")
+        names = ("rows", "files", "decoded", "ok", "content_hash", "split_hash", "splits", "labels", "shares")
         report: dict[str, Any] = {name: getattr(self, name) for name in names}
         report["licences"] = [licence._asdict() for licence in self.licences]
         report["findings"] = [
@@ -89,6 +90,8 @@ class VerifyReport:
             f"{self.rows} rows, {self.files} files ({decoded})", "",
             f"content {self.content_hash[:16]}, splits {self.split_hash[:16]}: {splits}", "",
         ]  # fmt: skip
+        if self.labels:
+            lines += [f"values of labels: {', '.join(f'{name} {count}' for name, count in self.labels.items())}", ""]
         for one in self.findings:
             lines += [f"* **{one.level}** `{one.kind}`: {one.sentence}", *(f"  * {text}" for text in one.examples)]
             lines += ["  * and more: `--out` names the files"] * (0 < len(one.examples) < len(one.files))
@@ -133,6 +136,9 @@ def verify(manifest: Manifest, *, decode: bool = True, objects: bool = False, th
         licences=licences(manifest),
         shares=_shares(manifest),
         splits={name: counts[name] for name in SPLITS if name in counts},
+        labels={
+            name: int(manifest.present(name).sum()) for name in manifest.table.column_names if name.startswith("label.")
+        },
         split_hash=split_hash(manifest),
         content_hash=manifest.content_hash,
         scan=scanned,

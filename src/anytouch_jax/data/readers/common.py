@@ -32,8 +32,8 @@ Folder = tuple[str, list[str], list[str]]  # its path below a base, its folders,
 _WORDS = {"train": "train", "training": "train", "trn": "train", "val": "val", "valid": "val", "validation": "val",
           "dev": "val", "test": "test", "testing": "test", "tst": "test", "eval": "test", "evaluation": "test",
           "holdout": "test"}  # fmt: skip
-_MORE = r"(?:set|sets|split|data|dataset|images?|imgs?|frames|pictures|samples)"  # around a word, as in train_set
-_SPLIT = re.compile(rf"[\W_]*(?:{_MORE}[\W_]+)?({'|'.join(_WORDS)})(?:[\W_]*{_MORE})?[\W_]*", re.IGNORECASE)
+_MORE = r"(?:set|sets|split|data|dataset|images?|imgs?|frames|pictures|samples|seen|unseen)"  # around a word: train_set
+_SPLIT = re.compile(rf"[\W_]*(?:{_MORE}[\W_]+)?({'|'.join(_WORDS)})(?:20\d\d)?(?:[\W_]*{_MORE})*[\W_]*", re.IGNORECASE)
 MOST_LABELS = 1000  # of one value
 TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)  # in names of cameras and fields
 PARTS = ("train", "val", "test")  # published splits

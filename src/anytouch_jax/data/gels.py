@@ -43,7 +43,7 @@ SIDE = 320  # pixels of the long side of a median
 SETTLED = 300  # frames after which a running estimate stays
 TINT = 8.0  # grey levels: frames of one unit differ by less in most places, units of one product by more
 STORED = 32  # units whose pictures a file stores
-ADVICE = "Give one of the gel with nothing on it: --background, or background.png next to the frames."
+ADVICE = f"Record {FEWEST} frames or more of the sensor, or name a picture of its gel in the column background_path."
 
 
 class Spread:
@@ -121,12 +121,18 @@ def alike(frames: Sequence[Array]) -> list[Array]:
 class RunningGel:
     """The untouched gel of a live source: `picture`, None before its first frame, from the frames so far.
 
-    It is estimated whenever their number has doubled, and `settled` after SETTLED of them.
+    A thread estimates it whenever their number has doubled. The result counts from half as many frames later, so that
+    no frame waits for it, and equal frames have equal pictures. It is `settled` after SETTLED frames.
     """
 
     def __init__(self) -> None:
         self.picture: Array | None = None
-        self.settled, self._spread, self._due = False, Spread(reduced), 1
+        self.settled, self._spread, self._due = False, Spread(reduced), 2
+        self._thread: threading.Thread | None = None
+        self._found = list[Array]()
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy does without the estimate at work
+        return self.__dict__ | {"_thread": None}
 
     def add(self, frame: Array) -> None:
         """Take one frame more, RGB u8 (h, w, 3)."""
@@ -134,9 +140,17 @@ class RunningGel:
             return
         self._spread.add(frame)
         count = self._spread.count
-        if count >= self._due:
-            self._due, self.settled = min(2 * count, SETTLED), count >= SETTLED
-            self.picture = estimate(self._spread.items)
+        if count == 1:
+            self.picture = self._spread.items[0]
+        elif count == self._due:
+            frames = alike(self._spread.items)
+            self._thread = threading.Thread(target=lambda: self._found.append(estimate(frames)), daemon=True)
+            self._thread.start()
+        elif count == self._due * 3 // 2:
+            if self._thread is not None:
+                self._thread.join()
+            self.picture = self._found.pop() if self._found else self.picture
+            self._due, self.settled = min(2 * self._due, SETTLED * 2 // 3), count >= SETTLED
 
 
 def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
@@ -300,9 +314,9 @@ class UnitGels:
         return found if gel is None or why else _Unit(gel, "the picture that the head was fitted with", 0, True)
 
     def _fitted(self, rows: Array) -> Array:
-        """Return the rows of split train, or else all but those of split background."""
+        """Return the rows of split train, or all but those of split background if these are too few."""
         train = rows[self._split[rows] == "train"]
-        return train if len(train) else rows[self._split[rows] != "background"]
+        return train if len(train) >= FEWEST else rows[self._split[rows] != "background"]
 
     def _median(self, rows: Array, fewest: int, source: str) -> _Unit:
         frames = []

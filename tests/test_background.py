@@ -63,14 +63,18 @@ def test_what_is_left_is_the_contact_on_middle_grey():
     assert np.abs(subtract_background([GEL], large)[0].astype(int) - 128).max() <= 1
 
 
-def test_training_and_probes_read_the_same_differences(touches):
+@pytest.mark.parametrize(("stored", "used"), [(True, "a stored picture"), (False, "the median of")])
+def test_training_and_probes_read_the_same_differences(touches, stored, used):
     table = manifests.read(touches)
-    rows = table.rows_of("test")
+    if not stored:
+        table = without_backgrounds(table, np.arange(len(table)), touches.parent / "bare.parquet")
+    rows, gels = table.rows_of("test"), UnitGels(table)
     (_, batch), *_ = evaluation(table, rows, settings(touches, batch_size=len(rows)))
-    for clip, row in zip(batch.clip, rows, strict=True):
-        frame, ground = decode(table.file(int(row))), decode(table.file(int(row), "background_path"))
-        np.testing.assert_array_equal(clip[0], np.clip(frame.astype(int) - ground + 128, 0, 255))
+    for clip, row in zip(batch.clip, rows.tolist(), strict=True):
+        ground = decode(table.file(row, "background_path")) if stored else gels(row)
+        np.testing.assert_array_equal(clip[0], np.clip(decode(table.file(row)).astype(int) - ground + 128, 0, 255))
     config = settings(touches)
+    assert sum(f"untouched gel: {used}" in note for note in Loader(table, config).notes) == 1
     seen = {tuple(one.reshape(-1)[:60]) for step in range(6) for one in Loader(table, config).batch(step).clip[:, 0]}
     (_, everything), *_ = evaluation(
         table, table.rows_of("train"), replace(config, data=replace(config.data, batch_size=48))
@@ -128,9 +132,9 @@ def test_rows_that_are_too_few_for_a_median_are_left_out_and_counted(encoder, to
     alone, said = manifests.from_columns(columns, touches.parent / "few.parquet"), list[str]()
     ids, _ = embed_rows(encoder, alone, np.arange(3), log=said.append)
     assert ids.tolist() == [0, 2] and "1 of 3 rows have no picture of the untouched gel, and are left out" in said
-    with pytest.raises(UserError, match=r"too few frames to estimate it.*--background"):
+    with pytest.raises(UserError, match=r"too few frames to estimate it.*background_path"):
         embed_rows(encoder, alone, np.array([1]), log=said.append)
-    with pytest.raises(SampleError, match=r"row \d+ of .* has no background_path.*--data.background keep"):
+    with pytest.raises(SampleError, match=r"row \d+ of .* has no picture of the untouched gel.*background_path"):
         list(evaluation(alone, np.arange(3), settings(touches)))
     ((ids, _),) = evaluation(alone, np.arange(3), settings(touches, on_bad_sample="skip"))
     assert ids.tolist() == [0, 2]
@@ -189,21 +193,18 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
         assert np.abs(written["features"] - wanted).max() > 1e-3 and len(written["gels"]) == 1
 
 
-def test_training_says_at_once_which_rows_have_no_background(touches):
+def test_training_leaves_out_the_rows_of_a_sensor_of_few_frames(touches):
     table = manifests.read(touches)
+    rows = table.rows_of("train")
     columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
-    for row in table.rows_of("train")[:5]:
-        columns["background_path"][row] = None
+    for row in rows[:3].tolist():
+        columns["background_path"][row], columns["sensor"][row] = None, "taxim"
+    config = settings(touches)
     holed = manifests.from_columns(columns, touches.parent / "holed.parquet")
-    with pytest.raises(manifests.ManifestError, match=r"row 0 of .* and 4 other rows have no background_path"):
-        Loader(holed, settings(touches))
-    loader = Loader(holed, settings(touches, on_bad_sample="skip"))
-    assert any("left out 5 rows without background_path" in note for note in loader.notes)
-    columns["background_path"] = [None] * len(table)
-    with pytest.raises(manifests.ManifestError, match="have no background_path"):
-        Loader(
-            manifests.from_columns(columns, touches.parent / "none.parquet"), settings(touches, on_bad_sample="skip")
-        )
+    left_out = f"3 of {len(rows)} rows have no picture of the untouched gel, and are left out"
+    assert left_out in Loader(holed, config).notes
+    with pytest.raises(manifests.ManifestError, match=r"row 0 of .* and 2 other rows have no picture.*Record 5 frames"):
+        Loader(manifests.select_rows(holed, rows[:3]), config)
 
 
 def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
@@ -249,7 +250,7 @@ def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
 
 
 def test_either_subtracts_half_of_the_samples_and_every_known_background_in_evaluation(touches):
-    """Each row is drawn by itself, again in every epoch; a row without a background is never subtracted."""
+    """Each row is drawn by itself, again in every epoch; a row without an untouched gel is never subtracted."""
     table = manifests.read(touches)
     readers = {mode: SampleReader(table, settings(touches, mode)) for mode in ("keep", "subtract", "either")}
     rows = np.flatnonzero(table.column("split").to_numpy(zero_copy_only=False) == "train")
@@ -265,11 +266,8 @@ def test_either_subtracts_half_of_the_samples_and_every_known_background_in_eval
     draws = np.stack([subtracted(epoch) for epoch in range(40)])
     assert 0.4 < draws.mean() < 0.6 and draws.std(0).min() > 0.2 and draws.std(1).min() > 0
     assert subtracted(None).all()
-    bare = manifests.from_columns(
-        {n: [None] * len(table) if n == "background_path" else table.column(n) for n in table.table.column_names},
-        touches,
-    )
-    plain = SampleReader(bare, settings(touches, "either")).touch(rows[:1], None)
+    bare = without_backgrounds(manifests.select_rows(table, rows[:1]), np.arange(1), touches)
+    plain = SampleReader(bare, settings(touches, "either")).touch(np.arange(1), None)
     assert np.array_equal(plain, readers["keep"].touch(rows[:1], None))
 
 

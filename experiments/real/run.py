@@ -113,7 +113,7 @@ def main() -> None:
     if options.backgrounds:
         background_records(options.models[0], options.data, options.out / "backgrounds.jsonl")
         return
-    data, out = recordings.read(options.data), options.out / "real.jsonl"
+    data, out = recordings.read(options.data, "rule"), options.out / "real.jsonl"
     common = {"data": data.content_hash}
     for name, compute in BASELINES.items():
         write_record(out, name, record_of(compute(data), data, common | {"kind": "baseline"}))

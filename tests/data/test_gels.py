@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
+import threading
+import time
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -72,6 +77,7 @@ def test_a_stored_picture_comes_first_and_the_median_of_training_frames_of_the_u
         (presses(6, tint=20), {"unit": "b"}), (presses(2), {"unit": "b", "background_path": "gel.png"}),
         ([gel_frame("coloured", 0)], {"unit": "c", "split": "background"}), (presses(2), {"unit": "c"}),
         (presses(2, tint=60), {"unit": "d"}), (presses(3), {"sensor": "taxim", "unit": "e"}),
+        (presses(2), {"unit": "f"}), (presses(8, tint=20), {"unit": "f", "split": "test"}),
     )  # fmt: skip
     rule, rows = gels.UnitGels(table), table.text_column("unit")
     first = {unit: int(np.flatnonzero(rows == unit)[0]) for unit in set(rows)}
@@ -81,12 +87,28 @@ def test_a_stored_picture_comes_first_and_the_median_of_training_frames_of_the_u
     assert rule(stored) is None and (rule.read(stored) == 90).all()
     assert distance(rule.read(first["c"] + 1)) < 2  # the picture of split background, not the median
     assert distance(rule.read(first["d"])) < 25  # too few frames: the median of the sensor, not of its own tint
+    assert distance(rule.read(first["f"]), tint=16) < 8  # two training frames are too few: all of the unit count
     everything = np.arange(len(table))
     assert rows[~rule.has(everything)].tolist() == ["e"] * 3
     report = rule.report(everything)
     assert "a stored picture for 2 rows" in report and "none for 3 rows" in report
-    assert set(rule.pictures(everything)) == {"digit a", "digit b", "digit c", "digit d"}
+    assert set(rule.pictures(everything)) == {"digit a", "digit b", "digit c", "digit d", "digit f"}
     assert rule.digest() == gels.UnitGels(table).digest()
+
+
+def test_a_unit_of_few_sequences_does_not_subtract_its_own_press(world):
+    """Such as a column `unit` that names the object. A unit of another look has only its own frames."""
+
+    def press(number, tint=0):
+        frames = [gel_frame("coloured", 1, shift=40.0 * number - 60, seed=10 * number + seed) for seed in range(8)]
+        frames = [np.clip(frame.astype(int) + tint, 0, 255).astype(np.uint8) for frame in frames]
+        return frames, {"unit": f"object {number}", "sequence": f"film {number}"}
+
+    rule = gels.UnitGels(world(*map(press, range(4)), press(9, tint=60)))
+    assert all(distance(rule.read(8 * number)) < 2 for number in range(4)) and distance(rule.read(32), tint=60) < 12
+    assert rule.report(np.arange(40)) == (
+        "untouched gel: the median of its sensor of 40 frames for 32 rows; the median of 8 frames for 8 rows"
+    )
 
 
 def test_the_same_unit_gets_the_picture_of_a_head_and_another_one_warning(world):
@@ -110,13 +132,31 @@ def test_the_same_unit_gets_the_picture_of_a_head_and_another_one_warning(world)
 def test_a_live_source_that_begins_with_a_press_settles_on_the_free_gel(look, share):
     frames, contact = press_film(look, share, frames=60)
     begin = int(np.argmax(contact))  # the first frame is pressed, if any is
-    running, before = gels.RunningGel(), []
-    for frame in [*frames[begin:], *frames[:begin]] * 6:
+    running, seen = gels.RunningGel(), []
+    for frame in [*frames[begin:], *frames[:begin]] * 9:
+        running = pickle.loads(pickle.dumps(running)) if len(seen) == 13 else running  # while a thread is at work
         running.add(frame)
-        before.append(running.settled)
-    assert not before[0] and running.settled and running.picture is not None
+        seen.append((running.settled, running.picture))
+    assert not seen[0][0] and running.settled and len({id(picture) for _, picture in seen}) > 6
     gel = UntouchedGel(gel_frame(look, 0))
     assert gel.score(running.picture) < THRESHOLDS[SENSORS[look]] / 2
+
+
+def test_no_frame_waits_for_an_estimate_and_equal_frames_have_equal_pictures(monkeypatch):
+    estimate, pictures, begun = gels.estimate, list[list[np.ndarray]](), time.perf_counter()
+    for _ in range(2):
+        running, seen, is_due = gels.RunningGel(), [], threading.Semaphore(0)
+        held = partial(lambda is_due, frames: is_due.acquire(timeout=60) and estimate(frames), is_due)
+        monkeypatch.setattr(gels, "estimate", held)
+        for number, frame in enumerate(presses(24), 1):
+            if number in (2, 4, 8, 16):  # twice as many frames as when the estimate was begun
+                is_due.release()
+            running.add(frame)
+            seen.append(running.picture)
+        is_due.release()
+        pictures.append(seen)
+    assert time.perf_counter() - begun < 60 and len({id(one) for one in seen}) == 5
+    assert all(map(np.array_equal, *pictures))
 
 
 def test_pictures_by_unit_are_read_from_the_arrays_that_were_written():

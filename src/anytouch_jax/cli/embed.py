@@ -209,7 +209,8 @@ def choose_gel(
             picture, what = look, str(stored) if stored else f"estimated from {count} frames of {data}"
         elif encoder.needs_background:
             raise UserError(
-                f"{data} has too few frames to estimate the untouched gel, which is subtracted. {gels.ADVICE}"
+                f"{data} has too few frames to estimate the untouched gel, which is subtracted. Give {gels.FEWEST} or "
+                "more, or a picture of the gel with nothing on it: --background, or background.png next to the frames."
             )
     if encoder.subtracts:
         log(f"untouched gel: {what}")

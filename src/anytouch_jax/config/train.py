@@ -95,7 +95,7 @@ class DataConfig:
     require: tuple[Literal["image", "text"], ...] = ()  # Draw only rows that have these modalities.
     contact_only: bool = False  # Leave out rows that label.contact marks as free. Unmarked rows stay.
     aligned_text: bool = True  # Use the text of touches that other sensors or units recorded too.
-    # Subtract the untouched gel (background_path), or for half of the samples, at random. Not in the paper.
+    # Subtract the untouched gel (docs/sensor.md), or for half of the samples, at random. Not in the paper.
     background: Literal["keep", "subtract", "either"] = "keep"
     flip: Share = 0.5  # Probability of a mirror image, for each direction.
     affine: NotNegative[tuple[float, float, float]] = (0.0, 0.0, 0.0)

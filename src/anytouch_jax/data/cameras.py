@@ -112,6 +112,8 @@ def open_source(
     A camera is `asked` for settings, and `log` gets a sentence on what it really gives. Raises UserError.
     """
     camera = camera_of(name)
+    if camera is None and Path(name).is_dir():
+        raise UserError(f"{name} is a folder, not a video or a camera. `anytouch embed` takes folders.")
     if camera is None and not Path(name).is_file():
         raise UserError(f"there is no video and no camera {name}; {_connected()}")
     source: Any

@@ -10,8 +10,9 @@ The first of these counts:
 
 A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one unit.
 
-The median is over frames of split train, if the unit has any. Pressed or not, they may all take part, as presses are at
-changing places. `experiments/results/backgrounds.md` compares it with stored pictures.
+The median is over frames of split train, if these are enough. Pressed or not, they may all take part, as presses are at
+changing places. A unit of few sequences may have one press only, as if it was named after an object. Its median is that
+of its sensor, if these look alike. `experiments/results/backgrounds.md` compares medians with stored pictures.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ from anytouch_jax.files import check_array
 Array = npt.NDArray[Any]
 T = TypeVar("T")
 FRAMES = 100  # frames of a median: 10 of them to all of them score alike
-FEWEST = 5  # frames of a median: fewer show the press itself
+FEWEST = 5  # frames of a median, of as many sequences: fewer show the press itself
 SIDE = 320  # pixels of the long side of a median
-SETTLED = 300  # frames after which a running estimate stays
+SETTLED = 512  # frames, a power of two, after which a running estimate stays
 TINT = 8.0  # grey levels: frames of one unit differ by less in most places, units of one product by more
 STORED = 32  # units whose pictures a file stores
-ADVICE = "Give one of the gel with nothing on it: --background, or background.png next to the frames."
+ADVICE = f"Record {FEWEST} frames or more of the sensor, or name a picture of its gel in the column background_path."
 
 
 class Spread:
@@ -121,22 +122,33 @@ def alike(frames: Sequence[Array]) -> list[Array]:
 class RunningGel:
     """The untouched gel of a live source: `picture`, None before its first frame, from the frames so far.
 
-    It is estimated whenever their number has doubled, and `settled` after SETTLED of them.
+    A thread estimates it whenever their number has doubled. The result counts when it has doubled again, so that no
+    frame waits for it, and equal frames have equal pictures. It is `settled` after SETTLED frames.
     """
 
     def __init__(self) -> None:
         self.picture: Array | None = None
-        self.settled, self._spread, self._due = False, Spread(reduced), 1
+        self.settled, self._spread = False, Spread(reduced)
+        self._thread: threading.Thread | None = None
+        self._found = list[Array]()
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy does without the estimate at work
+        return self.__dict__ | {"_thread": None}
 
     def add(self, frame: Array) -> None:
         """Take one frame more, RGB u8 (h, w, 3)."""
         if self.settled:
             return
         self._spread.add(frame)
-        count = self._spread.count
-        if count >= self._due:
-            self._due, self.settled = min(2 * count, SETTLED), count >= SETTLED
-            self.picture = estimate(self._spread.items)
+        if (count := self._spread.count).bit_count() > 1:
+            return
+        if self._thread is not None:
+            self._thread.join()
+        frames, self.settled = alike(self._spread.items), count >= SETTLED
+        self.picture = self._found.pop() if self._found else frames[0] if self.picture is None else self.picture
+        if not self.settled:
+            self._thread = threading.Thread(target=lambda: self._found.append(estimate(frames)), daemon=True)
+            self._thread.start()
 
 
 def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
@@ -193,7 +205,7 @@ class UnitGels:
         self._stored = manifest.present("background_path")
         self._split = manifest.text_column("split")
         self._has_image = ~np.isin(manifest.text_column("sensor"), FIELD_SENSORS)
-        self._units, self._lock = dict[int, _Unit](), threading.Lock()
+        self._units, self._sensors, self._lock = dict[int, _Unit](), dict[int, _Unit](), threading.Lock()
 
     def __call__(self, row: int) -> Array | None:
         """Return the picture RGB u8 (h, w, 3) of a row's unit; None if that of the row counts, or there is none."""
@@ -236,11 +248,11 @@ class UnitGels:
         for row in rows.tolist():
             one = self._of(row)
             count[one.source] += 1
-            units.setdefault(one.source, {})[int(self._unit[row])] = one.frames
+            units.setdefault(one.source, {})[id(one)] = one.frames
         parts = []
         for source, some in count.items():
             frames, of = sum(units[source].values()), len(units[source])
-            about = f" of {frames:,} frames of {of} unit{'s' * (of > 1)}" if frames else ""
+            about = f" of {frames:,} frames{f' of {of} units' * (of > 1)}" if frames else ""
             parts.append(f"{source}{about} for {some:,} rows")
         return f"untouched gel: {'; '.join(parts)}"
 
@@ -283,11 +295,7 @@ class UnitGels:
         rows = np.flatnonzero((self._unit == unit) & self._has_image)
         found = self._median(rows[self._split[rows] == "background"], 1, "rows of split background")
         if found.picture is None:
-            found = self._median(self._fitted(rows), FEWEST, "the median")
-        if found.picture is None:  # a unit of few frames is taken for another one of its sensor
-            sensor = self._manifest.codes("sensor")
-            alike = np.flatnonzero((sensor == sensor[self._first[unit]]) & self._has_image)
-            found = self._median(self._fitted(alike), FEWEST, "the median of its sensor")
+            found = self._median_of(unit, self._fitted(rows))
         if not self._known:
             return found
         look = found.picture if found.picture is not None else self._median(rows, 1, "").picture
@@ -299,10 +307,26 @@ class UnitGels:
             self._log = None  # once
         return found if gel is None or why else _Unit(gel, "the picture that the head was fitted with", 0, True)
 
+    def _median_of(self, unit: int, rows: Array) -> _Unit:
+        """Return the median of rows of a unit, or that of its sensor if they are few and do not show another unit."""
+        own = self._median(rows, FEWEST, "the median")
+        sensors = self._manifest.codes("sensor")
+        sensor = int(sensors[self._first[unit]])
+        everything = self._fitted(np.flatnonzero((sensors == sensor) & self._has_image))
+        few = own.picture is None or len(np.unique(self._manifest.codes("sequence", own=True)[rows])) < FEWEST
+        if not few or len(everything) == len(rows):
+            return own
+        if sensor not in self._sensors:
+            self._sensors[sensor] = self._median(everything, FEWEST, "the median of its sensor")
+        shared = self._sensors[sensor]
+        if own.picture is None or shared.picture is None:
+            return shared if own.picture is None else own
+        return own if same_unit({"": shared.picture}, own.picture)[1] else shared
+
     def _fitted(self, rows: Array) -> Array:
-        """Return the rows of split train, or else all but those of split background."""
+        """Return the rows of split train, or all but those of split background if these are too few."""
         train = rows[self._split[rows] == "train"]
-        return train if len(train) else rows[self._split[rows] != "background"]
+        return train if len(train) >= FEWEST else rows[self._split[rows] != "background"]
 
     def _median(self, rows: Array, fewest: int, source: str) -> _Unit:
         frames = []

@@ -67,7 +67,7 @@ class Loader:
             self._shard.check(number, name)
         self._reader, self._log, self._replaced = SampleReader(manifest, config), log, set[str]()
         self._pools, self._match_pools, self._sensor, self.tokenizer, self.notes = find_pools(
-            manifest, config, tokenizer, devices
+            manifest, config, tokenizer, devices, self._reader.gels
         )
         # Batches are drawn from these pools: of stills and clips, or of clips only.
         clips_only = len(self._pools) > 1 and config.data.clip_share == 1

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config
+from anytouch_jax.data.gels import ADVICE, UnitGels
 from anytouch_jax.data.loading.matching import Matches, MatchKeys, is_shared_touch
 from anytouch_jax.data.loading.sampling import EpochSampler, PartSampler, StratumQuota
 from anytouch_jax.data.manifest.manifest import Manifest, ManifestError, sensor_rows
@@ -81,12 +82,15 @@ class _Usable(NamedTuple):
         return None if self.weights is None else self.weights[windows[:, -1]]
 
 
-def find_pools(manifest: Manifest, config: Config, tokenizer: Tokenizer | None, devices: int) -> Pools:
+def find_pools(
+    manifest: Manifest, config: Config, tokenizer: Tokenizer | None, devices: int, gels: UnitGels | None = None
+) -> Pools:
     """Return the pools of the split `config.data.split`; `devices` sets the multiple of the slots.
 
+    `gels` are the pictures that are subtracted, if any are. Rows without one are left out if the model needs one.
     Raises UserError for an empty split, an unknown sensor, an unfit tokenizer, and for data without a training signal.
     """
-    usable, notes = _usable_rows(manifest, config)
+    usable, notes = _usable_rows(manifest, config, gels)
     captioned = usable.rows[usable.has_text[usable.rows]]
     if captioned.size and tokenizer is None:
         tokenizer, note = choose_tokenizer(manifest, captioned, config)
@@ -198,7 +202,7 @@ def _match_pools(
     return (still, clip), notes
 
 
-def _usable_rows(manifest: Manifest, config: Config) -> tuple[_Usable, list[str]]:
+def _usable_rows(manifest: Manifest, config: Config, gels: UnitGels | None) -> tuple[_Usable, list[str]]:
     """Return the rows of the split with images of a known sensor, a weight, and all that is required; and notes."""
     split, on_bad = config.data.split, config.data.on_bad_sample
     rows = manifest.rows_of(split)
@@ -210,15 +214,16 @@ def _usable_rows(manifest: Manifest, config: Config) -> tuple[_Usable, list[str]
             f"{files}: split {split!r} has no row of a known sensor with images; "
             "add some, or the sensor by --model.sensors"
         )
-    if config.data.background == "subtract":
-        missing = rows[~manifest.present("background_path")[rows]]
-        if len(missing) == len(rows) or (len(missing) and on_bad == "error"):
+    if gels is not None:
+        notes.append(gels.report(rows))
+        missing = rows[~gels.has(rows)] if config.data.background == "subtract" else rows[:0]
+        if len(missing) == len(rows):
             raise ManifestError(
-                f"{manifest.where(int(missing[0]))} and {len(missing) - 1} other rows have no background_path, which "
-                "--data.background subtract requires; add backgrounds, or pass --data.on-bad-sample skip"
+                f"{manifest.where(int(rows[0]))} and {len(rows) - 1} other rows have no picture of the untouched gel, "
+                f"which --data.background subtract requires. {ADVICE}"
             )
         if len(missing):
-            notes.append(f"left out {len(missing)} rows without background_path, which data.background needs")
+            notes.append(f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are left out")
             sensor, rows = sensor.copy(), np.setdiff1d(rows, missing)
             sensor[missing] = -1
     weights, note = epoch_weights(manifest, config, rows)

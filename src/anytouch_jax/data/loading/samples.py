@@ -16,7 +16,7 @@ import numpy as np
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data import transforms
-from anytouch_jax.data.gels import UnitGels
+from anytouch_jax.data.gels import ADVICE, UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
@@ -39,13 +39,18 @@ class SampleReader:
     """Reads samples of `manifest` at the model's size, augmented by the settings of `config`.
 
     The first resized frames that fit into `data.cache` MB stay in memory, so a small data set is read once. The
-    samples do not depend on it. `gels` are the pictures that are subtracted, by default those of the rows.
+    samples do not depend on it. `gels` are the pictures that are subtracted, by default those of the rule in
+    `data.gels`, None if none is.
     """
 
     manifest: Manifest
     config: Config
     gels: UnitGels | None = None
     _cache: dict[Path, tuple[np.ndarray, tuple[int, ...]]] = field(default_factory=dict, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.gels is None and self.config.data.background != "keep":
+            object.__setattr__(self, "gels", UnitGels(self.manifest))
 
     def touch(
         self, rows: np.ndarray, epoch: int | None, out: np.ndarray | None = None, prepare: Prepare | None = None
@@ -60,7 +65,7 @@ class SampleReader:
         size, data = self.config.model.image_size, self.config.data
         plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
         # Frames are resized once and cached, unless the background is subtracted at their original size.
-        gel = None if self.config.data.background == "keep" or self.gels is None else self.gels(int(rows[-1]))
+        gel = None if data.background == "keep" or self.gels is None else self.gels(int(rows[-1]))
         subtracts = self._subtracts(int(rows[-1]), epoch, gel)
         shapes: list[tuple[int, ...]] = []  # before resizing
         load = None if epoch is None or (plain and subtracts) else partial(self._resized, shapes=shapes)
@@ -68,10 +73,7 @@ class SampleReader:
         background = gel if subtracts else None
         if subtracts and gel is None:
             if self.manifest.value(rows[-1], "background_path") is None:
-                raise SampleError(
-                    f"{self.manifest.where(rows[-1])} has no background_path, which --data.background subtract "
-                    "requires; add one, or pass --data.background keep"
-                )
+                raise SampleError(f"{self.manifest.where(rows[-1])} has no picture of the untouched gel. {ADVICE}")
             background = read_image(self.manifest, rows[-1], "background_path", load or self._decode_background)
         if background is not None:
             resized = shapes[len(rows) :]  # of a background that was read
@@ -203,7 +205,7 @@ def evaluation(
         )
     side = config.model.image_size
     blank = np.zeros((side, side, 3), np.uint8) if like is None else like
-    reader = SampleReader(manifest, config, gels or (None if config.data.background == "keep" else UnitGels(manifest)))
+    reader = SampleReader(manifest, config, gels)
     return _batches(reader, rows, windows, sensor, prepare, blank, [] if skipped is None else skipped)
 
 

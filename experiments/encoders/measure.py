@@ -1,11 +1,10 @@
-"""Training and errors of the decoder that reads depth, shear, contact and force from a frozen encoder.
+"""Deviations and errors of the depth, shear, contact and force that an encoder reads.
 
-    python -m experiments.encoders.measure train anytouch-tiny --minutes 60 --out runs/fields
-    python -m experiments.encoders.measure test runs/fields/anytouch-tiny
+    python -m experiments.encoders.measure calibrate runs/anytouch-tiny/anytouch-tiny
+    python -m experiments.encoders.measure test anytouch-tiny
 
-Touches are simulated in the training program and never repeat. `train` continues from OUT, calibrates the deviations
-on objects of the validation split, and writes the encoder with its decoder. `test` measures errors on objects of the
-test split, by sensor, and writes `measure.jsonl`. Both see new units of the sensors only.
+`calibrate` scales the deviations on objects of the validation split, and writes the folder again. `test` measures
+errors on objects of the test split, by sensor, and writes `measure.jsonl`. Both see new units of the sensors only.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -22,12 +20,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.nn.functional import build
-from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
+from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, normalise_touch
 from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE
 from anytouch_jax.sim import endless, scene
 from anytouch_jax.simulated import FIELDS, field_batch
@@ -35,14 +32,9 @@ from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.progress import to_stderr as log
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.registry import PARTS, locate, write_encoder
-from anytouch_jax.weights.safetensors import read_safetensors, write_safetensors
-from anytouch_jax.weights.tree import flatten, nest
 from experiments.benchmarks import machine
 from experiments.records import write_record
 
-CHANNELS = 32
-BATCH = {"cpu": 32, "gpu": 512}
-RATE, WARMUP = 2e-3, 0.03
 UNIVERSAL = 0.25  # share of the touches that get the universal tokens
 QUANTITIES = ("depth", "shear", "normal", "tangential", "torque", "slip")
 
@@ -81,70 +73,24 @@ def batches(world: endless.World, config: Config, count: int, seed: int, **optio
         number += 1
 
 
-def train(model: str, minutes: float, out: Path) -> None:
-    """Train the decoder for a time, and write the encoder with it."""
-    end = time.monotonic() + 60 * minutes
-    loaded = load_model(locate(model))
-    config = loaded.config.with_settings({"model.fields": CHANNELS, "model.text": None, "model.image": None})
-    net, weights = build(config.model), out / "fields.safetensors"
-    fields = net.init(jax.random.key(0))["fields"]
-    seed = 1
-    if weights.exists():
-        arrays, about = read_safetensors(weights)
-        fields, seed = nest(arrays), int(about["seed"]) + 1
-    touch = jax.device_put(loaded.params["touch"])
-    tx = optax.chain(optax.clip_by_global_norm(5.0), optax.scale_by_adam(b2=0.99))
-    state = tx.init(fields)
-
-    @jax.jit
-    def step(fields: Any, state: Any, batch: FieldBatch, rate: jax.Array) -> tuple[Any, Any, dict[str, jax.Array]]:
-        def loss(fields: Any) -> Any:
-            return field_terms({"touch": touch, "fields": fields}, batch, net=net)
-
-        (_, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(fields)
-        updates, state = tx.update(gradient, state)
-        return jax.tree.map(lambda p, u: p - rate * u, fields, updates), state, metrics
-
-    begun, saved = None, time.monotonic()
-    count = BATCH["cpu" if jax.default_backend() == "cpu" else "gpu"]
-    sums: dict[str, float] = {}
-    source = batches(world_of("train", 2), config, count, seed, wild=0.2, free=0.06)
-    for number, batch in enumerate(source, 1):
-        share = 0.0 if begun is None else min((time.monotonic() - begun) / max(end - begun, 1e-3), 1.0)
-        rate = RATE * min(share / WARMUP, 1.0) * (0.5 + 0.5 * np.cos(np.pi * share))
-        fields, state, metrics = step(fields, state, batch, jnp.float32(rate))
-        if number == 2:
-            jax.block_until_ready(metrics)
-            begun = time.monotonic()
-        for name, value in metrics.items():
-            sums[name] = 0.98 * sums.get(name, float(value)) + 0.02 * float(value)
-        if number % 50 == 0:
-            log(f"{number * count} touches, " + ", ".join(f"{name} {value:.3f}" for name, value in sums.items()))
-        if time.monotonic() - saved > 120 or time.monotonic() >= end:
-            write_safetensors(weights, flatten(jax.device_get(fields)), {"seed": str(seed)})
-            saved = time.monotonic()
-        if time.monotonic() >= end:
-            break
-    finish(loaded, config, out, Path(model).name)
-
-
-def finish(loaded: Any, config: Config, out: Path, name: str) -> None:
-    """Calibrate the deviations, and write the folder of the encoder with its decoder."""
-    arrays, _ = read_safetensors(out / "fields.safetensors")
-    params = {"touch": loaded.params["touch"], "fields": nest(arrays)}
-    errors = collect(params, config, "val", 24)
+def calibrate(folder: Path) -> None:
+    """Scale the deviations on the validation split, and write the encoder again with its card."""
+    loaded = load_model(folder)
+    errors = collect(loaded.params, subtracted(loaded.config), "val", 24)
     factors = {
         name: float(np.quantile(np.abs(values["error"]) / values["deviation"], 0.68)) for name, values in errors.items()
     }
     log(f"deviations are multiplied by {factors}")
-    card = parse_json((loaded.path.parent / "config.json").read_text())
-    trained = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings({"run.steps": card["steps"]})
-    whole = dataclasses.replace(trained, model=dataclasses.replace(loaded.config.model, fields=CHANNELS))
-    metadata = {**loaded.metadata, "fields": factors}
-    full = dataclasses.replace(loaded, config=whole, params={**loaded.params, **params}, metadata=metadata)
-    tokenizer = loaded.path.parent / "tokenizer.json"
-    notes = (loaded.path.parent / "README.md").read_text(encoding="utf-8").partition("## Data")[2]
-    write_encoder(out / name, full, "## Data" + notes, parts=(*PARTS, "fields"), tokenizer=tokenizer)
+    card = parse_json((folder / "config.json").read_text())
+    config = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings({"run.steps": card["steps"]})
+    full = dataclasses.replace(loaded, config=config, metadata={**loaded.metadata, "fields": factors})
+    notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
+    write_encoder(folder, full, notes, parts=(*PARTS, "fields"))
+
+
+def subtracted(config: Config) -> Config:
+    """Return the configuration of a user who has the picture of the untouched gel."""
+    return config.with_settings({"data.background": "subtract"})
 
 
 def collect(params: Any, config: Config, split: str, count: int, size: int = 32) -> dict[str, dict[str, np.ndarray]]:
@@ -223,7 +169,7 @@ def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def test(model: Path, out: Path) -> None:
     """Write the errors of an encoder that measures, sensor by sensor."""
     loaded = load_model(locate(str(model)))
-    config = loaded.config
+    config = subtracted(loaded.config)
     params = {"touch": loaded.params["touch"], "fields": loaded.params["fields"]}
     stored = loaded.metadata.get("fields", "{}")
     factors = dict.fromkeys(QUANTITIES, 1.0) | (json.loads(stored) if isinstance(stored, str) else stored)
@@ -236,18 +182,15 @@ def test(model: Path, out: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    first = commands.add_parser("train", help="train the decoder of an encoder")
-    first.add_argument("model")
-    first.add_argument("--minutes", type=float, default=60.0)
-    first.add_argument("--out", type=Path, default=Path("runs/fields"))
+    first = commands.add_parser("calibrate", help="scale the deviations of an encoder's folder")
+    first.add_argument("model", type=Path)
     second = commands.add_parser("test", help="measure errors on objects that training never touched")
     second.add_argument("model", type=Path)
     second.add_argument("--out", type=Path, default=Path("experiments/results/measure.jsonl"))
     given = parser.parse_args()
     enable_compilation_cache()
-    if given.command == "train":
-        given.out.mkdir(parents=True, exist_ok=True)
-        train(given.model, given.minutes, given.out)
+    if given.command == "calibrate":
+        calibrate(given.model)
     else:
         test(given.model, given.out)
 

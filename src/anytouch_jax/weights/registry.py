@@ -1,7 +1,7 @@
 """Encoders by name: those in the package, and those on the Hugging Face hub.
 
 >>> list_encoders()
-['anytouch-tiny', 'anytouch-tiny-conv']
+['anytouch-tiny']
 >>> locate("anytouch-tiny")  # a file of the installed package
 """
 
@@ -11,6 +11,7 @@ import hashlib
 import json
 import re
 import shutil
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from anytouch_jax.weights.safetensors import Loaded
 
 DEFAULT = "anytouch-tiny"
+FORMER = "anytouch-tiny-conv"  # of earlier versions: the default has replaced it
 FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, model.safetensors, README.md
 WEIGHTS, CARD = "model.safetensors", "config.json"
 PARTS = ("touch", "fields", "text", "logit_scale")  # for features, depth and force, zero-shot questions
@@ -52,6 +54,9 @@ def locate(model: str | Path) -> Path:
     hf://user/repo or hf://user/repo@revision; its files are kept in the cache of `huggingface_hub`. Raises UserError
     for a damaged package, and for a repository that cannot be read.
     """
+    if str(model) == FORMER and not Path(model).exists():
+        warnings.warn(f"{FORMER} has left the package: {DEFAULT} is used, which is better", stacklevel=2)
+        model = DEFAULT
     if str(model) in list_encoders():
         return _packaged(str(model))
     if address := _HUB.fullmatch(str(model)):

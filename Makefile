@@ -159,7 +159,7 @@ weights: $(STAMP) ## train an encoder on endless touches for a time, and go on l
 	$(PY) -m experiments.encoders.train --minutes $(MINUTES) --real $(REAL) --out $(WEIGHTS)
 
 figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
-	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny anytouch-tiny-conv untrained:anytouch-tiny-conv$(if $(TOUCH), --data $(TOUCH))
+	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.real.run anytouch-tiny --backgrounds$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png
 	$(PY) -m experiments.pages

@@ -67,7 +67,7 @@ def check(config: Config, every: bool = True) -> None:
         assert not wrong, jax.tree.map(np.shape, batch)
 
 
-PARTS = [{}, {"decoder_sensor_tokens": True}, {"patch_encoder": "sensor"}, {"patch_encoder": "convolutional"}]
+PARTS = [{}, {"decoder_sensor_tokens": True}, {"patch_encoder": "sensor"}]
 HEADS = [("paper", "mlp"), ("paper", "cosine"), ("paper", "none"), ("release", "linear"), ("release", "cosine")]
 BASELINES = [(name, stage) for name, baseline in presets.BASELINES.items() for stage in baseline.stages]
 

@@ -24,11 +24,8 @@ from experiments.real.run import UNTRAINED, load
 from experiments.records import write_record
 
 
-def recall(encoders: dict[str, Encoder], path: Path, sensor: str = retrieval.ALL) -> dict[str, Any]:
-    """Return the recall@1 and its interval over objects of each encoder, and of pixels, on the test split.
-
-    Queries are by `sensor`.
-    """
+def recall(encoders: dict[str, Encoder], path: Path) -> dict[str, Any]:
+    """Return the recall@1 and its interval over objects of each encoder, and of pixels, on the test split."""
     table = manifests.read(path)
     rows = retrieval.deepest_rows(table, table.rows_of("test"))
     features = {name: embed_rows(one, table, rows, pooling="class", log=silent)[1] for name, one in encoders.items()}
@@ -36,7 +33,7 @@ def recall(encoders: dict[str, Encoder], path: Path, sensor: str = retrieval.ALL
     found = retrieval.cross_sensor_retrieval(table, features, rows, centre=(True,))
     scores = {
         one.name: {"share": one.top1, "interval": [one.low, one.high]}
-        for one in found if one.query_sensor == sensor
+        for one in found if one.query_sensor == retrieval.ALL
     }  # fmt: skip
     return {"data": table.content_hash, "touches": len(rows), "scores": scores}
 
@@ -46,7 +43,6 @@ def main() -> None:
     parser.add_argument("models", nargs="+")
     parser.add_argument("--fine", type=Path, help="folder of touches, a dent at the same place for every sensor")
     parser.add_argument("--coarse", type=Path, help="folder of touches by hand")
-    parser.add_argument("--left-out", help="only queries by this sensor, which stage 2 of the encoders left out")
     parser.add_argument("--out", type=Path, default=Path("experiments/results/lookalikes.jsonl"))
     options = parser.parse_args()
     encoders = {word.partition("=")[0]: load(word) for word in options.models}
@@ -54,9 +50,8 @@ def main() -> None:
     for grade in ("fine", "coarse"):
         if folder := getattr(options, grade):
             about = {"encoders": marks, "machine": dataclasses.asdict(machine.describe())}
-            record = about | recall(encoders, folder / "manifest.parquet", options.left_out or retrieval.ALL)
-            key = f"{grade} {options.left_out}" if options.left_out else grade
-            write_record(options.out, key, record | ({"left_out": options.left_out} if options.left_out else {}))
+            record = about | recall(encoders, folder / "manifest.parquet")
+            write_record(options.out, grade, record)
             print(grade, record["scores"], flush=True)
 
 

@@ -118,7 +118,7 @@ def measure(folder: Path) -> Page:
     low, high = (bound(row[1] for row in rows) for bound in (min, max))
     findings = [
         f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
-        "Real balls: a calibration of the unit is better. The network reads half of the depth.",
+        "Real balls: a calibration of the unit is better. The network reads less than the depth.",
     ]
     answer = "On new simulated units the depth in contact is off by this much."
     return Page("measure", [real, rows], findings, (answer, f"{low:.2f} to {high:.2f} mm"))
@@ -127,11 +127,8 @@ def measure(folder: Path) -> Page:
 def lookalikes(folder: Path) -> Page:
     """The same touch by another sensor, among 50 that resemble it."""
     rows, findings, readme = [], [], dict[str, Value]()
-    for key, record in sorted(
-        read_records(folder / "lookalikes.jsonl").items(), key=lambda item: "left_out" in item[1]
-    ):
-        sensor = record.get("left_out")
-        grade = key.partition(" ")[0] + " alignment" + (f", queries by {sensor}, left out of stage 2" if sensor else "")
+    for key, record in read_records(folder / "lookalikes.jsonl").items():
+        grade = f"{key} alignment"
         scores = {name: percent([one["share"], *one["interval"]]) for name, one in record["scores"].items()}
         scores = dict(sorted(scores.items(), key=lambda item: -item[1].mean))
         rows += [(grade, name, value) for name, value in scores.items()]

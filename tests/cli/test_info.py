@@ -55,7 +55,7 @@ def test_weights_report_whose_names_they_have(anytouch, tmp_path):
     safetensors.write_safetensors(theirs, convert.to_release(params, model), {safetensors.MODEL_KEY: to_json(model)})
     assert "this package's names" in (done := anytouch("info", ours)).out and "trained sensors: digit." in done.out
     assert "authors' (stage1) names" in (done := anytouch("info", theirs)).out and "unknown" in done.out
-    for kind in ("sensor", "convolutional"):
+    for kind in ("sensor", "shared"):
         other = touch_model(patch_encoder=kind)
         export_safetensors(theirs, build(other).init(jax.random.key(0)), {safetensors.MODEL_KEY: to_json(other)})
         assert f"{kind} patches of 7" in anytouch("info", theirs).out

@@ -68,12 +68,13 @@ def test_every_form_of_data_gives_maps_and_a_line_a_frame(frames, weights, capsy
         (("--out", "out.csv"), ".npz"), (("--out", "frames.npz", "--film", "x.gif"), ".mp4"),
         (("--out", "manifest.npz", "--data", "manifest.csv"), "is a file that is read"),
         (("--out", "out.npz", "--width-mm", "0"), "above 0"), (("--out", "out.npz", "--data", "nothing"), "exists"),
-        (("--out", "out.npz", "--model", "anytouch-tiny-conv"), "--model.fields 32"),
+        (("--out", "out.npz", "--model", "plain.safetensors"), "--model.fields 32"),
         (("--out", "out.npz", "--data", "manifest.csv", "--sensor", "digit"), "--sensor has no effect"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_sentence(frames, weights, capsys, monkeypatch, more, word):
     monkeypatch.chdir(frames)
+    measuring_weights(frames / "plain.safetensors", fields=0)
     given = {"--model": weights, "--data": "frames/4.png"} | dict(zip(more[::2], more[1::2], strict=True))
     assert main(["measure", *(part for pair in given.items() for part in pair)]) == 2
     assert word in capsys.readouterr().err.splitlines()[-1]

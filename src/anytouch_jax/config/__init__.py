@@ -3,7 +3,6 @@
 from anytouch_jax.config.model import (
     FIELD_SENSORS,
     SENSORS,
-    STEM,
     UNIVERSAL,
     ModelConfig,
     SpellingError,

@@ -14,7 +14,6 @@ UNIVERSAL = "universal"
 SENSORS = (
     "gelsight", "digit", "gelslim", "gelsight_mini", "duragel", "9dtact", "allsight", "tacto", "taxim", UNIVERSAL,
 )  # fmt: skip
-STEM = (24, 64)  # channels of the convolutions of patch_encoder "convolutional"
 _MOST = 1 << 20  # of every size: a damaged configuration must not ask for the whole memory
 Size = Annotated[int, Range(1, _MOST, f"1 to {_MOST}")]
 Number = Annotated[int, Range(0, _MOST, f"0 to {_MOST}")]
@@ -105,7 +104,7 @@ class ModelConfig:
     pre_norm: bool = True  # Layer norm before the blocks of the touch encoder (CLIP). DINOv2 and MAE have none.
     decoder_norm_eps: NotNegative[float] = 1e-12  # Epsilon of the decoder's layer norms.
     decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
-    patch_encoder: Literal["shared", "sensor", "convolutional"] = "shared"  # One, one a sensor (T3), or a small CNN.
+    patch_encoder: Literal["shared", "sensor"] = "shared"  # One, or one a sensor (T3).
     fields: Number = 0  # Channels of the decoder of depth, shear, contact and force. 0: none.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
     lora_rank: Number = 0  # Rank of the image tower's LoRA. 0: off.

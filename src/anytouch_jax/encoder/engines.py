@@ -126,39 +126,20 @@ def _tokens(graph: _Graph, touch: Any, model: ModelConfig, frames: int) -> str:
     x = graph("Cast", x, to=1)  # float32
     kernel = np.asarray(patch["kernel"], np.float64)
     kernel = kernel.sum(axis=-3, keepdims=True) if frames == 1 else kernel
-    if model.patch_encoder == "convolutional":
-        x = _convolutional(graph, patch, kernel, model, graph("Reshape", x, [-1, frames, p, p, 3]))
-    else:  # kernels (..., T, P*P*3, D), and normalisation of the pixels is folded into them
-        x = graph("Reshape", x, [-1, n * n, frames * p * p * 3])
-        each = kernel.reshape(*kernel.shape[:-2], p * p, 3, kernel.shape[-1])
-        matrix = (each * _SCALE[:, None]).reshape(*kernel.shape[:-3], -1, kernel.shape[-1])
-        bias = (each * _SHIFT[:, None]).sum(axis=(-4, -3, -2))
-        if model.patch_encoder == "sensor":
-            x = graph("MatMul", x, graph("Gather", graph.constant(matrix), "sensor"))
-            x = graph("Add", x, graph("Gather", graph.constant(bias[:, None]), "sensor"))
-        else:
-            x, position = graph("MatMul", x, matrix), np.concatenate([position[:1], position[1:] + bias])
+    # Kernels are (..., T, P*P*3, D), and normalisation of the pixels is folded into them.
+    x = graph("Reshape", x, [-1, n * n, frames * p * p * 3])
+    each = kernel.reshape(*kernel.shape[:-2], p * p, 3, kernel.shape[-1])
+    matrix = (each * _SCALE[:, None]).reshape(*kernel.shape[:-3], -1, kernel.shape[-1])
+    bias = (each * _SHIFT[:, None]).sum(axis=(-4, -3, -2))
+    if model.patch_encoder == "sensor":
+        x = graph("MatMul", x, graph("Gather", graph.constant(matrix), "sensor"))
+        x = graph("Add", x, graph("Gather", graph.constant(bias[:, None]), "sensor"))
+    else:
+        x, position = graph("MatMul", x, matrix), np.concatenate([position[:1], position[1:] + bias])
     x = graph("Add", x, position[1:])
     rows = touch["sensor_tokens"]
     start = np.broadcast_to(touch["class_token"] + position[0], (len(rows), 1, rows.shape[-1]))
     return graph("Concat", graph("Gather", np.concatenate([start, rows], axis=1), "sensor"), x, axis=1)
-
-
-def _convolutional(graph: _Graph, patch: Any, kernel: np.ndarray, model: ModelConfig, x: str) -> str:
-    """Return convolutional patches (B, N, D) of pixels (B * N, T, P, P, 3)."""
-    p, frames, few = model.patch, len(kernel), kernel.shape[-1]
-    x = graph("Add", graph("Mul", x, _SCALE), _SHIFT)
-    x = graph("Reshape", graph("Transpose", x, perm=[0, 1, 4, 2, 3]), [-1, frames * 3, p, p])
-    first = kernel.reshape(frames, 5, 5, 3, few).transpose(4, 0, 3, 1, 2).reshape(few, -1, 5, 5)
-    second = patch["second"]["kernel"].reshape(3, 3, few, -1).transpose(3, 2, 0, 1)
-    for number, weights in enumerate((first, second), 1):
-        side = weights.shape[-1]
-        x = graph("Conv", x, weights, kernel_shape=[side] * 2, pads=[side // 2] * 4, strides=[2, 2])
-        x = graph.norm(graph("Transpose", x, perm=[0, 2, 3, 1]), patch[f"norm{number}"], model.norm_eps)
-        x = graph("Gelu", x)
-        x = graph("Transpose", x, perm=[0, 3, 1, 2]) if number == 1 else x
-    last = patch["last"]
-    return graph.dense(graph("Reshape", x, [-1, model.patches, len(last["kernel"])]), last)
 
 
 def _fields(graph: _Graph, own: Any, model: ModelConfig, frames: int, states: list[str]) -> dict[str, tuple[int, ...]]:

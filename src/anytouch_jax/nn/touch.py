@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
-from anytouch_jax.config import STEM, ModelConfig
+from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.layers import (
     ACTIVATIONS,
     Dense,
@@ -22,7 +22,6 @@ from anytouch_jax.nn.layers import (
     stacked_blocks,
     stored,
     table,
-    windows,
 )
 from anytouch_jax.ops import tokens
 
@@ -51,42 +50,12 @@ class TouchPatch(nnx.Module):
         return jnp.einsum("bktc,btcd->bkd", patches.astype(own), each.astype(own))
 
 
-class ConvolutionalPatch(nnx.Module):
-    """Small convolutions inside each patch in place of the projection (ours; convolutions before a ViT: Xiao et al.
-    2021, "Early convolutions help transformers see better"). Nothing is read over a patch's border, so that what is
-    masked stays hidden."""
-
-    def __init__(self, model: ModelConfig) -> None:
-        few, more = STEM
-        self.kernel = table(model.frames, 5 * 5 * 3, few)
-        self.norm1 = LayerNorm(few, model.norm_eps, model.dtype)
-        self.second = Dense(3 * 3 * few, more, model, bias=False)
-        self.norm2 = LayerNorm(more, model.norm_eps, model.dtype)
-        left = -(-model.patch // 4)
-        self.last = Dense(left * left * more, model.touch.width, model, bias=False)
-        self.patch, self.dtype = model.patch, jnp.dtype(model.dtype)
-
-    def __call__(self, patches: Array, sensor: Array) -> Array:
-        """Project (B, K, T, P*P*3) to (B, K, D), as `TouchPatch`."""
-        b, k, frames, _ = patches.shape
-        kernel = self.kernel[...]
-        if frames == 1:
-            kernel = reduce(jnp.add, kernel)[None]
-        x = jnp.moveaxis(patches.reshape(b * k, frames, self.patch, self.patch, 3), 1, 3)
-        x = windows(x.reshape(b * k, self.patch, self.patch, frames * 3), 5)
-        kernel = jnp.moveaxis(kernel.reshape(frames, 25, 3, -1), 0, 1).reshape(-1, kernel.shape[-1])
-        x = product(x.reshape(-1, x.shape[-1]), kernel, self.dtype).reshape(*x.shape[:3], -1)
-        x = self.second(windows(gelu(self.norm1(x)), 3))
-        x = gelu(self.norm2(x))
-        return self.last(x.reshape(b, k, -1))
-
-
 class TouchEncoder(nnx.Module):
     """ViT over [class, sensor tokens, visible patches]; the architecture of CLIP's image tower."""
 
     def __init__(self, model: ModelConfig) -> None:
         width = model.touch.width
-        self.patch = (ConvolutionalPatch if model.patch_encoder == "convolutional" else TouchPatch)(model)
+        self.patch = TouchPatch(model)
         self.class_token = table(width)
         self.position = table(model.patches + 1, width)
         self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width)

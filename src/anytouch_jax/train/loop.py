@@ -87,11 +87,11 @@ def fit(
     of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
     `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
     `until` ends the run at that time of `time.monotonic`: the schedule then follows the time that has passed since the
-    first step, in place of `run.steps`. `examples` are a batch of each structure, as shapes and
-    as a function that makes it: what makes them and their steps are compiled before the first step, side by side.
-    SIGTERM and Ctrl-C finish the step, save and return. If one of several processes
-    gets the signal, all stop a step later. Raises UserError for settings that changed since the start, too many skipped
-    steps in a row, a full disk, an unreadable checkpoint, and a folder that some process cannot see.
+    first step, in place of `run.steps`. `examples` are a batch of each structure: its shapes, and a function that makes
+    it. Their steps are compiled before the first step, side by side. SIGTERM and Ctrl-C finish the step, save and
+    return. If one of several processes gets the signal, all stop a step later. Raises UserError for settings that
+    changed since the start, too many skipped steps in a row, a full disk, an unreadable checkpoint, and a folder that
+    some process cannot see.
     """
     refuse_forked()
     run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)

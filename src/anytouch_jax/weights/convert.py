@@ -125,8 +125,7 @@ def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False)
             "the matching MLP of recipe paper has no counterpart in the authors' files; allow extra keys to store it"
         )
     if model.patch_encoder != "shared":
-        ours = "one for each" if model.patch_encoder == "sensor" else "convolutions"
-        raise WeightsError(f"the authors' files have one patch projection for all sensors; this model has {ours}")
+        raise WeightsError("the authors' files have one patch projection for all sensors; this model has one for each")
     if model.sensors[-1] != UNIVERSAL:
         raise WeightsError(
             f"the authors' files keep the universal tokens in the last row; here it is {model.sensors[-1]!r}"

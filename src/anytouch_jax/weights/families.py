@@ -404,8 +404,6 @@ def touch_of_photographs(
             f"{source} is an encoder of {model.family.title}; a run starts from weights of AnyTouch, DINOv2, ViT-MAE, "
             "ViT, DeiT or CLIP"
         )
-    if set(fresh["patch"]) != {"kernel"}:
-        raise UserError(f"{source} has one patch projection; leave out --model.patch-encoder convolutional")
     kept = {name: getattr(ours, name) for name in ("embed", "frames", "sensor_tokens", "patch_encoder", "decoder")}
     theirs = replace(form.model, **kept, decoder_norm_eps=ours.decoder_norm_eps, pre_norm=form.pre_norm)
     compatible.check_form(Path(source), theirs, config)

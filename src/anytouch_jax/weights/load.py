@@ -249,13 +249,7 @@ def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
     """Return `params` with the touch encoder from the image tower `image`; sensor tokens are unchanged.
 
     The patch kernel is repeated over the frames. With `divide` the response to a still equals the tower's.
-    Raises WeightsError for a touch encoder of convolutions.
     """
-    if set(params["touch"]["patch"]) != {"kernel"}:
-        raise WeightsError(
-            "an image tower's patch projection does not fit convolutions: leave out --model.patch-encoder "
-            "convolutional, or --clip-weights"
-        )
     shape = params["touch"]["patch"]["kernel"].shape  # (T, ...), or (R, T, ...) with one kernel a sensor
     kernel = np.broadcast_to(np.asarray(image["patch"]["kernel"]), shape) / np.float32(shape[-3] if divide else 1)
     touch = {**image, "patch": {"kernel": kernel}, "sensor_tokens": params["touch"]["sensor_tokens"]}

@@ -3,8 +3,9 @@
     python -m experiments.encoders.motion anytouch-tiny --data data/corpus/*/manifest.parquet
 
 Features that are averaged over a picture say little about the sign of a turn. The head reads a vector from every patch:
-how the token changes from the first to the last touched frame of a clip. Exchanging the two frames turns all vectors
-around. A turn is the sum of the vectors' moments about the touched place, a slide is their mean.
+how its token changes from the first to the last touched frame of a clip. The tokens are those after a third and two
+thirds of the blocks. Exchanging the two frames turns all vectors around. A turn is the sum of the vectors' moments
+about the touched place, a slide is their mean.
 """
 
 from __future__ import annotations
@@ -67,8 +68,9 @@ def read(encoder: Encoder, paths: list[Path], most: int) -> Clips:
 
     @jax.jit
     def tokens(params: Any, frames: jax.Array, rows: jax.Array) -> jax.Array:
-        found = encoder.net.encode_tokens(params, normalise_touch(frames[:, None]), rows)
-        return found[:, 1 + encoder.net.model.sensor_tokens :].astype(jnp.float16)
+        states = encoder.net.bind(params).touch.states(normalise_touch(frames[:, None]), rows, 4)
+        first, last = encoder.net.model.touch.width, 3 * encoder.net.model.touch.width  # after a third and two thirds
+        return states[:, 1 + encoder.net.model.sensor_tokens :, first:last].astype(jnp.float16)
 
     flat = pairs.ravel()
     items = ((picture(int(row)), np.int32(encoder.sensor_row(columns["sensor"][row]))) for row in flat)

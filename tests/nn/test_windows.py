@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from anytouch_jax.nn.layers import windows
+from anytouch_jax.nn.fields import windows
 
 RNG = np.random.default_rng(0)
 

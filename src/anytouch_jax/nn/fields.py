@@ -12,8 +12,18 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, product, stored, table, windows
+from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, product, stored, table
 from anytouch_jax.ops.fields import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE, FieldOutput
+
+
+def windows(x: Array, side: int, stride: int = 2) -> Array:
+    """Every `stride`th window of `side` x `side` pixels (odd) of x (B, H, W, C), zeros around it: (B, ceil(H / stride),
+    ceil(W / stride), side * side * C), in the order (row, col, channel)."""
+    around = side // 2
+    x = jnp.pad(x, ((0, 0), (around, around), (around, around), (0, 0)))
+    ends = [size - side + 1 for size in x.shape[1:3]]
+    cut = [x[:, i : i + ends[0] : stride, j : j + ends[1] : stride] for i in range(side) for j in range(side)]
+    return jnp.concatenate(cut, axis=-1)
 
 
 class Convolution(nnx.Module):

@@ -185,14 +185,6 @@ def test_stage_two_resumes_bit_for_bit_without_its_stage_one(straight, aligned, 
     assert not [name for name, array in parts(first.params, *learned).items() if np.array_equal(array, after[name])]
 
 
-def test_a_tokenizer_of_the_captions_has_the_size_of_the_option_at_most(world, tmp_path):
-    config = clips_only(run_config(world, 2))
-    config = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=262)))
-    params = train(config, tmp_path / "r", stop_after=0).params
-    assert params["text"]["token"].shape == (262, 16)
-    assert from_json((tmp_path / "r" / "config.json").read_text()).model.text.vocab == 262
-
-
 def test_stage_two_of_the_release(straight, world, tmp_path):
     run, _ = straight
     config = clips_only(run_config(world, 2, "release"))
@@ -246,18 +238,6 @@ def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize("content", [b'{"architectures": ["CLIPModel"]}', b"\xff\xfe\x00"], ids=["foreign", "binary"])
-def test_a_config_that_is_not_ours_is_replaced_or_named(straight, world, tmp_path, content):
-    (tmp_path / "new").mkdir()
-    (tmp_path / "new" / "config.json").write_bytes(content)
-    train(run_config(world), tmp_path / "new", stop_after=0)  # no run was there
-    assert from_json((tmp_path / "new" / "config.json").read_text()).run.steps == 4
-    shutil.copytree(straight[0], tmp_path / "started")
-    (tmp_path / "started" / "config.json").write_bytes(content)
-    message = refused(run_config(world), tmp_path / "started")
-    assert f"{tmp_path / 'started' / 'config.json'} cannot be read" in message
-
-
 def test_a_run_without_its_config_resumes_from_its_checkpoint(straight, world, tmp_path):
     shutil.copytree(straight[0], tmp_path / "r")
     (tmp_path / "r" / "config.json").unlink()
@@ -284,21 +264,6 @@ def test_settings_without_effect_are_one_sentence(world, tmp_path):
     assert "--optim.accumulate must be 1 in stage 2" in refused(config, tmp_path / "r")
     both = refused(run_config(world), tmp_path / "r", init="a.pth", clip="b.safetensors")
     assert "--init and --clip-weights" in both and not (tmp_path / "r").exists()
-
-
-def test_a_batch_that_the_devices_cannot_share_is_one_sentence(world, tmp_path):
-    assert "4 devices" in refused(run_config(world, batch=6), tmp_path / "r")
-
-
-def test_without_captions_and_photographs_stage_two_still_matches(world, tmp_path):
-    """No tokenizer is needed, none is written, and no text tower is asked for anything."""
-    rows = [{**row, "text": "", "image_path": ""} for row in read_rows(world)]
-    columns = tuple(rows[0])
-    manifest = write_manifest(world.parent / "bare.csv", [[row[c] for c in columns] for row in rows], columns)
-    result = train(clips_only(run_config(manifest, 2)), tmp_path / "r", stop_after=1)
-    assert not (tmp_path / "r" / "tokenizer.json").exists()
-    (line,) = read_metrics(tmp_path / "r")
-    assert line["match"] > 0 and line["align"] == 0 and result.step == 1
 
 
 def test_two_processes_never_train_one_run(straight, world, tmp_path):
@@ -334,16 +299,3 @@ def test_a_run_does_not_resume_on_other_rows(world, tmp_path):
     moved = shutil.copytree(world.parent, tmp_path / "moved")
     write_manifest(moved / "other.csv", rows[:-1])  # the same rows and files at another place
     assert train(run_config(moved / "other.csv"), tmp_path / "r", stop_after=2).step == 2
-
-
-def test_the_tokenizer_of_a_failed_start_is_not_used(straight, world, tmp_path):
-    run = tmp_path / "r"
-    refused(run_config(world, 2), run, init=tmp_path / "mistyped")
-    assert not run.exists()
-    run.mkdir()
-    (run / "tokenizer.json").write_text("{}")  # of other data
-    train(run_config(world, 2), run, init=straight[0], stop_after=0)
-    assert texts.load_tokenizer(run / "tokenizer.json").vocab_size > 2
-
-
-# Sensors ------------------------------------------------------------------------------------------------------------

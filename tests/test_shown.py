@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import anytouch_jax as at
-from anytouch_jax.encoder import encoder as encoders
 from anytouch_jax.encoder.embed import Features, save_npz
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.search import load_index
@@ -44,15 +43,6 @@ def test_every_repr_is_short_and_shows_no_array(tmp_path, world, tiny_run):
         assert len(text) <= 600 and len(text.splitlines()) <= 8, (name, text)
         assert " object at 0x" not in text and "array(" not in text and "[[" not in text, (name, text)
         assert text.startswith(type(one).__name__), (name, text)
-
-
-def test_an_encoder_names_what_a_user_asks_first(tiny_run):
-    encoder = encoders.load_encoder(tiny_run)
-    lines = dict(line.strip().split("  ", 1) for line in repr(encoder).splitlines()[1:])
-    assert {name.strip() for name in lines} == {"family", "parameters", "input", "background", "features", "sensors"}
-    assert str(tiny_run)[-20:] in repr(encoder).splitlines()[0]
-    count = sum(leaf.size for leaf in jax.tree.leaves(encoder.params))
-    assert f"{count:,}" in lines["parameters"] and "28 x 28" in lines["input"] and "digit" in lines["sensors"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from batch_leaves import assert_same
 
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.errors import UserError
 from anytouch_jax.pretrain import pretrain
 from anytouch_jax.simulated import SIMULATED, SimulatedLoader, _partners, augmented, caption_tokenizer, load_real
 
@@ -118,8 +117,3 @@ def test_a_run_for_a_time_follows_the_time(tmp_path):
         rates.append(float(line.partition('"learning_rate": ')[2].partition(",")[0]))
     assert 2 < result.step < 1_000_000
     assert rates[0] == 0 and max(rates) > 0.5 * config.optim.learning_rate and rates[-1] < 0.5 * max(rates)
-
-
-def test_mistakes_get_a_sentence(tmp_path):
-    with pytest.raises(UserError, match="recipe paper"):
-        SimulatedLoader(replace(tiny(), recipe="release"))

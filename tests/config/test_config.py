@@ -1,8 +1,6 @@
 """The configuration: the tables of presets and recipes, strict JSON, the rules over parameter names."""
 
 import json
-import re
-import sys
 from dataclasses import replace
 from itertools import product
 
@@ -10,7 +8,6 @@ import pytest
 from tiny_models import full_model
 
 from anytouch_jax.config import (
-    SENSORS,
     Config,
     DataConfig,
     LossConfig,
@@ -24,7 +21,7 @@ from anytouch_jax.config import (
     preset,
     to_json,
 )
-from anytouch_jax.errors import ConfigError, UserError
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.train.optim import match_rules
 from anytouch_jax.weights.tree import flatten
@@ -65,20 +62,6 @@ def test_presets_are_the_table(name):
     assert one.towers == "none" and size(one.model.touch) == tower
 
 
-def test_what_both_recipes_have_in_common():
-    for name, stage, recipe, towers in ALL:
-        config = preset(name, stage=stage, recipe=recipe, towers=towers)
-        o, loss, data = config.optim, config.objective, config.data
-        assert (o.beta1, o.beta2, o.weight_decay, o.learning_rate) == (0.9, 0.99, 0.1, 2e-4)
-        assert (o.grad_clip, o.accumulate) == (None, 1)
-        assert (loss.mask_ratio, loss.alpha_tv, loss.alpha_tl, loss.alpha_vl) == (0.75, 1.0, 1.0, 0.2)
-        assert (loss.match_weight, loss.universal_start, loss.universal_end, loss.groups) == (0.1, 0.0, 0.75, 1)
-        assert (config.model.temperature, config.model.sensor_tokens, config.model.frames) == (0.07, 5, 3)
-        assert (data.flip, data.jitter, data.rotation) == (0.5, (0.4, 0.4, 0.5, 0.3), 20.0)
-        assert config.model.sensors == SENSORS and SENSORS.index("universal") == 9
-        assert (config.model.norm_eps, config.model.decoder_norm_eps, config.model.activation) == (1e-5, 1e-12, "gelu")
-
-
 def test_the_points_on_which_the_recipes_differ():
     paper, release = (preset("large", stage=2, recipe=r, towers="pretrained") for r in ("paper", "release"))
     assert (paper.model.match_head, release.model.match_head) == ("mlp", "linear")
@@ -94,9 +77,8 @@ def test_the_points_on_which_the_recipes_differ():
     assert one.reconstructs and not one.splits_steps and one.optim.decay == "cosine"
 
 
-@pytest.mark.parametrize("args", ALL)
-def test_json_there_and_back(args):
-    name, stage, recipe, towers = args
+@pytest.mark.parametrize(("name", "stage", "recipe", "towers"), ALL[::3])
+def test_json_there_and_back(name, stage, recipe, towers):
     config = preset(name, stage=stage, recipe=recipe, towers=towers)
     again = from_json(to_json(config))
     assert again == config and hash(again) == hash(config)
@@ -143,130 +125,48 @@ def test_wrong_json_is_an_error_that_names_the_key():
         from_json("[]")
 
 
-def test_json_takes_whole_numbers_for_floats_and_none_where_it_may_be():
-    data = json.loads(to_json(preset("tiny")))
-    data["optim"]["eps"], data["optim"]["grad_clip"] = 1, 2
-    config = from_json(json.dumps(data))
-    assert config.optim.eps == 1.0 and isinstance(config.optim.eps, float) and config.optim.grad_clip == 2.0
-    assert from_json(json.dumps({"model": data["model"]})) == Config(config.model)  # the rest has defaults
-
-
-def test_impossible_models_are_errors():
-    model = preset("tiny").model
-    for change, word in (
-        ({"patch": 13}, "multiple of patch 13"),
-        ({"sensors": ("digit", "digit", "universal")}, "twice"),
-        ({"sensors": ("digit",)}, "universal"),
-    ):
-        with pytest.raises(ConfigError, match=word):
-            replace(model, **change)
-    with pytest.raises(ConfigError, match="multiple of heads 5"):
-        Stack(192, 6, 5, 768)
-    assert issubclass(ConfigError, UserError) and issubclass(UserError, ValueError)
-
-
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
         (Stack, {"heads": 0}, "heads must be 1 to 1048576, not 0"),
-        (Stack, {"width": -4}, "width must be 1 to 1048576, not -4"),
+        (Stack, {"heads": 5}, ".* multiple of heads 5.*"),
         (TextTower, {"length": 0}, "--model.text.length must be 1 to 1048576, not 0"),
-        (ModelConfig, {"patch": 0}, "--model.patch must be 1 to 1048576, not 0"),
+        (ModelConfig, {"patch": 13}, ".* multiple of patch 13.*"),
+        (ModelConfig, {"sensors": ("digit", "digit", "universal")}, ".* twice.*"),
+        (ModelConfig, {"sensors": ("digit",)}, ".*universal.*"),
         (ModelConfig, {"temperature": 0.0}, "--model.temperature must be above 0, not 0.0"),
         (ModelConfig, {"lora_rank": -1}, "--model.lora-rank must be 0 to 1048576, not -1"),
         (ModelConfig, {"decoder": Stack(18, 1, 2, 72)}, "--model.decoder.width must be a multiple of 4 .*, not 18"),
+        (ModelConfig, {"dtype": "float16"}, "--model.dtype must be one of float32, bfloat16, float64, not 'float16'"),
         (LossConfig, {"groups": 0}, "--objective.groups must be 1 or more, not 0"),
         (LossConfig, {"mask_ratio": 1.5}, "--objective.mask-ratio must be 0 to 1, not 1.5"),
-        (LossConfig, {"mask_ratio": -0.1}, "--objective.mask-ratio must be 0 to 1, not -0.1"),
         (LossConfig, {"alpha_vl": -0.2}, "--objective.alpha-vl must be 0 or more, not -0.2"),
-        (OptimConfig, {"accumulate": 0}, "--optim.accumulate must be 1 or more, not 0"),
-        (OptimConfig, {"grad_clip": -1.0}, "--optim.grad-clip must be above 0, not -1.0"),
-        (RunConfig, {"seed": 2**32}, "--run.seed must be 0 to 4294967295, not 4294967296"),
-        (RunConfig, {"seed": -1}, "--run.seed must be 0 to 4294967295, not -1"),
         (OptimConfig, {"grad_clip": 0.0}, "--optim.grad-clip must be above 0, not 0.0"),
         (OptimConfig, {"learning_rate": float("nan")}, "--optim.learning-rate must be 0 or more, not nan"),
-        (OptimConfig, {"learning_rate": float("inf")}, "--optim.learning-rate must be 0 or more, not inf"),
         (OptimConfig, {"learning_rate": 1e200}, r"--optim.learning-rate must be 0 or more, not 1e\+200"),
         (OptimConfig, {"eps": 0.0}, r"--optim.eps must be 1.2e-38 or more \(float32\), not 0.0"),
         (OptimConfig, {"beta2": 1.0}, "--optim.beta2 must be 0 or more and below 1, not 1.0"),
         (DataConfig, {"flip": 7.0}, "--data.flip must be 0 to 1, not 7.0"),
-        (DataConfig, {"clip_share": -1.0}, "--data.clip-share must be 0 to 1, not -1.0"),
         (DataConfig, {"jitter": (0.4, -0.1, 0.5, 0.3)}, "--data.jitter must be 0 or more, not -0.1"),
-        (DataConfig, {"batch_size": 0}, "--data.batch-size must be 1 or more, not 0"),
+        (DataConfig, {"require": ("image", "txt")}, r"--data.require\[1\] must be one of image, text, not 'txt'"),
+        (DataConfig, {"require": "image"}, "--data.require must be a list, not 'image'"),
+        (RunConfig, {"seed": 2**32}, "--run.seed must be 0 to 4294967295, not 4294967296"),
         (RunConfig, {"steps": -5}, "--run.steps must be 1 or more, not -5"),
-        (RunConfig, {"keep": 0}, "--run.keep must be 1 or more, not 0"),
+        (Config, {"towers": "pretraned"}, "towers must be one of none, scratch, pretrained, not 'pretraned'"),
+        (Config, {"stage": "2"}, "stage must be one of 1, 2, not '2'"),
     ],
 )
-def test_numbers_out_of_range_are_errors(kind, options, message):
+def test_settings_that_cannot_be_are_errors(kind, options, message):
+    """From Python nothing else reads them: a slip would train something else."""
+    config = preset("tiny")
     sound = {
-        Stack: preset("tiny").model.touch,
-        ModelConfig: preset("tiny").model,
+        Config: config,
+        ModelConfig: config.model,
+        Stack: config.model.touch,
         TextTower: TextTower(Stack(8, 1, 2, 32)),
     }
     with pytest.raises(ConfigError, match=f"^{message}$"):
         replace(sound.get(kind) or kind(), **options)
-
-
-@pytest.mark.parametrize(
-    ("kind", "options", "message"),
-    [
-        (
-            ModelConfig,
-            {"match_head": "cosin"},
-            "--model.match-head must be one of mlp, linear, cosine, none, not 'cosin'",
-        ),
-        (ModelConfig, {"dtype": "float16"}, "--model.dtype must be one of float32, bfloat16, float64, not 'float16'"),
-        (OptimConfig, {"decay": "cosin"}, "--optim.decay must be one of linear, cosine, not 'cosin'"),
-        (DataConfig, {"order": "alternating"}, "--data.order must be one of alternate, random, not 'alternating'"),
-        (
-            DataConfig,
-            {"background": "substract"},
-            "--data.background must be one of keep, subtract, either, not 'substract'",
-        ),
-        (DataConfig, {"require": ("image", "txt")}, r"--data.require\[1\] must be one of image, text, not 'txt'"),
-        (DataConfig, {"require": "image"}, "--data.require must be a list, not 'image'"),
-        (Config, {"towers": "pretraned"}, "towers must be one of none, scratch, pretrained, not 'pretraned'"),
-        (Config, {"stage": 3}, "stage must be one of 1, 2, not 3"),
-        (Config, {"stage": "2"}, "stage must be one of 1, 2, not '2'"),
-    ],
-)
-def test_choices_that_there_are_not_are_errors(kind, options, message):
-    """From Python nothing else reads them: a slip would train something else."""
-    sound = {ModelConfig: preset("tiny").model, Config: preset("tiny")}
-    with pytest.raises(ConfigError, match=f"^{message}$"):
-        replace(sound.get(kind) or kind(), **options)
-    if kind is Config:
-        for stage in (1, 2):
-            with pytest.raises(ConfigError, match=f"^{message}$"):
-                preset("tiny", **{"stage": stage, **options})
-
-
-def test_numbers_that_mean_nothing_of_it_are_not():
-    LossConfig(mask_ratio=0.0, universal_end=0.0, match_weight=0.0)
-    OptimConfig(learning_rate=0.0, warmup=0, grad_clip=None)
-    DataConfig(flip=0.0, jitter=(0.0, 0.0, 0.0, 0.0), rotation=0.0, clip_share=0.0, threads=0, prefetch=0)
-    RunConfig(save_every=0, figure_every=0, max_skipped=0)
-    replace(preset("tiny").model, sensor_tokens=0, lora_rank=0)
-
-
-def test_wrong_presets_are_errors():
-    with pytest.raises(ConfigError, match=r"unknown preset 'huge'\. Choose one of tiny, small, base, large"):
-        preset("huge")
-    with pytest.raises(ConfigError, match="recipe must be one of paper, release, not 'papr'"):
-        preset("tiny", recipe="papr")
-    with pytest.raises(ConfigError, match="needs towers"):
-        preset("tiny", stage=2, towers="none")
-
-
-def test_rows_of_sensors():
-    model = preset("tiny").model
-    assert [model.sensor_row(name) for name in ("gelsight", "digit", "duragel", "universal")] == [0, 1, 4, 9]
-    assert model.universal_row == 9
-    with pytest.raises(ConfigError, match="'gelsigt' is not known: did you mean gelsight"):
-        model.sensor_row("gelsigt")
-    with pytest.raises(ConfigError, match="'tac3d' measures a force field"):
-        model.sensor_row("tac3d")
-    assert replace(model, sensors=("universal", "mine")).universal_row == 0
 
 
 @pytest.mark.parametrize(
@@ -278,10 +178,6 @@ def test_warm_up_is_a_twentieth_or_a_twelfth(stage, steps, expected):
     assert config.warmup == expected
     assert replace(config, optim=replace(config.optim, warmup=7)).warmup == 7
     assert replace(config, optim=replace(config.optim, warmup=0)).warmup == 0
-
-
-def test_the_keep_ratio():
-    assert LossConfig().keep_ratio == 0.25 and LossConfig(mask_ratio=1.0).keep_ratio == 0.0
 
 
 def parameters(config):
@@ -329,15 +225,6 @@ def test_what_is_frozen():
     assert {n for n, v in match_rules(one.frozen, flatten(build(one.model).abstract())).items() if v} == {
         "decoder/position"
     }
-
-
-def test_configs_are_static():
-    config = preset("tiny", stage=2)
-    with pytest.raises(AttributeError):
-        config.stage = 1
-    assert isinstance(hash(config), int)
-    assert not any(re.match("jax", name) for name in sys.modules["anytouch_jax.config"].__dict__)
-    assert TextTower(Stack(8, 1, 1, 8)).end_token is None
 
 
 OLD = {  # settings of version 0.1, at values that changed nothing
@@ -396,7 +283,3 @@ def test_a_retired_setting_with_an_effect_stops_a_run_but_not_an_encoder(change)
 def test_json_has_limits(text, words):
     with pytest.raises(ConfigError, match=words):
         parse_json(text)
-
-
-def test_json_within_the_limits_is_read():
-    assert parse_json(b'{"a": [1, 2.5, null, true, "\\ud83d\\ude00"]}') == {"a": [1, 2.5, None, True, "\U0001f600"]}

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import jax
 import numpy as np
-import pyarrow as pa
 import pytest
-from runs import run_config, train
+from runs import run_config
 from touch_world import make_touches
 
 from anytouch_jax.cli import app
-from anytouch_jax.config import from_json, presets, to_json
+from anytouch_jax.config import from_json, to_json
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder import adapt as module
 from anytouch_jax.encoder.adapt import adapt, choose_frames, save
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
@@ -82,12 +79,6 @@ def test_the_loss_falls_on_frames_that_were_not_fitted(fitted):
     assert len(adapted.losses) == 40 and np.isfinite(adapted.losses).all()
 
 
-def test_the_same_seed_gives_the_same_tokens(fitted, run, table):
-    again = adapt(run, table, "gelslim", frames=8, labels="hardness", steps=40)
-    np.testing.assert_array_equal(again.params["touch"]["sensor_tokens"], fitted[0].params["touch"]["sensor_tokens"])
-    assert again.losses == fitted[0].losses
-
-
 def test_the_result_is_a_run_that_embeds(fitted, run, tmp_path):
     adapted, _ = fitted
     save(adapted, run, tmp_path / "out")
@@ -122,21 +113,6 @@ def test_a_sensor_outside_the_table_gets_a_new_row(run, table, tmp_path):
     np.testing.assert_array_equal(encoder.encode_touch(stills, "my_gel"), encoder.encode_touch(stills, "universal"))
 
 
-def test_a_model_without_universal_tokens_starts_from_the_mean_of_its_sensors(run, table, tmp_path):
-    params, text, _ = checkpoint.load_params(run)
-    config = presets.apply_baseline("no_universal", from_json(text))
-    other = stored(tmp_path / "own", config, params, seen=["gelsight", "digit"])
-    tokens = np.asarray(adapt(other, table, "my_gel", frames=0).params["touch"]["sensor_tokens"])
-    np.testing.assert_allclose(tokens[10], params["touch"]["sensor_tokens"][:2].mean(0), rtol=1e-6)
-    np.testing.assert_array_equal(tokens[9], params["touch"]["sensor_tokens"][9])  # of others nothing changes
-
-
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"steps": -3}, {"frames": -1}])
-def test_numbers_that_make_no_sense_are_refused(run, table, wrong):
-    with pytest.raises(UserError, match="frames are 0 or more and steps 1 or more"):
-        adapt(run, table, "gelslim", **wrong)
-
-
 def test_frames_come_from_as_many_recordings_as_there_are(table):
     rows = choose_frames(table, "gelslim", "train", 12)
     sequence = [table.value(row, "sequence") for row in rows]
@@ -150,27 +126,7 @@ def test_frames_come_from_as_many_recordings_as_there_are(table):
         choose_frames(table, "gelslim", "train", 30)
 
 
-def test_rows_without_a_label_are_never_chosen(table):
-    train = np.flatnonzero((column(table, "sensor") == "gelslim") & (column(table, "split") == "train"))
-    classes = np.full(len(table), -1, np.int32)
-    classes[train[::2]] = 0
-    for seed in range(3):
-        assert np.isin(choose_frames(table, "gelslim", "train", 6, classes, seed), train[::2]).all()
-    np.testing.assert_array_equal(choose_frames(table, "gelslim", "train", len(train[::2]), classes), train[::2])
-    with pytest.raises(UserError, match="'train' has 12 usable frames"):
-        choose_frames(table, "gelslim", "train", 13, classes)
-
-
 # With labels ---------------------------------------------------------------------------------------------------------
-
-
-def test_labels_draw_the_new_sensor_to_the_classes_of_the_known_ones(run, table):
-    train = table.rows_of("train")  # without frames in val the loss is measured on those that were fitted
-    part = replace(table, table=table.table.take(train), source=table.source[train], number=table.number[train])
-    adapted = adapt(run, part, "gelslim", frames=4, labels="hardness", steps=40, rate=2e-2)
-    assert adapted.measured == "fitted" and adapted.after < adapted.before - 1e-3
-    before, after = flatten(checkpoint.load_params(run)[0]), flatten(adapted.params)
-    assert {n for n in before if not np.array_equal(before[n], after[n])} == {"touch/sensor_tokens"}
 
 
 @pytest.mark.parametrize(
@@ -187,18 +143,6 @@ def test_mistakes_are_one_sentence(run, table, change, told):
     with pytest.raises(UserError, match=told) as error:
         adapt(run, table, **options)
     assert "\n" not in str(error.value)
-
-
-def test_models_that_cannot_be_adapted_say_so(run, table, tmp_path):
-    params, text, _ = checkpoint.load_params(run)
-    config = from_json(text)
-    only = stored(tmp_path / "bare", config, {"decoder": params["decoder"]})
-    with pytest.raises(UserError, match="no touch encoder"):
-        adapt(only, table, "gelslim", frames=0)
-    t3 = presets.apply_baseline("t3", config)
-    other = stored(tmp_path / "t3", t3, build(t3.model).init(jax.random.key(0)), seen=["digit"])
-    with pytest.raises(UserError, match="without tokens"):
-        adapt(other, table, "gelslim", frames=0)
 
 
 def test_an_adapted_run_is_written_whole_or_not_at_all(run, table, tmp_path, monkeypatch):
@@ -218,26 +162,6 @@ def test_an_adapted_run_is_written_whole_or_not_at_all(run, table, tmp_path, mon
     assert checkpoint.load_params(tmp_path / "out")[1]
 
 
-def test_a_run_without_its_trained_sensors_is_adapted_with_a_warning(run, table, tmp_path):
-    params, text, _ = checkpoint.load_params(run)
-    said = []
-    old = stored(tmp_path / "old", from_json(text), params)
-    adapted = adapt(old, table, "gelslim", frames=0, log=said.append)
-    assert "does not store its trained sensors" in said[0] and "seen" not in adapted.metadata
-
-
-@pytest.mark.slow
-def test_what_training_saw_is_written_down(world, tiny_run, tmp_path):
-    assert checkpoint.read_metadata(tiny_run)["seen"] == ["digit", "gelsight_mini"]
-    rows = [line for line in world.read_text().splitlines() if "gelsight_mini" not in line]
-    (world.parent / "digit_only.csv").write_text("\n".join(rows))
-    config = run_config(world.parent / "digit_only.csv", 2)
-    train(config, tmp_path / "r", init=tiny_run, stop_after=1)  # what stage 1 saw counts too
-    assert checkpoint.read_metadata(tmp_path / "r")["seen"] == ["digit", "gelsight_mini"]
-    train(config, tmp_path / "r", stop_after=2)  # and is not forgotten by a run that goes on without --init
-    assert checkpoint.read_metadata(tmp_path / "r")["seen"] == ["digit", "gelsight_mini"]
-
-
 def test_the_command(run, data, tmp_path, capsys):
     args = ["adapt", "--model", run, "--data", data, "--sensor", "gelslim", "--labels", "hardness", "--frames", 8]
     args += ["--steps", 40, "--out"]
@@ -252,22 +176,6 @@ def test_the_command(run, data, tmp_path, capsys):
     assert "gelslim has the universal tokens" in capsys.readouterr().out
 
 
-def test_prototypes_of_features_of_any_length(run, table, monkeypatch):
-    labels = np.array(["hard", "soft"])[np.arange(len(table)) % 2]
-    table = manifests.replace_column(table, "label.hardness", pa.array(labels))
-    values = RNG.normal(size=(len(table), 12)).astype(np.float32)
-    values[0] = 0
-
-    def prototypes(scale):
-        monkeypatch.setattr(module, "embed_rows", lambda encoder, manifest, rows, log: (rows, values[rows] * scale))
-        return module._classes(run, table, "gelslim", "hardness", print)[1]
-
-    plain = prototypes(np.float32(1))
-    np.testing.assert_allclose(np.linalg.norm(plain, axis=1), 1, atol=1e-6)  # a row of zeros is no NaN
-    for power in (80, -80):
-        np.testing.assert_allclose(prototypes(np.float32(2.0**power)), plain, rtol=1e-6)
-
-
 def test_the_fit_does_not_depend_on_the_precision_of_jax(fitted, run, table):
     with jax.enable_x64(True):
         again = adapt(run, table, "gelslim", frames=8, labels="hardness", steps=40, log=lambda _: None)
@@ -275,14 +183,3 @@ def test_the_fit_does_not_depend_on_the_precision_of_jax(fitted, run, table):
     tokens = [np.asarray(one.params["touch"]["sensor_tokens"]) for one in (again, fitted[0])]
     np.testing.assert_array_equal(*tokens)
     assert tokens[0].dtype == np.float32
-
-
-def test_a_run_whose_arrays_do_not_fit_is_refused_even_without_a_fit(run, table, data, tmp_path):
-    params, text, _ = checkpoint.load_params(run)
-    del params["touch"]["class_token"]
-    with pytest.raises(UserError, match="class_token"):
-        adapt(stored(tmp_path / "lost", from_json(text), params), table, "gelslim", frames=0)
-    params, text, _ = checkpoint.load_params(run)
-    params["touch"]["class_token"] = params["touch"]["class_token"] * np.nan
-    with pytest.raises(UserError, match="not finite"):
-        adapt(stored(tmp_path / "nan", from_json(text), params), table, "gelslim", frames=0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.encoder.arrays import spread_lines, unit_rows
-from anytouch_jax.encoder.embed import embed_frames, read_npz, run_in_batches
+from anytouch_jax.encoder.embed import embed_frames, run_in_batches
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 
@@ -25,27 +25,10 @@ def test_batches_are_of_one_size_and_results_keep_their_order(count, shapes):
         np.testing.assert_array_equal(values, items * 2)
 
 
-def test_tuples_are_stacked_one_by_one_and_the_last_item_fills_up():
-    def check(batch):
-        first, second = batch
-        assert first.shape == (2, 3) and second.shape == (2,)
-        return first.sum(1) + second
-
-    items = [(np.full(3, i), np.int32(10 * i)) for i in range(5)]
-    np.testing.assert_array_equal(run_in_batches(check, iter(items), 2), 13 * np.arange(5))
-
-
 def test_results_that_are_not_finite_are_refused():
     huge = RNG.standard_normal((3, 2)).astype(np.float32) * np.float32(1e30)
     with np.errstate(over="ignore"), pytest.raises(UserError, match="the features are not finite"):
         run_in_batches(lambda batch: batch * batch, huge, 2)
-
-
-@pytest.mark.parametrize("rows", [np.int64(0), np.arange(2), np.zeros(0, np.int64), np.array(["a", "b", "c"])])
-def test_rows_that_do_not_fit_their_features_are_refused(tmp_path, rows):
-    np.savez(tmp_path / "f.npz", features=np.zeros((3, 2)), rows=rows)
-    with pytest.raises(UserError, match=r"f\.npz needs numeric arrays features \(n, d\) and rows"):
-        read_npz(tmp_path / "f.npz")
 
 
 @pytest.fixture(scope="module")

@@ -6,17 +6,14 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from runs import run_config
-from tiny_models import touch_model
-from weights_world import write_heads
 
-from anytouch_jax.config import Config, DataConfig, to_json
+from anytouch_jax.config import DataConfig, to_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder.base import Preprocess
-from anytouch_jax.encoder.embed import Features, embed_rows, plain_column, save_npz
-from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
+from anytouch_jax.encoder.embed import Features, embed_rows, save_npz
+from anytouch_jax.encoder.encoder import load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint, convert, safetensors
@@ -61,23 +58,6 @@ def test_what_cannot_be_embedded_is_one_sentence(encoder):
             encoder.encode_touch(CLIPS[:, 0], np.asarray(ids))
 
 
-def test_an_unknown_sensor_gets_the_universal_tokens_and_that_is_logged(encoder):
-    lines = []
-    assert encoder.sensor_row("digit", lines.append) == 1 and lines == []
-    assert encoder.sensor_row("my_sensor", lines.append) == 9
-    assert len(lines) == 1 and "'my_sensor'" in lines[0] and "universal tokens" in lines[0]
-    still = CLIPS[:, 0]
-    with pytest.warns(UserWarning, match="'my_sensor'"):  # from Python it is said as a warning
-        served = encoder.encode_touch(still, "my_sensor")
-    np.testing.assert_array_equal(served, encoder.encode_touch(still))
-    assert np.abs(encoder.encode_touch(still) - encoder.encode_touch(still, "digit")).max() > 1e-4
-    np.testing.assert_allclose(
-        encoder.encode_touch(still, np.asarray([9, 1])),
-        [encoder.encode_touch(still)[0], encoder.encode_touch(still, "digit")[1]],
-        atol=1e-6,
-    )
-
-
 def test_a_sensor_of_the_table_that_training_never_used_is_reported(encoder, tmp_path):
     assert encoder.trained_sensors == ("digit", "gelsight_mini") and encoder.universal_drawn
     lines = []
@@ -111,50 +91,6 @@ def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
     np.testing.assert_array_equal(wanted, encoder.encode_touch(CLIPS[:, 0], "digit"))
 
 
-def test_an_encoder_of_a_weights_file(tmp_path):
-    """Our metadata stores the head counts; a file without it needs a config.json next to it."""
-    wide = replace(touch_model().touch, width=64, heads=1)
-    model = touch_model(touch=wide, decoder=replace(touch_model().decoder, width=32, heads=1))
-    for heads, about in ((1, False), (4, True)):
-        here = replace(model, touch=replace(wide, heads=heads))
-        made = random_encoder(Config(here), seed=3)
-        params = build(here).init(jax.random.key(1))
-        metadata = {safetensors.MODEL_KEY: to_json(here)} if about else {}
-        path = tmp_path / f"{heads}.safetensors"
-        safetensors.write_safetensors(path, convert.to_release(params, here), metadata)
-        if not about:
-            with pytest.raises(UserError, match=r"1\.safetensors.*heads of .*touch \(width 64\)"):
-                load_encoder(path)
-            write_heads(tmp_path, here)
-        result = load_encoder(path)
-        np.testing.assert_array_equal(result.params["touch"]["patch"]["kernel"], params["touch"]["patch"]["kernel"])
-        assert result.config.model.touch == here.touch
-        wanted = Encoder(made.config, {"touch": params["touch"]}, "").encode_touch(CLIPS[:, 0], "digit")
-        np.testing.assert_allclose(result.encode_touch(CLIPS[:, 0], "digit"), wanted, atol=1e-6)
-
-
-def test_what_holds_no_encoder_is_one_sentence(tmp_path, world):
-    with pytest.raises(UserError, match="no run folder or weights file"):
-        load_encoder(tmp_path / "gone")
-    with pytest.raises(UserError, match="checkpoint"):
-        load_encoder(tmp_path)
-    with pytest.raises(UserError, match="unknown type"):
-        load_encoder(world)
-    np.savez(tmp_path / "features.npz", values=np.zeros((2, 3), np.float32), path=np.array(["a.png", "b.png"]))
-    with pytest.raises(UserError, match=r"features\.npz has no weights: path is <U5, not real numbers"):
-        load_encoder(tmp_path / "features.npz")
-
-
-def test_a_random_encoder_is_of_the_same_size_and_of_its_seed(world, encoder):
-    config = run_config(world, 2)
-    a, b, c = (random_encoder(config, seed).encode_touch(CLIPS[:, 0], "digit") for seed in (0, 0, 1))
-    assert a.shape == encoder.encode_touch(CLIPS[:, 0], "digit").shape
-    np.testing.assert_array_equal(a, b)
-    assert np.abs(a - c).max() > 1e-3
-    model = random_encoder(config).config.model
-    assert model.image is None and model.text is None and model.match_head == "none"
-
-
 # Manifests ----------------------------------------------------------------------------------------------------------
 
 
@@ -169,19 +105,6 @@ def test_a_manifest_gives_what_its_pictures_give(encoder, world):
         np.testing.assert_allclose(value, wanted[0], atol=1e-5)
 
 
-def test_every_touch_may_have_a_sensor_of_its_own(encoder):
-    side, names = encoder.config.model.image_size, encoder.config.model.sensors
-    frames = np.random.default_rng(0).integers(0, 256, (3, side, side, 3), np.uint8)
-    reported = ["gelsight_mini", "digit", "gelsight_mini"]
-    result = encoder.encode_touch(frames, reported)
-    np.testing.assert_array_equal(
-        result, encoder.encode_touch(frames, np.array([names.index(name) for name in reported]))
-    )
-    np.testing.assert_array_equal(result, encoder.encode_touch(frames, np.array(reported)))
-    with pytest.raises(UserError, match="one integer for each of the 3 touches"):
-        encoder.encode_touch(frames, reported[:2])
-
-
 def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
     manifest = manifests.read(world)
     rows, values = embed_rows(encoder, manifest, np.asarray([3, 6]), 3, "both", batch=8)
@@ -192,23 +115,6 @@ def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
         embed_rows(encoder, manifest, np.asarray([1]), 3)
     with pytest.raises(UserError, match="no rows"):
         embed_rows(encoder, manifest, np.asarray([], np.int64))
-
-
-def test_an_unknown_sensor_of_a_manifest_is_logged_once(encoder, world):
-    known = replace(encoder.config.model, sensors=("gelsight", "digit", "universal"))
-    params = {"touch": encoder.params["touch"] | {"sensor_tokens": encoder.params["touch"]["sensor_tokens"][[0, 1, 9]]}}
-    small, lines = Encoder(replace(encoder.config, model=known), params, "small"), []
-    manifest = manifests.read(world)
-    _, values = embed_rows(small, manifest, np.asarray([4, 5, 0]), batch=8, log=lines.append)
-    assert len(lines) == 1 and "'gelsight_mini'" in lines[0]
-    image = touch_evaluation([decode(world.parent / "b0.png")], 28)[None]
-    np.testing.assert_allclose(values[0], encoder.encode_touch(image)[0], atol=1e-5)
-
-
-def test_a_text_column_has_no_nulls(world):
-    manifest = manifests.read(world)
-    column = manifest.text_column("text")
-    assert column.shape == (12,) and column[0] == "a round thing, a" and column[1] == ""
 
 
 # Files --------------------------------------------------------------------------------------------------------------
@@ -236,24 +142,6 @@ def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["f.npz"]
 
 
-def test_two_processes_may_write_the_same_file(tmp_path, monkeypatch):
-    values = np.zeros((1, 2), np.float32)
-    features = Features(values, np.array([0]), {})
-    write, process = np.savez, iter((1, 2))
-    monkeypatch.setattr("os.getpid", lambda: next(process))
-
-    def meanwhile(file, **arrays):  # another process writes the whole of it while this one has begun
-        monkeypatch.setattr(np, "savez", write)
-        save_npz(tmp_path / "f.npz", features, {"by": "other"})
-        write(file, **arrays)
-
-    monkeypatch.setattr(np, "savez", meanwhile)
-    save_npz(tmp_path / "f.npz", features, {"by": "this"})
-    with np.load(tmp_path / "f.npz") as file:
-        assert str(file["about/by"]) == "this"
-    assert [path.name for path in tmp_path.iterdir()] == ["f.npz"]
-
-
 def test_a_run_of_cudnn_can_be_used_where_there_is_none(encoder, monkeypatch, tiny_run):
     """The configuration of a run trained on a GPU asks for cuDNN's attention."""
     stored = replace(encoder.config, model=replace(encoder.config.model, attention="cudnn"))
@@ -276,19 +164,6 @@ def test_a_run_that_keeps_an_average_is_used_by_it(tmp_path):
     params, _, _ = checkpoint.load_params(tmp_path)
     assert params["touch"]["a"].tolist() == [7, 7, 7] and params["decoder"]["b"].tolist() == [5, 5]
     assert set(params) == {"touch", "decoder"}
-
-
-def test_rows_of_which_none_can_be_read_are_one_sentence(encoder, world):
-    manifest = manifests.read(world)
-    lenient = replace(encoder, config=replace(encoder.config, data=replace(encoder.config.data, on_bad_sample="skip")))
-    blind = replace(lenient, config=replace(lenient.config, data=replace(lenient.config.data, background="subtract")))
-    with pytest.raises(UserError, match="untouched gel"):  # however it was trained
-        embed_rows(blind, manifests.select_rows(manifest, np.array([0])), np.array([0]), log=lambda _: None)
-    gone = {name: manifest.column(name).to_pylist() for name in manifest.table.column_names}
-    gone |= {"path": ["gone.png"] * len(manifest)}
-    with pytest.raises(UserError, match=r"none of the 2 rows can be read"):
-        lost = manifests.from_columns(gone, manifest.files[0])
-        embed_rows(lenient, lost, np.array([0, 1]), on_bad_sample="skip", log=lambda _: None)
 
 
 def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
@@ -318,29 +193,6 @@ def test_frames_of_other_types_are_seen_as_embed_reads_them(tiny_run):
     for bad in (grey, alpha, rgb.astype(np.float32)):
         with pytest.raises(UserError, match="a frame must be RGB uint8"):
             touch_evaluation([bad], 28)
-
-
-def test_names_of_pooling_and_join_and_rows_are_checked(tiny_run):
-    encoder = load_encoder(tiny_run)
-    with pytest.raises(UserError, match="pooling is one of class, mean, both, not 'cls'"):
-        encoder.encode_touch(CLIPS, "digit", pooling="cls")
-    with pytest.raises(UserError, match="join is one of mean, sum, concat, not 'max'"):
-        encoder.encode_touch(CLIPS, "digit", join="max")
-    with pytest.raises(UserError, match="one integer for each"):
-        encoder.encode_touch(CLIPS, np.full(len(CLIPS), 0.5))
-
-
-def test_a_column_of_a_manifest_becomes_an_array_without_objects(tmp_path):
-    columns = {
-        "path": ["a.png", "b.png"], "sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1],
-        "split": ["train"] * 2, "label.force": [1.5, None], "label.count": [3, 4], "label.slip": [True, None],
-        "label.pose": [[1.0, 2.0], [3.0]],
-    }  # fmt: skip
-    table = manifests.from_columns(columns, tmp_path / "m.parquet")
-    force, count = plain_column(table, "label.force"), plain_column(table, "label.count")
-    assert force[0] == 1.5 and np.isnan(force[1]) and count.tolist() == [3, 4] and count.dtype.kind == "i"
-    assert plain_column(table, "label.slip").tolist() == ["True", ""]
-    assert plain_column(table, "label.pose").tolist() == ["[1.0, 2.0]", "[3.0]"]
 
 
 def test_features_do_not_depend_on_the_precision_of_jax(tiny_run):

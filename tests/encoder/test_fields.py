@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from measuring import gel, measuring_weights
-from places import ROOT
 
-from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import fields
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
@@ -145,14 +143,6 @@ def test_a_fault_is_logged_and_no_value_is_sure(encoder, kind, word):
     for name in ("depth", "force", "torque", "area"):
         assert (getattr(bad, f"{name}_std") >= np.abs(getattr(bad, name))).all()
     assert bad.depth_std.min() >= LENGTH * 18.88 and bad.slip_std.min() >= 1
-
-
-@pytest.mark.parametrize("name", ["gelslam-gelsight_mini", "normalflow-gelsight_mini"])
-def test_a_real_unit_in_order_has_no_fault(name):
-    file = ROOT.parent / "shared" / "real_touch" / name / "background.png"
-    if file.is_file():  # the pack is not part of the repository
-        picture = decode(file)
-        assert fields.faults_of(picture, picture, "gelsight_mini", 0.75) == ()
 
 
 def test_the_part_is_kept_in_the_package_and_its_calibration_too(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.encoder import linear_head, novelty
-from anytouch_jax.encoder.novelty import Calibration, ContactGate
+from anytouch_jax.encoder.novelty import ContactGate
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits
 from experiments.real.trust import calibration_error
@@ -50,12 +50,6 @@ def test_a_limit_covers_new_groups_as_often_as_asked(alike, count, above):
         new = alike * rng.standard_normal(1) + 0.2 * rng.standard_normal(20)
         inside.append(np.mean(new <= novelty.conformal_limit(scores, groups, 0.9)))
     assert 0.9 - 0.03 < np.mean(inside) < 0.9 + above + 0.03
-
-
-def test_frames_of_one_recording_count_once():
-    scores, groups = np.array([1.0, 2.0, 3.0, 4.0]), np.arange(4)
-    many = np.repeat(np.arange(4), (1, 1, 1, 1000))
-    assert novelty.conformal_limit(scores[many], groups[many], 0.6) == novelty.conformal_limit(scores, groups, 0.6) == 3
 
 
 @pytest.mark.parametrize(("groups", "is_finite"), [(8, False), (9, True)])
@@ -111,30 +105,6 @@ def test_few_recordings_of_wide_features_raise_no_more_false_alarms_than_asked()
     assert 0.001 < np.mean(alarms) < 0.08, alarms
 
 
-def test_a_training_touch_is_not_novel():
-    x = np.random.default_rng(3).standard_normal((20, 6)).astype(np.float32)
-    references = np.repeat(x, novelty.NEIGHBOURS, 0)
-    np.testing.assert_allclose(novelty.novelty_scores(x, references), 0, atol=1e-3)
-    np.testing.assert_allclose(novelty.novelty_scores(x[:1] + 3, references[:5]), 3 * np.sqrt(6), rtol=1e-4)
-    own = novelty.novelty_scores(x, references, np.arange(20), np.repeat(np.arange(20), novelty.NEIGHBOURS))
-    assert own.min() > 0.5
-    assert np.isinf(novelty.novelty_scores(x[:1], references[:5], np.zeros(1), np.zeros(5))).all()
-
-
-def test_whitened_features_have_equal_spread():
-    rng = np.random.default_rng(8)
-    x = (rng.standard_normal((5000, 4)) * (1, 2, 3, 4)) @ np.linalg.qr(rng.standard_normal((4, 4)))[0]
-    np.testing.assert_allclose(np.cov((x @ novelty.fit_whitening(x)).T), np.eye(4), atol=0.2)
-    assert np.isfinite(novelty.fit_whitening(np.ones((5, 3)))).all()
-
-
-def test_references_are_spread_over_recordings():
-    groups = np.repeat(np.arange(10), 50)
-    chosen = novelty.choose_references(groups, 40)
-    assert len(chosen) == 40 and np.bincount(groups[chosen], minlength=10).min() >= 3
-    assert novelty.choose_references(groups[:3], 40).tolist() == [0, 1, 2]
-
-
 def test_a_sensor_that_was_not_named_is_reported():
     rng = np.random.default_rng(4)
     head = calibrated(*touches(rng, 160, sensor_shift=5.0))
@@ -157,32 +127,6 @@ def test_a_saved_head_keeps_its_calibration(tmp_path):
     for one, two in zip(head.assess(x), again.assess(x), strict=True):
         np.testing.assert_array_equal(one, two)
     assert (again.calibration.sensors == head.calibration.sensors).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("temperature", 0.0), ("temperature", "1"), ("novelty_limit", np.nan), ("references", np.zeros((2, 3))),
-        ("whitening", np.eye(3)),
-        ("references", np.full((1, WIDTH), np.inf)), ("sensors", np.zeros(3)), ("recordings", None),
-    ],
-)  # fmt: skip
-def test_a_damaged_calibration_is_refused(tmp_path, name, value):
-    head = calibrated(*touches(np.random.default_rng(6), 60))
-    linear_head.save_head(tmp_path / "h.npz", head)
-    arrays = dict(np.load(tmp_path / "h.npz"))
-    del arrays[f"calibration/{name}"]
-    np.savez(tmp_path / "h.npz", **arrays, **({} if value is None else {f"calibration/{name}": value}))
-    with pytest.raises(UserError, match=r"h\.npz is not the head"):
-        linear_head.load_head(tmp_path / "h.npz")
-
-
-def test_a_head_without_calibration_says_so():
-    head = calibrated(*touches(np.random.default_rng(6), 60))
-    bare = linear_head.LinearHead(**{**vars(head), "calibration": None})
-    with pytest.raises(UserError, match="no calibration"):
-        bare.assess(np.zeros((1, WIDTH)))
-    assert Calibration.from_arrays({}, WIDTH) is None
 
 
 def test_contact_is_a_difference_from_the_untouched_gel():

@@ -22,7 +22,6 @@ from anytouch_jax.encoder.stream import (
     Embedded,
     Frame,
     Mailbox,
-    Result,
     Reuse,
     budget,
     collect,
@@ -147,15 +146,6 @@ def test_a_slow_reader_of_a_video_loses_nothing(encoder, video):
     assert [first.number, *(one.number for one in embedded)] == list(range(8))
 
 
-def test_pooling_and_join_are_those_of_embed(encoder, video):
-    source, live = open_source(video)
-    outcome = list(stream(encoder, source, live=live, sensor=DIGIT, frames=6, pooling="both", join="concat"))
-    small = touch_evaluation(list(frames_from_video(video)), 28)
-    wanted = encoder.encode_touch(np.stack([small[:6], small[1:7], small[2:]]), "digit", pooling="both", join="concat")
-    assert wanted.shape == (3, 48)
-    np.testing.assert_allclose([one.values for one in outcome], wanted, atol=1e-5)
-
-
 # Cameras ------------------------------------------------------------------------------------------------------------
 
 
@@ -179,58 +169,6 @@ def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
     assert camera.released
 
 
-def test_the_encoder_is_compiled_once_before_the_first_frame(encoder, monkeypatch):
-    happened, camera = [], Camera(ready=1)
-    compile_for_one, grab = streams.compile_for_one, camera.grab
-    monkeypatch.setattr(
-        streams, "compile_for_one", lambda *a, **k: (happened.append("compile"), compile_for_one(*a))[1]
-    )
-    camera.grab = lambda: (happened.append("grab"), grab())[1]
-    embedded = stream(encoder, camera, live=True, sensor=DIGIT)
-    assert happened == ["compile"]
-    next(embedded)
-    camera.show(2)
-    next(embedded)
-    embedded.close()
-    camera.end()
-    assert happened[0] == "compile" and set(happened[1:]) == {"grab"}
-
-
-def test_a_stream_that_is_left_lets_its_camera_go(encoder):
-    camera = Camera(ready=1)
-    embedded = stream(encoder, camera, live=True, sensor=DIGIT)
-    next(embedded)
-    camera.end()
-    embedded.close()
-    assert camera.released
-
-
-def test_a_camera_that_hangs_does_not_hold_the_program(encoder, monkeypatch):
-    monkeypatch.setattr(streams, "_PATIENCE", 0.01)
-    camera = Camera(ready=1)
-    embedded = stream(encoder, camera, live=True, sensor=DIGIT)
-    next(embedded)
-    embedded.close()  # the reader still waits in grab()
-    assert not camera.released
-    camera.end()
-
-
-def test_what_the_reader_fails_with_reaches_the_caller(encoder):
-    camera = Camera(ready=9)
-    camera.retrieve = lambda: (True, np.zeros((32, 40, 2), np.uint8))
-    with pytest.raises(UserError, match=r"frame 0 has shape \(32, 40, 2\)"):
-        next(stream(encoder, camera, live=True, sensor=DIGIT))
-    assert camera.released
-
-    def broken():
-        raise OSError("the cable")
-
-    camera = Camera(ready=9)
-    camera.retrieve = broken
-    with pytest.raises(OSError, match="the cable"):
-        next(stream(encoder, camera, live=False, sensor=DIGIT))
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_camera_that_misses_a_read_goes_on_and_then_fails(encoder, kind):
     """The picture of another shape is a missed read. No clip spans it, and the end of a camera is never normal."""
@@ -250,19 +188,6 @@ def test_no_clip_spans_a_missed_read(encoder):
     while (clip := mailbox.take()) is not None:
         clips.append([int(frame.max()) for frame in clip.frames])
     assert clips == [[0, 1, 2], [1, 2, 3], [4, 5, 6], [5, 6, 7]]
-
-
-def test_a_camera_that_changes_its_size_for_good_fails_with_both_sizes(encoder):
-    result = collect(stream(encoder, FaultyCamera("resized"), live=True, sensor=DIGIT, log=lambda sentence: None))
-    assert result.numbers[-1] == 2 and "(16, 20, 3)" in str(result.error) and "(32, 40, 3)" in str(result.error)
-
-
-def test_a_grey_camera_is_read_as_grey_files_are(encoder):
-    camera = FaultyCamera()
-    camera.retrieve = lambda: (True, np.full((32, 40), 90 + camera.count, np.uint8))
-    result = collect(stream(encoder, camera, live=True, sensor=DIGIT, log=lambda sentence: None))
-    wanted = features_of(encoder, [np.full((32, 40, 3), 90 + i, np.uint8) for i in result.numbers], [(0,)])
-    np.testing.assert_allclose(result.values[:1], wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["frozen", "black", "ok"])
@@ -297,52 +222,6 @@ def test_times_of_a_video_are_those_of_its_frames(encoder, tmp_path):
     source, live = open_source(write_uneven_video(tmp_path / "uneven.mkv", stamps))
     outcome = list(stream(encoder, source, live=live, sensor=DIGIT))
     np.testing.assert_allclose([one.time for one in outcome], np.array(stamps) / 1000, atol=1e-6)
-
-
-def test_a_frame_of_a_video_that_cannot_be_decoded(encoder):
-    camera = Camera(ready=9)
-    camera.retrieve = lambda: (True, None)
-    assert list(stream(encoder, camera, live=False, sensor=DIGIT)) == [], "a video ends there"
-    with pytest.raises(UserError, match="frame 0 of the video cannot be decoded"):
-        list(stream(encoder, FaultyCamera("raise", 0), live=False, sensor=DIGIT))
-
-
-def test_what_cannot_be_streamed_is_one_sentence(encoder, tmp_path):
-    with pytest.raises(UserError, match="a clip needs 3 frames"):
-        stream(encoder, Camera(), live=True, sensor=DIGIT, frames=2)
-    with pytest.raises(UserError, match="stride of a clip must be at least 1, not 0"):
-        stream(encoder, Camera(), live=True, sensor=DIGIT, frames=3, stride=0)
-    with pytest.raises(UserError, match=r"no video and no camera .*gone\.avi"):
-        open_source(tmp_path / "gone.avi")
-    text = tmp_path / "text.avi"
-    text.write_text("no video")
-    with pytest.raises(UserError, match=r"text\.avi is not a video"):
-        open_source(text)
-
-
-def test_a_number_is_a_camera_unless_a_file_has_that_name(monkeypatch, tmp_path):
-    asked = []
-
-    class Opened:
-        def __init__(self, name):
-            asked.append(name)
-
-        def isOpened(self):
-            return asked[-1] != 7
-
-        def grab(self):
-            return True
-
-        def set(self, *_):
-            pass
-
-    monkeypatch.setattr(cv2, "VideoCapture", Opened)
-    monkeypatch.chdir(tmp_path)
-    assert open_source("0")[1] and asked == [0]
-    with pytest.raises(UserError, match="camera 7 cannot be opened"):
-        open_source("7")
-    (tmp_path / "3").write_bytes(b"")
-    assert not open_source("3")[1] and asked[-1] == str(tmp_path / "3")
 
 
 # Reuse --------------------------------------------------------------------------------------------------------------
@@ -400,12 +279,6 @@ def test_reuse_of_equal_clips_changes_no_bit(encoder, embedded_clips, frames):
     assert budget(found)[-1].endswith(f"{len(clips) - sum(new)} reused")
 
 
-def test_a_gel_that_nobody_touches_is_embedded_once(encoder, embedded_clips):
-    film = Film(np.full((6, 28, 28, 3), 90, np.uint8))
-    assert collect(stream(encoder, film, live=False, sensor=DIGIT)).reused.tolist() == [False] + [True] * 5
-    assert len(embedded_clips) == 1
-
-
 def test_noise_is_reused_and_a_small_touch_is_not():
     """The noise is learned first. A slow drift adds up, since clips are compared with the one that was embedded."""
     rng = np.random.default_rng(0)
@@ -432,41 +305,6 @@ def test_noise_is_reused_and_a_small_touch_is_not():
 
 def clip(number: int) -> Clip:
     return Clip(Frame(number, np.zeros(0), 0.0, 0.0), np.zeros(0), 0.0)
-
-
-def test_a_newer_clip_takes_the_place_of_an_older_one():
-    mailbox = Mailbox(replace=True)
-    assert mailbox.put(clip(0)) and mailbox.put(clip(1))
-    assert mailbox.take().last.number == 1
-
-
-def test_what_lies_in_the_mailbox_is_taken_after_the_end():
-    for replace in (True, False):
-        mailbox = Mailbox(replace=replace)
-        assert mailbox.put(clip(0))
-        mailbox.close()
-        assert mailbox.take().last.number == 0 and mailbox.take() is None and not mailbox.put(clip(1))
-        assert mailbox.take() is None
-
-
-def test_a_failure_comes_after_what_was_read_before_it():
-    mailbox = Mailbox(replace=False)
-    mailbox.put(clip(0))
-    mailbox.close(OSError("first"))
-    mailbox.close(OSError("second"))
-    assert mailbox.take().last.number == 0
-    with pytest.raises(OSError, match="first"):
-        mailbox.take()
-
-
-def test_a_reader_that_waits_for_the_slot_goes_on_when_the_stream_is_left():
-    mailbox, answers = Mailbox(replace=False), []
-    mailbox.put(clip(0))
-    reader = threading.Thread(target=lambda: answers.append(mailbox.put(clip(1))))
-    reader.start()
-    mailbox.close()
-    reader.join(60)
-    assert answers == [False] and mailbox.take().last.number == 0
 
 
 # Results ------------------------------------------------------------------------------------------------------------
@@ -514,22 +352,3 @@ def test_sigterm_keeps_what_there_is_and_a_long_stream_only_its_last_times(monke
     assert result.total == 9 and result.numbers.tolist() == [6, 7, 8]
     assert budget(result)[-1].startswith("9 frames embedded; of the last 3: 0 dropped")
     assert len(collect(some(9)).values) == 9, "features are all kept"
-
-
-def test_nothing_is_a_result_too():
-    result = collect(some(0))
-    assert result.values.shape == (0, 0) and result.seconds.shape == (0, 4)
-    assert budget(result)[-1] == "0 frames embedded, 0 dropped, nan frames/s"
-
-
-def test_the_budget_names_each_part():
-    seconds = np.zeros((101, 4))
-    seconds[:, 3] = np.arange(101) / 1000  # 0 .. 100 ms
-    seconds[:, 1] = 0.002
-    numbers = np.arange(101) * 2
-    result = Result(np.zeros((101, 3)), numbers, np.arange(101) / 25, seconds, np.full(101, 0.05), 101, False)
-    lines = {line.rsplit(maxsplit=2)[0]: line.split()[-2:] for line in budget(result)[1:-1]}
-    assert list(lines) == [*PARTS, "frame to features"]
-    assert lines["encoder"] == ["50.00", "99.00"] and lines["resize"] == ["2.00", "2.00"]
-    assert lines["frame to features"] == ["50.00", "50.00"]
-    assert budget(result)[-1] == "101 frames embedded, 100 dropped, 25.0 frames/s"

@@ -64,14 +64,6 @@ def test_towers_equal_those_of_training(encoder, stored):
     np.testing.assert_allclose(unit_rows(encoder.encode_image(PHOTOS)), z.image, atol=1e-5)
 
 
-def test_batches_do_not_change_embeddings(encoder):
-    np.testing.assert_allclose(encoder.encode_text(TEXTS, batch=2), encoder.encode_text(TEXTS), atol=1e-5)
-    np.testing.assert_allclose(encoder.encode_image(PHOTOS, batch=2), encoder.encode_image(list(PHOTOS)), atol=1e-5)
-    np.testing.assert_allclose(encoder.encode_text(TEXTS[1])[0], encoder.encode_text(TEXTS)[1], atol=1e-5)
-    np.testing.assert_allclose(encoder.encode_image(PHOTOS[1])[0], encoder.encode_image(PHOTOS)[1], atol=1e-5)
-    assert encoder.encode_text([]).shape == encoder.encode_image([]).shape == (0, 12)
-
-
 def test_similarity_is_a_cosine_and_a_softmax_at_the_learned_temperature(encoder, stored):
     touch, texts = encoder.encode_touch(STILLS, "digit"), encoder.encode_text(TEXTS)
     cosine = encoder.similarity(touch, TEXTS)
@@ -95,15 +87,6 @@ def test_the_matching_head_of_a_run(encoder, stored):
     wanted = jax.jit(net.match)(stored.params, unit_rows(first), unit_rows(second))
     np.testing.assert_allclose(logits, wanted, atol=1e-5)
     assert logits.shape == (7,) and np.ptp(logits) > 1e-4
-
-
-def test_towers_go_to_the_device_only_when_they_are_called(stored):
-    encoder = load_encoder(stored.run)
-    encoder.encode_touch(STILLS, "digit")
-    assert set(encoder._compiled) == {("class", "mean")} and set(encoder.params) == {"touch"}
-    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(encoder.others["text"]))
-    encoder.encode_text(TEXTS)
-    assert set(encoder._compiled) == {("class", "mean"), "encode_text"}
 
 
 def test_absent_towers_and_wrong_types_are_one_sentence(encoder, stored, tiny_run, tmp_path):
@@ -130,19 +113,3 @@ def test_absent_towers_and_wrong_types_are_one_sentence(encoder, stored, tiny_ru
     object.__setattr__(other, "tokenizer_file", tmp_path / "tokenizer.json")
     with pytest.raises(UserError, match="tokens, the text tower"):
         other.encode_text(TEXTS)
-
-
-def test_towers_do_not_depend_on_the_precision_of_jax(stored):
-    touch = RNG.normal(size=(3, 12)).astype(np.float32)
-
-    def all_of_it():
-        encoder = load_encoder(stored.run)
-        texts = encoder.encode_text(TEXTS)
-        chances = encoder.similarity(touch, TEXTS, probabilities=True)
-        return [texts, encoder.encode_image(PHOTOS), chances, encoder.match(touch, touch[::-1])]
-
-    plain = all_of_it()
-    with jax.enable_x64(True):
-        wide = all_of_it()
-    for one, other in zip(plain, wide, strict=True):
-        np.testing.assert_array_equal(one, other)

@@ -12,7 +12,6 @@ from tiny_models import tiny_config
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import random_encoder
-from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import counterfactual as cf
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore
 from anytouch_jax.evaluate.probing import probe_tasks
@@ -98,8 +97,3 @@ def test_the_background_alone_is_the_same_for_all_frames_of_a_gel(tmp_path):
     np.testing.assert_array_equal(background[0], background[1])
     np.testing.assert_allclose(mean, np.repeat(real.mean(0)[None], 2, 0))
     assert not np.allclose(real[0], background[0])
-
-
-def test_one_encoder_is_compared(tmp_path):
-    with pytest.raises(UserError, match="one encoder"):
-        cf.probe_counterfactual(["a", "b"], [tmp_path / "m.csv"])

@@ -167,12 +167,6 @@ def test_the_order_of_frames(monkeypatch, encoder, pictures):
     assert np.abs(values["right"] - values["repeated"]).max() > 1e-4
 
 
-def test_universal_tokens_for_sensors_that_the_model_knows(encoder, pictures):
-    known, universal = (encoder_features(encoder, pictures, universal=one) for one in (False, True))
-    rows = np.flatnonzero(np.array(pictures.column("sensor").to_pylist()) == "digit")[:3]
-    assert np.abs(known.get(rows[:, None], 1) - universal.get(rows[:, None], 1)).max() > 1e-4
-
-
 # ---- raw pixels ---------------------------------------------------------------------------------------------
 
 HALF = 24 * 32 * 3
@@ -199,21 +193,6 @@ def test_pixels_are_block_means_in_colour() -> None:
     assert np.abs(turned[:, :HALF] - features[:, :HALF]).mean() > 0.05, "colour depends on slope and must be used"
 
 
-@pytest.mark.parametrize("shape", [(320, 240), (50, 77), (30, 33)])
-def test_any_size_is_averaged_by_area(shape: tuple[int, int]) -> None:
-    frame = noise(1, *shape)
-    fine = np.repeat(np.repeat(frame[0] / 255, 24, 0), 32, 1)  # 24 x 32 whole blocks, whatever the shape
-    expected = fine.reshape(24, shape[0], 32, shape[1], 3).mean((1, 3))
-    np.testing.assert_allclose(raw_pixels(frame, frame)[0, :HALF], expected.ravel(), atol=1e-5)
-
-
-def test_a_frame_like_its_background_has_no_difference() -> None:
-    frames = noise(4)
-    assert not raw_pixels(frames, frames)[:, HALF:].any()
-    assert raw_pixels(frames, noise(4, seed=2))[:, HALF:].any(axis=1).all()
-    assert not feature_cache.raw_pixels(frames[0], None)[HALF:].any()
-
-
 def test_components_are_those_of_train() -> None:
     rng = np.random.default_rng(0)
     features = rng.normal(size=(60, 10)) * np.array([9, 5, *[0.1] * 8])
@@ -224,16 +203,6 @@ def test_components_are_those_of_train() -> None:
     wild = features.copy()
     wild[~train] *= 100
     np.testing.assert_allclose(principal_components(wild, train, 2)[train], kept[train], atol=1e-5)
-
-
-def test_few_rows_give_few_components() -> None:
-    frames = noise(12)
-    assert principal_components(raw_pixels(frames, noise(12, seed=1)), np.arange(12) < 9).shape == (12, 9)
-
-
-def test_components_need_rows_of_train() -> None:
-    with pytest.raises(UserError, match="train"):
-        principal_components(np.ones((3, 2)), np.zeros(3, bool))
 
 
 # ---- features files ----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Heads on frozen features: their optimum, their options, their steps; saved heads."""
+"""Heads on frozen features: their optimum, their options, their steps; saved heads; logistic regression."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import jax
 import numpy as np
 import optax
 import pytest
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import log_loss
 from task_world import blobs
 
 from anytouch_jax.encoder import linear_head, search
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads
-from anytouch_jax.evaluate.heads import GradientRecipe, LinearModel, ProbeHead, fit_head, linear_path
-from anytouch_jax.evaluate.splits import best_option
+from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead, fit_head, linear_path
 
 FIT, TEST = slice(0, 500), slice(500, 700)
 
@@ -45,43 +46,7 @@ def test_every_head_learns_a_number(name, least):
     assert 1 + max(scores(head, 0)) / np.var(data(0)[1][TEST]) > least
 
 
-@pytest.mark.parametrize("name", ["linear", "knn", "gradient"])
-def test_a_single_class_is_predicted_everywhere(name):
-    x, _ = data()
-    fitted = fit_head(ProbeHead(name), x[FIT], np.full(500, 2), 4)
-    predicted = fitted.predict(x[TEST])
-    assert len(fitted.options) == len(predicted) > 1 and {2} == set(np.ravel(predicted))
-
-
-def test_an_unknown_head_is_refused():
-    with pytest.raises(UserError, match="forest"):
-        scores(ProbeHead("forest"), 4)
-
-
 # ---- linear heads ------------------------------------------------------------------------------------------
-
-
-def weights_of(model: LinearModel) -> np.ndarray:
-    assert model.fit is not None
-    return model.fit.weights
-
-
-def test_logistic_regression_is_at_its_optimum():
-    x, y = blobs(classes=3)
-    x = x * 3 + 1
-    (model,) = linear_path(x, y, [0.1])
-    scaled = (x - x.mean(0)) / x.std(0)
-    logits = scaled @ weights_of(model) + model.fit.bias
-    share = np.exp(logits - logits.max(1, keepdims=True))
-    share /= share.sum(1, keepdims=True)
-    gradient = (share - np.eye(3)[y]).T @ scaled / len(y) + 0.1 * weights_of(model).T
-    assert np.abs(gradient).max() < 5e-3
-
-
-def test_a_penalty_means_the_same_for_any_number_of_rows():
-    x, y = blobs()
-    (once,), (thrice,) = linear_path(x, y, [0.1]), linear_path(np.tile(x, (3, 1)), np.tile(y, 3), [0.1])
-    np.testing.assert_allclose(weights_of(thrice), weights_of(once), atol=2e-3)
 
 
 @pytest.mark.parametrize("name", ["linear", "knn"])
@@ -113,14 +78,6 @@ def test_features_of_any_magnitude_give_the_same_predictions(name, classes, scal
     (x, y), head = data(classes), ProbeHead(name, scaling)
     plain, scaled = (fit_head(head, rows[FIT], y[FIT], classes).predict(rows[TEST]) for rows in (x, np.ldexp(x, power)))
     np.testing.assert_array_equal(plain, scaled)
-
-
-def test_a_start_changes_no_prediction():
-    x, y = data()
-    start = linear_path(x[FIT], y[FIT], [0.01])[0]
-    assert scores(ProbeHead(options=(0.001,)), 4, start) == pytest.approx(
-        scores(ProbeHead(options=(0.001,)), 4), abs=0.006
-    )
 
 
 def test_ridge_equals_its_normal_equations():
@@ -195,21 +152,6 @@ def test_the_gradient_head_is_drawn_from_its_seed_and_its_rate_falls_to_zero(mon
     assert np.all(np.diff(rates[:15]) < 0)
 
 
-@pytest.mark.parametrize("classes", [0, 4])
-def test_the_gradient_head_does_not_depend_on_the_precision_of_jax(classes):
-    (x, y), head = data(classes), ProbeHead("gradient", recipe=GradientRecipe(epochs=3, batch=100))
-    plain = fit_head(head, x[FIT], y[FIT], classes).predict(x[TEST])
-    with jax.enable_x64(True):
-        np.testing.assert_array_equal(fit_head(head, x[FIT], y[FIT], classes).predict(x[TEST]), plain)
-
-
-def test_the_gradient_head_reads_unscaled_features():
-    """As in the released code nothing is standardised: shrunken features learn less in the same steps."""
-    (x, y), head = data(), ProbeHead("gradient", recipe=GradientRecipe(epochs=2, batch=100))
-    plain, small = (fit_head(head, rows[FIT], y[FIT], 4).predict(rows[TEST])[-1] for rows in (x, x * 1e-3))
-    assert np.mean(plain == y[TEST]) > np.mean(small == y[TEST])
-
-
 def test_the_gradient_head_equals_a_run_of_optax():
     x, y = data(2)
     recipe = GradientRecipe(epochs=2, batch=50, rate=0.01, decay=0.1)
@@ -271,6 +213,41 @@ def test_heads_of_the_first_release_still_load(tmp_path):
             linear_head.load_head(tmp_path / "h.npz")
 
 
-def test_the_middle_of_equals_is_selected():
-    assert best_option([0.5, 1.0, 1.0, 1.0, 0.5]) == 2
-    assert best_option([-4.0, -0.1]) == 1
+# Logistic regression --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("classes", [2, 3, 20])
+@pytest.mark.parametrize("penalty", [1.0, 0.01, 0.0001])
+def test_the_optimum_is_scikit_learns(classes, penalty):
+    x, y = blobs(classes=classes)
+    ours = list(heads.logistic_path(x, y, classes, [1.0, penalty][penalty == 1.0 :]))[-1]
+    model = LogisticRegression(C=1 / (penalty * len(y)), tol=1e-8, max_iter=5000)
+    model.fit(x.astype(np.float64), y)
+    theirs = log_loss(y, model.predict_proba(x), labels=range(classes)) + penalty / 2 * np.sum(model.coef_**2)
+    assert ours.finished
+    assert abs(ours.loss - theirs) < 1e-4
+    logits, weights = x @ ours.weights + ours.bias, ours.weights
+    exact = np.mean(np.logaddexp(0, -np.where(y == 1, 1, -1) * logits[:, 0])) if classes == 2 else np.mean(
+        np.log(np.exp(logits).sum(1)) - logits[np.arange(len(y)), y])  # fmt: skip
+    assert exact + penalty / 2 * np.sum(weights**2) == pytest.approx(ours.loss, abs=1e-5)
+    assert np.mean(ours(x) == model.predict(x)) > 0.99
+
+
+def test_a_start_saves_steps_and_changes_nothing(monkeypatch):
+    x, y = blobs()
+    calls = []
+    plain = heads._log_loss
+    monkeypatch.setattr(heads, "_log_loss", lambda *a: calls.append(1) or plain(*a))
+    cold = next(heads.logistic_path(x, y, 4, [0.001]))
+    took = len(calls)
+    warm = next(heads.logistic_path(x, y, 4, [0.001], cold))
+    assert len(calls) - took < took / 3
+    assert warm.loss == pytest.approx(cold.loss, abs=1e-6)
+
+
+def test_more_features_than_rows_is_no_obstacle():
+    x, y = blobs(n=30, d=80, classes=3, apart=3.0)
+    fit = next(heads.logistic_path(x, y, 3, [0.01]))
+    assert np.isfinite(fit.loss) and np.mean(fit(x) == y) == 1.0
+    constant = np.concatenate([x, np.zeros((30, 4), np.float32)], 1)
+    assert next(heads.logistic_path(constant, y, 3, [0.01])).loss == pytest.approx(fit.loss, abs=1e-4)

@@ -87,17 +87,6 @@ def test_scores_are_means_over_clips(tmp_path, background):
     assert ("untouched reconstruction" in result) == (background == "subtract") and "plain next_frame" in result
 
 
-def test_what_cannot_be_scored_is_refused(tmp_path):
-    manifest = manifests.read(make_touches(tmp_path, touches={"test": 1}, sensors=("digit",), frames=4, size=28))
-    config = tiny_config(1)
-    with pytest.raises(ValueError, match="at least one clip"):
-        pixel_scores({}, manifest, np.zeros(0, np.int64), net=NET, config=config)
-    with pytest.raises(ValueError, match="norm_pix_loss"):
-        ends = manifest.clips(4, "test")[:, -1]
-        relative = replace(config, objective=replace(config.objective, norm_pix_loss=True))
-        pixel_scores({}, manifest, ends, net=NET, config=relative)
-
-
 # Pictures
 
 CONFIG = tiny_config(1)
@@ -137,16 +126,6 @@ def test_a_clip_is_shown_with_its_mask_reconstruction_and_next_frame():
         assert (filled[:, hidden[sample]] != CLIP[sample, :3][:, hidden[sample]]).mean() > 0.9
         np.testing.assert_array_equal(grid[sample, 9], CLIP[sample, 3])
         assert (grid[sample, 10] != CLIP[sample, 3]).mean() > 0.9
-
-
-def test_a_still_has_three_panels_and_the_mask_follows_the_seed():
-    still = CLIP[:, :1]
-    first, second = (
-        cells(reconstruction_panels(PARAMS, still, SENSOR, net=NET, config=CONFIG, seed=seed)) for seed in (0, 5)
-    )
-    assert first.shape[:2] == (2, 3)
-    for grid, seed in ((first, 0), (second, 5)):
-        np.testing.assert_array_equal((grid[:, 1] == 128).all(-1), hidden_pixels(still, seed))
 
 
 def test_normalised_patches_are_brought_back_to_pixels(monkeypatch):

@@ -8,7 +8,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -16,13 +15,11 @@ import numpy as np
 import pytest
 from markdown_it import MarkdownIt
 from markdown_it.common.utils import escapeHtml
-from touch_world import SENSORS, make_touches
+from touch_world import make_touches
 
 from anytouch_jax.config import from_json, to_json
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import plots, report
 from anytouch_jax.evaluate.report import (
     LABELS,
     PIXELS,
@@ -30,11 +27,8 @@ from anytouch_jax.evaluate.report import (
     VECTOR,
     Section,
     demo_report,
-    retrieval_section,
-    samples_section,
     write_report,
 )  # fmt: skip
-from anytouch_jax.evaluate.retrieval import MatchScore, cross_sensor_retrieval
 from anytouch_jax.evaluate.statistics import as_text, markdown_table
 from anytouch_jax.weights import checkpoint
 
@@ -127,111 +121,6 @@ def touched(tmp_path_factory: Any) -> Path:
     return make_touches(tmp_path_factory.mktemp("touched"), touches=counts, frames=4, each=3)
 
 
-def changed(path: Path, **columns: Any) -> manifests.Manifest:
-    manifest = manifests.read(path)
-    return manifests.from_columns(manifest.table.to_pydict() | columns, path)
-
-
-@pytest.fixture
-def grids(monkeypatch: Any) -> list[Any]:
-    """The arguments of each sample grid that is drawn."""
-    seen: list[Any] = []
-    draw = plots.sample_grid
-
-    def keep(*args: Any) -> None:
-        seen.append(args)
-        draw(*args)
-
-    monkeypatch.setattr(plots, "sample_grid", keep)
-    return seen
-
-
-def test_samples_show_one_touch_a_row(touched: Path, tmp_path: Path, grids: list[Any]) -> None:
-    manifest = manifests.read(touched)
-    coarse, fine = samples_section(manifest, tmp_path)
-    assert (coarse.title, fine.title) == ("Samples, coarse", "Samples, fine")
-    assert fine.figure == tmp_path / "figures" / "samples_fine.png" and fine.figure.is_file()
-    _, images, rows, columns = grids[1]
-    assert columns == [*SENSORS, "photograph"] and len(set(rows)) == len(rows) == 5  # five objects
-    lines = fine.notes.splitlines()
-    assert len(lines) == 5 and lines[0].startswith(f"1. *{rows[0]}*: ")
-    assert all(one.shape == (40, 30, 3) for one in (line[3] for line in images))  # fine ones have a photograph
-    assert all(line[3] is None for line in grids[0][1])  # coarse ones have none
-    texts, touch = manifest.column("text").to_pylist(), manifest.column("touch").to_pylist()
-    for line, note in zip(images, lines, strict=True):
-        first = next(i for i in range(len(manifest)) if same_frame(manifest, i, line[0]))
-        caption = {texts[i] for i in range(len(manifest)) if touch[i] == touch[first]}.pop() or "no caption"
-        assert note.endswith(f": {caption}")
-        for j in (1, 2):  # the other sensors' frames are of the same touch
-            assert any(touch[i] == touch[first] and same_frame(manifest, i, line[j]) for i in range(len(manifest)))
-
-
-def same_frame(manifest: manifests.Manifest, row: int, image: Any) -> bool:
-    return np.array_equal(cv2.imread(str(manifest.file(row)))[..., ::-1], image)
-
-
-def test_samples_of_a_force_field_and_of_a_missing_sensor(touched: Path, tmp_path: Path, grids: list[Any]) -> None:
-    field = np.zeros((20, 20, 6))
-    field[3, 4] = (3.0, 0.0, 4.0, 9.0, 9.0, 9.0)  # mm, and the force in N, which is none of the size
-    np.save(touched.parent / "field.npy", field)
-    table = manifests.read(touched).table
-    gelslim = [one == "gelslim" for one in table["sensor"].to_pylist()]
-    sensor = ["tac3d" if yes else name for yes, name in zip(gelslim, table["sensor"].to_pylist(), strict=True)]
-    touch = [None if name == "digit" else one for name, one in zip(sensor, table["touch"].to_pylist(), strict=True)]
-    manifest = changed(
-        touched, sensor=sensor, touch=touch, field_path=["field.npy" if yes else None for yes in gelslim]
-    )
-    samples_section(manifest, tmp_path)
-    _, images, _, columns = grids[0]
-    assert columns == ["gelsight", "tac3d", "photograph"]
-    assert all(line[1].shape == (20, 20) and line[1][3, 4] == 5.0 for line in images)
-    (touched.parent / "field.npy").write_bytes(b"no array")
-    with pytest.raises(UserError, match=r"column 'field_path', is no field of forces"):
-        samples_section(manifest, tmp_path)
-
-
-def scored(manifest: manifests.Manifest, size: int = 10) -> dict[str, Any]:
-    rows = manifest.rows_of("test")
-    code = manifest.codes("touch")[rows]
-    rng = np.random.default_rng(0)
-    features = {"stage 2": rng.normal(size=(900, 8))[code], "random": rng.normal(size=(len(rows), 8))}
-    kinds = {"matched": ("label.force",), "by chance": None}
-    return {
-        kind: cross_sensor_retrieval(manifest, features, rows, gallery_size=size, match=match)
-        for kind, match in kinds.items()
-    }
-
-
-def test_the_table_of_retrieval(touched: Path, tmp_path: Path) -> None:
-    section, changes = retrieval_section({"fine": scored(manifests.read(touched))}, "stage 2", ["a note"], tmp_path)
-    rows = [line for line in section.table.splitlines() if line.startswith("| fine")]
-    assert rows[0].startswith("| fine | stage 2 | 100.0 % (100.0 to 100.0) | 100.0 % | 100.0 %")
-    assert rows[0].endswith("| 10 | 180 |") and len(rows) == 3
-    mean, low, high = changes["fine"]["random"]
-    assert list(changes["fine"]) == ["random"] and 0.7 < low <= mean <= high <= 1
-    assert rows[2] == f"| fine | random | {100 * mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f}) |"
-    assert "nearest in force" in section.text and section.notes == "- a note"
-    lock, _ = retrieval_section(
-        {"fine": {"by chance": scored(manifests.read(touched))["by chance"]}}, "x", [], tmp_path
-    )
-    assert "| fine | random | - | - | - |" in lock.table
-    empty, none = retrieval_section({}, "stage 2", ["nothing scored"], tmp_path)
-    assert empty.figure is None and not none and "nothing scored" in empty.notes
-
-
-def test_the_section_of_matching_shows_both_ways(monkeypatch: Any) -> None:
-    found = [
-        MatchScore("any", 0.8, 0.7, 0.9, 0.85, 0.65, 300, 60),
-        MatchScore("same_sensor", 0.6, 0.5, 0.7, 0.7, 0.5, 9, 3),
-    ]
-    study = SimpleNamespace(test=lambda values: values, classes={"stage 2": None}, rows=None, manifest=None)
-    monkeypatch.setattr("anytouch_jax.evaluate.retrieval.score_matching", lambda *_: found)
-    section, numbers = report._matching(study, None)  # type: ignore[arg-type]
-    lines = section.table.splitlines()
-    assert lines[2] == "| of any sensor | 80.0 % (70.0 to 90.0) | 0.850 | 65.0 % | 300 |" and len(lines) == 4
-    assert section.notes == "" and section.figure is None and numbers["found"] == found
-
-
 @pytest.fixture(scope="module")
 def later(tiny_run: Path, tmp_path_factory: Any) -> Path:
     """A run that calls itself one of stage 2, with the weights and the log of `tiny_run`."""
@@ -303,71 +192,6 @@ def test_the_numbers_of_the_demo_report(demo: tuple[Path, list[str]], touched: P
     assert [one["probe"] for one in probes["hardness"]] == [*NAMES, PIXELS]
     assert all(one["n_train"] == 36 and one["test_groups"] <= 10 for one in probes["force"])
     assert all("r2" in one for one in probes["force"]) and all("accuracy" in one for one in probes["indenter"])
-
-
-def test_the_reconstructions_show_each_sensor(demo: tuple[Path, list[str]]) -> None:
-    image = cv2.imread(str(demo[0].parent / "figures" / "reconstructions.png"))
-    assert image.shape == (16 + 3 * 32, 11 * 32, 3)
-
-
-def test_a_report_says_what_it_could_not_score(
-    touched: Path, tiny_run: Path, later: Path, tmp_path: Path, monkeypatch: Any
-) -> None:
-    """No covariates, no forces, too few touches: the report is made and names each."""
-    table = manifests.read(touched).table
-    gone = ("label.x", "label.y", "label.depth", "label.force", "label.area", "background_path", "grade")
-    poor = touched.parent / "poor.parquet"
-    manifests.write(manifests.from_columns(table.drop_columns(list(gone)).to_pydict(), poor), poor)
-    monkeypatch.setattr("anytouch_jax.evaluate.report.reconstructions_section", lambda *args: (Section("none"), {}))
-    path = demo_report(poor, tiny_run, later, tmp_path, lambda _: None, touches=12)
-    text = path.read_text()
-    for words in (
-        f"no baseline by {VECTOR}: the manifest has none",
-        "test: a sensor has 12 touches only, so galleries have 12, not 50",
-        "test, gallery matched: not scored: The manifest has none of label.x",
-        "force: the manifest has no column label.force",
-    ):  # fmt: skip
-        assert words in text, words
-    assert "| test | stage 2 | - | - | - |" in text
-
-
-def test_mistakes_come_before_any_work(touched: Path, tiny_run: Path, later: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no run folder"):
-        demo_report(touched, tmp_path / "none", tiny_run, tmp_path / "out")
-    with pytest.raises(UserError, match="there is no manifest"):
-        demo_report(tmp_path / "none.csv", tiny_run, tiny_run, tmp_path / "out")
-    with pytest.raises(UserError, match=r"--stage2 .*w\.safetensors is a weights file"):
-        (tmp_path / "w.safetensors").write_bytes(b"")
-        demo_report(touched, tiny_run, tmp_path / "w.safetensors", tmp_path / "out")
-    with pytest.raises(UserError, match=r"needs 4 frames .* gives 3 with --touches 1, 90 at most"):
-        demo_report(touched, tiny_run, later, tmp_path / "out", lambda _: None, touches=1)
-    few = make_touches(tmp_path / "few", touches={"train": 2, "test": 1})
-    with pytest.raises(UserError, match=r"needs 4 frames .* gives 3 with --touches 200, 3 at most"):
-        demo_report(few, tmp_path / "none", later, tmp_path / "out", lambda _: None)  # before a run is looked at
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("init", "sentence"),
-    [
-        ("{run}", ""),
-        ("elsewhere/{name}", ""),  # moved since
-        ("elsewhere/other", "Stage 2 started from another run (other), so this stage 1 is no part of it."),
-        (None, "Stage 2 started from no run, so this stage 1 is no part of it."),
-    ],
-)
-def test_runs_that_do_not_belong_together_are_told_of(tiny_run: Path, init: str | None, sentence: str) -> None:
-    told = None if init is None else init.format(run=tiny_run, name=tiny_run.name)
-    second = replace(load_encoder(tiny_run), metadata={"source": {"init": told}})
-    assert report._lineage(tiny_run, second) == sentence
-
-
-def test_a_run_stands_for_its_own_stage_alone(touched: Path, tiny_run: Path, later: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"--stage1 .* is a run of stage 2. Give the stage 1"):
-        demo_report(touched, later, later, tmp_path / "never")
-    with pytest.raises(UserError, match=r"--stage2 .* is a run of stage 1. Give a stage 2"):
-        demo_report(touched, tiny_run, tiny_run, tmp_path / "never")
-    assert not (tmp_path / "never").exists()
 
 
 def test_a_report_that_fails_leaves_the_one_before(

@@ -11,7 +11,7 @@ from task_world import row, simulated, table
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import tasks
-from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, available_tasks, select
+from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, select
 from anytouch_jax.sim import scene
 
 WORLD = simulated()
@@ -66,13 +66,6 @@ def test_slip_is_a_share_above_a_half_or_a_mark():
     assert select(marked, TASKS["slip"]).labels.tolist() == ["yes"]
 
 
-def test_force_tells_contact_before_a_score():
-    cases = ((0.2, 1.0), (0.0, 9.0), (3.0, None))  # soft: it touches and hardly shows
-    rows = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__force=f, label__contact_score=s)
-            for i, (f, s) in enumerate(cases)]  # fmt: skip
-    assert select(table(rows), TASKS["object"]).rows.tolist() == [[0], [2]]
-
-
 def test_a_file_with_scores_takes_scored_contact_only():
     scores = (9.0, 7.0, None)
     rows = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact_score=s)
@@ -100,12 +93,6 @@ def test_groups_fall_back_to_the_recording():
     assert select(table(rows), video).groups.tolist() == ["recording v"] * 3 + ["recording w"]
     one = [row(sequence=f"mine/{i}", label__object="b") for i in range(2)]
     assert select(table(one), video).groups.tolist() == ["sequence mine/0", "sequence mine/1"]
-
-
-def test_without_objects_the_touches_of_a_video_are_one_group():
-    rows = [row(sequence=f"{video}/{first}", label__material="wood") for video in "vw" for first in (0, 40)]
-    selected = select(table(rows), TASKS["material"])
-    assert selected.groups.tolist() == ["recording v"] * 2 + ["recording w"] * 2
 
 
 def test_recordings_of_joined_files_are_never_one_group(tmp_path):
@@ -143,14 +130,6 @@ def test_what_cannot_be_selected_is_refused():
         select(table([row(label__material="x", label__contact=0)]), TASKS["material"])
 
 
-def test_the_authors_lists_decide_whichever_manifest_it_is():
-    tests = ("material", "rough", "material+rough", None)
-    rows = [row(path=f"{i}.png", sequence=f"v/{i}", split="train", label__rough=i % 2, downstream_test=t)
-            for i, t in enumerate(tests)]  # fmt: skip
-    selected = select(table(rows), Task("r", "label.rough", which="all", test_list="rough"))
-    assert selected.split.tolist() == ["train", "test", "test", "train"]
-
-
 def grasps() -> list[dict]:
     rows = []
     for grasp, fingers in (("mug/0", "BA"), ("mug/1", "A"), ("pan/0", "AB")):
@@ -177,16 +156,6 @@ def test_two_fingers_of_a_grasp_stand_side_by_side():
         select(one, TASKS["grasp"])
 
 
-def test_frames_after_the_grasp_keep_the_label_and_split_of_it():
-    world = table(grasps())
-    selected = select(world, TASKS["grasp_after"])
-    assert [[world.value(int(one), "sequence") for one in pair] for pair in selected.rows] == [
-        ["mug/0/after/A", "mug/0/after/B"]
-    ]
-    assert (selected.labels.tolist(), selected.split.tolist()) == (["1"], ["train"])
-    assert any("after" in note for note in selected.notes)
-
-
 @pytest.mark.parametrize("empty", ["", " ", "n/a", "NaN", "None", "null", "-", "?"])
 def test_an_empty_label_takes_no_part(manifest, empty):
     full = manifests.read(manifest)
@@ -195,11 +164,6 @@ def test_an_empty_label_takes_no_part(manifest, empty):
     assert len(selected.rows) == 2 and "'Wood' and 'wood' differ only by" in selected.notes[-1]
     with pytest.raises(UserError, match=r"has a label|has no label"):
         select(manifests.replace_column(full, "label.kind", empties), Task("kind", "label.kind", which="all"))
-
-
-def test_available_tasks_have_a_label():
-    assert available_tasks(WORLD) == ("material", "object", "slip", "force", "twist", "slide")
-    assert available_tasks(table(grasps())) == ("grasp", "grasp_after", "object")  # from the column of that name
 
 
 TURNED = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
@@ -230,21 +194,6 @@ def test_flips_are_those_of_a_mirrored_sensor(number):
         assert turned == {name: mirrored(name, plain[name], across, down) for name in plain}
 
 
-def test_the_presets_are_the_authors():
-    """Released code, run_probe_*.sh; batches of two devices together."""
-    presets = {name: (one.pooling, one.universal, one.recipe.batch, one.recipe.rate, one.recipe.decay) for name, one
-               in BENCHMARKS.items()}  # fmt: skip
-    assert presets == {
-        "touch_and_go_material": ("class", False, 128, 2e-4, 0.05),
-        "touch_and_go_roughness": ("class", False, 128, 2e-4, 0.05),
-        "touch_and_go_hardness": ("class", False, 128, 2e-4, 0.05),
-        "feel_grasp": ("class", False, 256, 1e-3, 0.05),
-        "objectfolder1_material": ("mean", True, 128, 1e-3, 0.01),
-        "objectfolder2_material": ("class", True, 256, 1e-3, 0.01),
-    }
-    assert {one.recipe.epochs for one in BENCHMARKS.values()} == {50}
-
-
 # ---- a label column as a task ------------------------------------------------------------------------------
 
 COUNT = 24
@@ -267,75 +216,3 @@ def manifest(tmp_path):
     path = tmp_path / "manifest.csv"
     manifests.write(manifests.from_columns(columns, path), path)
     return path
-
-
-def rows_of(manifest, label, group="", **options) -> tasks.TaskRows:
-    loaded = manifests.read(manifest)
-    return select(loaded, tasks.label_task(loaded, label, group=group, **options))
-
-
-def subsets_of(manifest, label, column, **options) -> tuple[tasks.TaskRows, dict]:
-    selected = rows_of(manifest, label, column, **options)
-    return selected, tasks.described_subsets(manifests.read(manifest), column or label, selected.rows[:, 0], "things")
-
-
-def test_classes_that_were_described_in_train_stand_apart(manifest):
-    selected, (named, others) = (lambda rows, masks: (rows, masks.values()))(*subsets_of(manifest, "object", ""))
-    assert set(selected.labels[named]) == {"object 0", "object 1"}
-    np.testing.assert_array_equal(others, ~named)
-    assert len(np.unique(selected.groups)) == COUNT // 2  # recordings
-    held_out, (named, _) = (lambda rows, masks: (rows, masks.values()))(
-        *subsets_of(manifest, "slip", "object", where=("score", 3)))  # fmt: skip
-    assert len(held_out.rows) == COUNT - 4 and len(np.unique(held_out.groups)) == 5
-    assert set(held_out.groups[named]) == {"object object 1"}
-    assert subsets_of(manifest, "object", "", where=("score", 7))[1] == {}
-    assert subsets_of(manifest, "slip", "label.slip")[1] == {}  # both classes were
-
-
-def test_recordings_of_joined_files_are_never_one_group_of_a_label(manifest, tmp_path):
-    other = tmp_path / "other" / "manifest.csv"
-    other.parent.mkdir()
-    other.write_bytes(manifest.read_bytes())
-    groups = rows_of([manifest, other], "object").groups
-    assert len(np.unique(groups)) == COUNT and not set(groups[:COUNT]) & set(groups[COUNT:])
-
-
-def test_label_rows_that_are_not_there_are_refused(manifest, tmp_path):
-    for word, options in (("gelslim", {"sensor": "gelslim"}), ("slip", {"where": ("score", 1e9)}),
-                          ("taste", {"group": "taste"}), ("text", {"where": ("object", 1.0)})):  # fmt: skip
-        with pytest.raises(UserError, match=word):
-            rows_of(manifest, "slip", **options)
-    columns = manifests.read(manifest).table.to_pydict() | {"label.pose": [[1.0, 2.0]] * COUNT}
-    path = tmp_path / "lists.parquet"
-    manifests.write(manifests.from_columns(columns, path), path)
-    with pytest.raises(UserError, match="pose"):
-        rows_of(path, "pose")
-
-
-def test_groups_are_objects_then_touches_then_recordings_unless_they_are_the_label(manifest):
-    objects = {f"object object {n}" for n in range(6)}
-    assert set(rows_of(manifest, "slip").groups) == set(rows_of(manifest, "label.slip").groups) == objects
-    assert set(rows_of(manifest, "object").groups) == {f"sequence s{n}" for n in range(COUNT // 2)}
-    assert set(rows_of(manifest, "object", "slip").groups) == {"label.slip yes", "label.slip no"}
-    np.testing.assert_array_equal(*(rows_of(manifest, "object", name).groups for name in ("slip", "label.slip")))
-    columns = manifests.read(manifest).table.to_pydict()
-    for name, values in (("touch", 3), ("grasp_group", 2)):
-        columns[name] = [None if n % 5 == 4 else str(n % values) for n in range(COUNT)]
-        manifests.write(manifests.from_columns(columns, manifest), manifest)
-        groups = set(rows_of(manifest, "object").groups)
-        assert {f"{name} {n}" for n in range(values)} < groups and any(one.startswith("sequence s") for one in groups)
-
-
-def test_labels_never_stand_for_the_columns_of_a_manifest(manifest):
-    odd = manifests.read(manifest).table.to_pydict()
-    odd |= {"label.sensor": ["gelslim"] * COUNT, "label.split": ["train"] * COUNT, "label.sequence": ["one"] * COUNT}
-    manifests.write(manifests.from_columns(odd, manifest), manifest)
-    selected = rows_of(manifest, "object", sensor="digit")
-    assert set(selected.split) == {"train", "test"} and len(np.unique(selected.groups)) == COUNT // 2
-
-
-def test_rows_of_force_fields_take_no_part(manifest):
-    columns = manifests.read(manifest).table.to_pydict()
-    columns["sensor"] = ["tac3d" if n % 2 else "digit" for n in range(COUNT)]
-    manifests.write(manifests.from_columns(columns, manifest), manifest)
-    assert set(rows_of(manifest, "object").sensors) == {"digit"}

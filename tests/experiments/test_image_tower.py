@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from runs import run_config, train
+from runs import run_config
 from tiny_models import full_model
 
 from anytouch_jax.config import to_json
@@ -45,14 +45,6 @@ def test_a_still_gives_the_towers_own_embedding(tmp_path, rank):
     assert "image tower" in encoder.source
 
 
-def test_a_clip_gives_the_embedding_of_its_mean_frame(tmp_path):
-    config = run_config(tmp_path, 2)
-    params = build(config.model).init(jax.random.key(3))
-    encoder = image_tower_encoder(stored(tmp_path, config, params))
-    clip = np.stack([STILLS // 4 * 3, STILLS // 4 * 3 + 3, STILLS // 4 * 3 + 6], axis=1).astype(np.uint8)
-    np.testing.assert_allclose(encoder.encode_touch(clip), encoder.encode_touch(clip[:, 1]), atol=2e-5)
-
-
 def test_the_tower_of_clip_weights(tmp_path):
     model = replace(full_model(), match_head="linear")
     params = build(model).init(jax.random.key(9))
@@ -71,9 +63,3 @@ def test_a_run_without_an_image_tower_is_one_sentence(tmp_path):
         image_tower_encoder(run)
     with pytest.raises(UserError, match="no run folder or weights file"):
         image_tower_encoder(tmp_path / "gone")
-
-
-@pytest.mark.slow
-def test_the_tower_of_a_run_that_was_trained(world, tmp_path):
-    train(run_config(world, 2), tmp_path / "r", stop_after=1)
-    assert image_tower_encoder(tmp_path / "r").encode_touch(STILLS).shape == (2, 12)

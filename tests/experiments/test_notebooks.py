@@ -39,10 +39,6 @@ def test_what_a_notebook_shows_of_a_name_is_text(name, tmp_path):
         assert not {"_repr_html_", "_repr_markdown_", "_repr_svg_", "_repr_javascript_"} & {*dir(one)}
 
 
-def test_there_are_seven():
-    assert [path.stem[:2] for path in FILES] == [f"0{number}" for number in range(1, 8)]
-
-
 @pytest.fixture(scope="session")
 def few_scenes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes")

@@ -22,13 +22,6 @@ def test_what_is_written_is_read_in_the_order_of_the_keys(tmp_path):
     assert len(path.read_text().splitlines()) == 2 and [*path.parent.iterdir()] == [path]
 
 
-def test_a_reader_may_change_what_it_read(tmp_path):
-    path = tmp_path / "study.jsonl"
-    write_record(path, "a", {"value": 1})
-    read_records(path)["b"] = {}
-    assert [*read_records(path)] == ["a"]
-
-
 def test_processes_lose_no_record(tmp_path):
     path = tmp_path / "study.jsonl"
     code = "import sys; from pathlib import Path; from experiments.records import write_record\n"

@@ -7,7 +7,6 @@ import json
 import pytest
 from scripts import visit
 
-from anytouch_jax.errors import UserError
 from experiments.records import read_records
 from experiments.translation.settings import runs_of
 
@@ -25,11 +24,6 @@ def test_pouring(tmp_path, tiny_run, monkeypatch, capsys):
     before = results.stat().st_mtime_ns
     visit(monkeypatch, "pouring/study.py")
     assert results.stat().st_mtime_ns == before
-
-
-def test_steps_of_stage_1_are_not_for_encoders_that_are_done(tmp_path, monkeypatch):
-    with pytest.raises(UserError, match="leave it out with RUNS"):
-        visit(monkeypatch, "translation/study.py", RUNS=f"anytouch={tmp_path}", STEPS1=5, OUT=tmp_path)
 
 
 @pytest.mark.slow

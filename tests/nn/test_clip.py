@@ -76,14 +76,3 @@ def test_lora_starts_as_no_change_and_is_added_to_the_kernels():
     after = np.asarray(net.encode_image(params, image))
     assert np.abs(after - before).max() > 1e-3
     np.testing.assert_allclose(after, NET.encode_image(merged, image), atol=1e-5)
-
-
-def test_matching_heads():
-    z = RNG.standard_normal((3, 12)).astype("f4")
-    z = z / np.linalg.norm(z, axis=1, keepdims=True)
-    assert NET.match(PARAMS, z, z[::-1]).shape == (3,)
-    np.testing.assert_allclose(NET.match(PARAMS, z, z[::-1]), NET.match(PARAMS, z[::-1], z), rtol=1e-5)
-    linear = compiled(full_model(match_head="linear"))
-    head = jax.device_get(linear.params["matcher"])
-    expected = (z * z[::-1]) @ head["kernel"][:, 0] + head["bias"]
-    np.testing.assert_allclose(linear.match(linear.params, z, z[::-1]), expected, rtol=1e-5)

@@ -44,9 +44,3 @@ def test_parts_left_out_do_not_exist():
     assert set(build(touch_model()).abstract()) == {"touch", "decoder"}
     with pytest.raises(AttributeError):
         compiled(touch_model()).encode_image(compiled(touch_model()).params, np.zeros((1, 28, 28, 3)))
-
-
-def test_a_part_of_the_parameters_serves_the_methods_that_read_it():
-    net, clip, row = compiled(full_model()), np.ones((1, 1, 28, 28, 3), "f4"), np.zeros(1, np.int32)
-    part = net.encode_touch({"touch": net.params["touch"]}, clip, row)
-    np.testing.assert_array_equal(part, net.encode_touch(net.params, clip, row))

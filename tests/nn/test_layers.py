@@ -12,7 +12,7 @@ from flax import nnx
 from tiny_models import STACK, compiled, full_model, touch_model
 
 from anytouch_jax.nn.functional import build
-from anytouch_jax.nn.layers import gelu, quick_gelu, read_blocks, run_blocks, stacked_blocks, stored
+from anytouch_jax.nn.layers import gelu, read_blocks, run_blocks, stacked_blocks, stored
 
 CLIP, ROWS = np.random.default_rng(2).standard_normal((2, 1, 28, 28, 3)).astype("f4"), np.asarray([0, 1], np.int32)
 X = np.linspace(-6, 6, 241, dtype="f4")
@@ -33,10 +33,6 @@ def test_gelu_is_the_exact_form_in_value_and_derivative(dtype, step):
         result = jax.jit(function)(x)
         assert result.dtype == dtype
         np.testing.assert_allclose(np.asarray(result, np.float64), wanted, rtol=step, atol=1e-6)
-
-
-def test_quick_gelu():
-    np.testing.assert_allclose(jax.jit(quick_gelu)(X), X / (1 + np.exp(-1.702 * X)), rtol=1e-5, atol=1e-7)
 
 
 def reference_block(x, p, heads, eps):

@@ -7,9 +7,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from tiny_models import compiled, full_model, tiny_config, touch_model
+from tiny_models import compiled, full_model, touch_model
 
-from anytouch_jax.config import presets
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.compatible import serve_unseen
 from anytouch_jax.weights.convert import to_release
@@ -66,12 +65,6 @@ def test_a_row_outside_the_table_is_nan_not_the_last_sensor():
         assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
 
 
-def test_each_kernel_starts_at_the_size_of_a_shared_one():
-    shared, own = (np.asarray(parameters(model)["touch"]["patch"]["kernel"]) for model in (SHARED, OWN))
-    assert own.shape == (10, *shared.shape) and not np.array_equal(own[0], own[1])
-    np.testing.assert_allclose(np.abs(own).max(), np.abs(shared).max(), rtol=0.02)
-
-
 @pytest.mark.parametrize(
     "model",
     [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)],
@@ -104,9 +97,3 @@ def test_sensors_never_seen_are_served_by_the_universal_row():
         for row in range(2, 9):
             np.testing.assert_array_equal(a[row], b[9])
     np.testing.assert_array_equal(after["position"], before["position"])
-
-
-def test_t3_is_a_model_that_is_built():
-    model = presets.apply_baseline("t3", tiny_config(1)).model
-    assert param_shapes(model)["touch/patch/kernel"] == (10, 3, 147, 16)
-    assert param_shapes(model)["touch/sensor_tokens"] == (10, 0, 16)

@@ -62,7 +62,7 @@ def test_array_likes_strict_types_and_empty_batches(name):
         assert x.shape or float(x) == 0  # the loss of nothing is 0
 
 
-@pytest.mark.parametrize("factor", [1, 2.0, 0.5, -1])
+@pytest.mark.parametrize("factor", [1, -0.5])
 @pytest.mark.parametrize(
     "name", ["reconstruction_loss", "next frame", "info_nce", "places", "centered", "alignment_loss"]
 )

@@ -1,10 +1,13 @@
-"""Patches, positions and segments."""
+"""Patches, positions, segments, and random masking: each sample by its own noise, and the way back."""
+
+from __future__ import annotations
 
 import jax
 import numpy as np
 import pytest
 
 from anytouch_jax.ops import tokens
+from anytouch_jax.ops.tokens import count_visible
 
 patchify, segments, sincos_table = (
     jax.jit(f, static_argnums=n) for f, n in ((tokens.patchify, 1), (tokens.segments, 1), (tokens.sincos_table, (0, 1)))
@@ -28,11 +31,6 @@ def test_unpatchify_is_the_exact_inverse(shape):
     np.testing.assert_array_equal(unpatchify(patches, 2, shape[2]), clip)
 
 
-def test_patchify_refuses_sizes_that_do_not_divide():
-    with pytest.raises(ValueError, match="5 x 4"):
-        patchify(np.zeros((1, 1, 5, 4, 3)), 2)
-
-
 def test_sincos_table_class_row_is_zero_and_positions_differ():
     table = np.asarray(sincos_table(32, 4))
     assert table.shape == (17, 32)
@@ -44,11 +42,6 @@ def test_sincos_table_class_row_is_zero_and_positions_differ():
     np.testing.assert_array_equal(table[1 + 4, :16], table[1, :16])  # one row on: the column half stays
 
 
-def test_sincos_table_refuses_odd_widths():
-    with pytest.raises(ValueError, match="multiple of 4"):
-        sincos_table(30, 4)
-
-
 @pytest.mark.parametrize(("total", "starts"), [(3, [0]), (6, [0, 3]), (7, [0, 3, 4]), (10, [0, 3, 6, 7])])
 def test_segments_cover_every_frame_and_end_with_the_last(total, starts):
     cut = np.asarray(segments(np.arange(total).reshape(1, total, 1), 3))
@@ -57,6 +50,44 @@ def test_segments_cover_every_frame_and_end_with_the_last(total, starts):
     assert set(cut.ravel().tolist()) == set(range(total))
 
 
-def test_segments_refuse_a_short_clip():
-    with pytest.raises(ValueError, match="2 frames"):
-        segments(np.zeros((1, 2, 1)), 3)
+# Masking --------------------------------------------------------------------------------------------------------------
+
+
+random_mask = jax.jit(tokens.random_mask, static_argnums=1)
+
+
+def test_masks_are_drawn_per_row():
+    # A per-batch permutation looks right and is wrong: rows of one batch must hide different patches.
+    hidden = np.asarray(random_mask(np.random.default_rng(0).random((64, 16)), 4)[2])
+    assert len(np.unique(hidden, axis=0)) > 50
+    # and every position is hidden about as often as any other
+    share = hidden.mean(axis=0)
+    assert abs(share.mean() - 0.75) < 1e-6
+    assert share.min() > 0.5 and share.max() < 0.95
+
+
+def test_a_row_depends_on_its_own_noise_only():
+    noise = np.random.default_rng(0).random((3, 9))
+    other = noise.copy()
+    other[0] = other[0, ::-1]
+    before, after = (np.asarray(random_mask(x, 3)[0]) for x in (noise, other))
+    np.testing.assert_array_equal(before[1:], after[1:])
+    assert not np.array_equal(before[0], after[0])
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 9])
+def test_kept_are_the_smallest_noise_in_order_and_restore_is_the_inverse(count):
+    noise = np.random.default_rng(1).random((2, 9))
+    keep_ids, restore_ids, hidden = jax.device_get(random_mask(noise, count))
+    np.testing.assert_array_equal(keep_ids, np.argsort(noise, axis=1)[:, :count])
+    assert hidden.sum() == 2 * (9 - count)
+    x = np.random.default_rng(2).standard_normal((2, 9, 4)).astype("f4")
+    visible = jax.jit(tokens.keep)(x, keep_ids)
+    assert visible.shape == (2, count, 4)
+    back = jax.jit(tokens.restore)(visible, np.full(4, -7.0, "f4"), restore_ids)
+    np.testing.assert_array_equal(back, np.where(hidden[..., None], np.float32(-7.0), x))
+
+
+def test_number_of_kept_patches():
+    cases = [(256, 0.25), (64, 0.25), (16, 0.0), (16, 1.0), (1, 0.25)]
+    assert [count_visible(*case) for case in cases] == [64, 16, 0, 16, 0]

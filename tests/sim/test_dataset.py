@@ -7,18 +7,13 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from blank_recorder import BlankRecorder
 
-from anytouch_jax.config import preset
-from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import dataset, scene
 from anytouch_jax.sim.scene import Scenes
-from anytouch_jax.sim.sensing.sensors import SENSORS
 
 SCENES = Scenes(touches=10, objects=24, seed=4, sensors=("digit", "tac3d"), size=32, frames=4, vision=0.5, text=0.5)
 
@@ -76,46 +71,11 @@ def test_shares_and_labels_are_as_drawn(made):
     assert {row["image_path"] is None for row in rows} == {row["text"] is None for row in rows} == {True, False}
 
 
-def test_every_recording_has_a_photograph_and_words_of_its_own(tmp_path):
-    dataset.simulate(replace(SCENES, sensors=("digit", "gelslim"), vision=1.0, text=1.0), tmp_path / "all")
-    rows = [row for row in manifests.read(tmp_path / "all" / "manifest.parquet").table.to_pylist() if row["touch"]]
-    told: dict[tuple[str, str], str] = {}
-    for touch in {row["touch"] for row in rows}:
-        pair = [{row["image_path"] for row in rows if (row["touch"], row["sensor"]) == (touch, s)} for s in SENSORS]
-        first, second = (cv2.imread(str(tmp_path / "all" / paths.pop())).astype(int) for paths in pair if paths)
-        assert np.abs(first - second).mean() > 1  # from another view
-        told |= {(touch, row["sensor"]): row["text"] for row in rows if row["touch"] == touch}
-    alike = [told[touch, "digit"] == told[touch, "gelslim"] for touch, _ in told]
-    assert sum(alike) < len(alike) / 2
-
-
-def test_images_and_fields_are_whole(made):
-    for row in manifests.read(made / "manifest.parquet").table.to_pylist():
-        if row["sensor"] == "tac3d":
-            assert np.load(made / row["path"]).shape == (20, 20, 6) and row["field_path"] == row["path"]
-        else:
-            assert cv2.imread(str(made / row["path"])).shape == (43, 32, 3) and row["field_path"] is None
-            assert cv2.imread(str(made / row["background_path"])).shape == (43, 32, 3)
-    assert not list(made.rglob("*.tmp")) and not (made / "parts").exists()
-
-
 def test_a_data_set_of_another_version_is_not_continued(made, monkeypatch):
     assert json.loads((made / "dataset.json").read_text())["version"] == dataset.VERSION
     monkeypatch.setattr(dataset, "VERSION", 99)
     with pytest.raises(UserError, match=r"version \d+, not 99"):
         dataset.simulate(SCENES, made)
-
-
-def test_only_what_is_asked_for_is_written(tmp_path, monkeypatch):
-    folder = tmp_path / "few:v2"
-    asked = replace(SCENES, sensors=("digit",), vision=0.0, text=0.0, fields=("pressure",), touches=3)
-    monkeypatch.chdir(tmp_path)
-    dataset.simulate(asked, folder.name)  # a name for pyarrow too, not the address of a store
-    assert {path.name for path in folder.iterdir()} == {"digit", "manifest.parquet", "dataset.json"}
-    assert not list(folder.rglob("photo.jpg"))
-    rows = manifests.read(folder / "manifest.parquet").table.to_pylist()
-    assert all(row["text"] is None for row in rows)
-    assert np.load(folder / rows[0]["field_path"]).shape == (12, 8, 1)
 
 
 def test_touches_from_another_number_on_are_others_of_the_same_objects(made, tmp_path):
@@ -229,13 +189,3 @@ def test_settings_are_compared_by_value(made):
     whole = replace(SCENES, depth=(SCENES.depth[0], int(SCENES.depth[1])))  # 1 for 1.0
     assert SCENES.depth[1] == 1 and dataset.simulate(whole, made) == made / "manifest.parquet"
     file.write_bytes(before)
-
-
-def test_the_loader_trains_on_it(made):
-    config = preset("tiny", stage=2)
-    config = replace(config, data=replace(config.data, batch_size=4), model=replace(config.model, image_size=28))
-    loader = Loader(manifests.read(made / "manifest.parquet"), config)
-    batch = loader.batch(0)
-    assert any("left out" in note and "tac3d" in note for note in loader.notes)
-    assert batch.align.clip.shape == (4, 1, 28, 28, 3)
-    assert batch.match is None  # one camera: nothing to match

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -14,7 +13,7 @@ from anytouch_jax.sim import endless, scene
 from anytouch_jax.sim.draws import Draws
 from anytouch_jax.sim.recorder import View, simulate_clip
 from anytouch_jax.sim.scene import Scenes
-from anytouch_jax.sim.sensing.sensors import SENSORS, bases, draw_drift, draw_unit, look
+from anytouch_jax.sim.sensing.sensors import SENSORS, draw_drift, draw_unit, look
 
 SCENES = Scenes(objects=60, seed=41, depth=(0.15, 1.0))
 COUNT = 3000
@@ -107,27 +106,3 @@ def test_kinds_that_are_held_out_never_occur():
     assert len({thing.seed for thing in more}) == len(more)
     with pytest.raises(UserError, match="no object of 5"):
         endless.objects_of(Scenes(objects=5), "test")
-
-
-def test_the_family_of_a_sensor_has_its_numbers():
-    for name in endless.CAMERAS:
-        numbers, sensor = endless.family(SENSORS[name]), SENSORS[name]
-        again = endless.as_sensor(numbers)
-        np.testing.assert_allclose([float(x) for x in again.field], sensor.field, rtol=1e-6)
-        assert float(again.halo) == pytest.approx(sensor.halo) and float(again.noise) == pytest.approx(sensor.noise)
-        assert (numbers.gels.max((1, 2, 3)) > 0).sum() == len(bases(sensor))
-
-
-def test_a_wild_family_lies_between_two_and_keeps_its_places():
-    one, other = (jax.tree.map(jnp.asarray, endless.family(SENSORS[name])) for name in ("digit", "gelslim"))
-    mixed = endless.wild(one, other, Draws(jax.random.key(0)))
-    low, high = np.minimum(one.gel, other.gel), np.maximum(one.gel, other.gel)
-    assert np.all(mixed.gel >= low - 1e-3) and np.all(mixed.gel <= high + 1e-3)
-    assert mixed.photometry.normal.shape == one.photometry.normal.shape
-
-
-def test_draws_refuse_more_than_their_block():
-    rng = Draws(jax.random.key(0), 4)
-    rng.normal(size=3)
-    with pytest.raises(ValueError, match="larger block"):
-        rng.normal(size=2)

@@ -73,14 +73,6 @@ def test_objects_take_turns_and_a_seed_decides():
     assert not np.array_equal(other.place, again.place)
 
 
-def test_places_lie_evenly_within_three_millimetres():
-    """Of a disc of radius r a share of (r / 3)^2 lies within r: they do not crowd in its middle."""
-    within = np.array([np.sum(scene.draw_touch(SCENES, number, SPLITS).place ** 2) / 9 for number in range(600)])
-    assert within.max() <= 1
-    for share in (0.1, 0.25, 0.5, 0.75):
-        assert abs((within < share).mean() - share) < 0.06
-
-
 def test_one_device_of_each_sensor_mounted_straight():
     one = replace(SCENES, units="one")
     several = [recordings(one, number) for number in range(4)]
@@ -98,14 +90,6 @@ def test_one_device_of_each_sensor_mounted_straight():
     assert not np.array_equal(several[0]["digit"].unit.tint, several[0]["duragel"].unit.tint)
 
 
-def test_another_sensor_in_the_list_changes_nothing():
-    few = recordings(replace(SCENES, sensors=("digit",)))["digit"]
-    many = recordings(replace(SCENES, sensors=("gelslim", "tac3d", "digit")))["digit"]
-    for one, two in zip(few.unit, many.unit, strict=True):
-        np.testing.assert_array_equal(one, two)
-    assert (few.has_photo, few.has_text, few.seed) == (many.has_photo, many.has_text, many.seed)
-
-
 def test_fine_recordings_move_alike_and_coarse_ones_share_only_the_place():
     fine = list(recordings(SCENES, 5).values())
     assert all(np.array_equal(fine[0].motion, r.motion) and np.array_equal(fine[0].depth, r.depth) for r in fine)
@@ -119,20 +103,6 @@ def test_fine_recordings_move_alike_and_coarse_ones_share_only_the_place():
         [r.start[:2] for n in range(60) for r in recordings(replace(SCENES, grade="coarse"), n).values()]
     )
     assert 0.6 < offsets.std() < 1.0 and np.abs(offsets.mean()) < 0.15
-
-
-def test_units_and_noise_are_never_shared_between_recordings():
-    found = [r for n in range(20) for r in recordings(SCENES, n).values()]
-    assert len({tuple(np.concatenate([np.ravel(v) for v in r.unit])) for r in found}) == len(found)
-    assert len({r.seed for r in found}) == len(found)
-
-
-def test_shares_of_photographs_and_captions():
-    found = [r for n in range(60) for r in recordings(replace(SCENES, vision=0.25, text=0.75), n).values()]
-    assert 0.15 < np.mean([r.has_photo for r in found]) < 0.35
-    assert 0.65 < np.mean([r.has_text for r in found]) < 0.85
-    none = [r for n in range(20) for r in recordings(replace(SCENES, vision=0, text=1), n).values()]
-    assert not any(r.has_photo for r in none) and all(r.has_text for r in none)
 
 
 def gesture(motion, slide=(0.0, 0.0), twist=0.0, shown=1.0, middle=0.5, lift=-1.0):
@@ -163,47 +133,6 @@ def test_a_gesture_presses_then_moves_then_lets_go(motion):
     assert not moved[:40].any()
     np.testing.assert_allclose(moved[-1], [*slide, twist], atol=1e-9)
     assert (np.diff(moved @ np.sign([1.5, -0.5, 0.2])) >= -1e-12).all()  # never backwards
-
-
-def test_a_clip_shows_a_part_of_a_gesture():
-    whole, depth = scene.trajectory(101, gesture("slide", (1, 0)))
-    part, shallow = scene.trajectory(11, gesture("slide", (1, 0), shown=0.1, middle=0.55))
-    np.testing.assert_allclose(part, whole[50:61], atol=1e-9)
-    np.testing.assert_allclose(shallow, depth[50:61], atol=1e-9)
-
-
-def test_a_regrasp_leaves_the_object_and_comes_back_elsewhere():
-    for frames in (4, 40):
-        moved, depth = scene.trajectory(frames, gesture("hold", shown=0.5, lift=0.5))
-        off = np.flatnonzero(depth <= 0)
-        assert len(off) >= 1 and depth[0] > 0 and depth[-1] > 0
-        assert not moved[0].any()
-        np.testing.assert_allclose(moved[-1], [1.0, 0, 0.1])
-
-
-def test_gestures_differ_in_length_and_some_frames_are_without_contact():
-    depths = np.stack([recordings(SCENES, number)["digit"].depth for number in range(400)])
-    assert 0.03 < (depths <= 0).mean() < 0.2
-    assert ((depths > 0).sum(1) > 0).mean() > 0.97
-    lengths = [scene.draw_touch(SCENES, number, SPLITS).gesture.shown for number in range(400)]
-    assert min(lengths) < 0.4 and max(lengths) > 1.1
-
-
-def test_a_still_is_the_deepest_press():
-    moved, depth = scene.trajectory(1, gesture("slide", (1, 1)))
-    assert not moved.any() and depth.tolist() == [0.8]
-
-
-def test_a_still_has_no_motion_to_tell():
-    still = replace(SCENES, frames=1)
-    found = [scene.directions(recordings(still, number)["digit"]) for number in range(12)]
-    assert all(one == {"label.motion": "hold", "label.twist": "none", "label.slide": "none"} for one in found)
-
-
-def test_a_sensor_of_fields_has_no_camera_that_mirrors_or_crops():
-    for number in range(8):
-        unit = recordings(replace(SCENES, sensors=("tac3d",)), number)["tac3d"].unit
-        assert (unit.mirror == 1).all() and not unit.window.any() and unit.zoom == 1
 
 
 def test_directions_are_those_of_the_picture():

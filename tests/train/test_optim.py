@@ -1,3 +1,5 @@
+"""Rules, rates, AdamW and layer decay against plain numpy; small leaves as one vector."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -12,9 +14,8 @@ from adam_moments import moments
 from tiny_models import compiled, tiny_config
 from train_toy import toy_config, toy_params
 
-from anytouch_jax.config import preset
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.train.optim import depth_rate, learning_rate, match_rules, optimizer, schedule
+from anytouch_jax.train.optim import depth_rate, learning_rate, match_rules, optimizer, packing, schedule
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.tree import flatten
 
@@ -32,14 +33,6 @@ def test_the_first_rule_wins_and_a_name_without_one_is_an_error():
         match_rules(rules[:2], ["b/kernel"])
 
 
-def test_no_vector_decays_and_every_matrix_or_token_does():
-    names = ["touch/pre_norm/scale", "touch/class_token", "logit_scale", "touch/blocks/attention/query/bias"]
-    decayed = ["touch/position", "touch/sensor_tokens", "decoder/mask_token", "lora/query/a", "touch/patch/kernel"]
-    found = match_rules(preset("tiny").weight_decay, names + decayed)
-    assert [found[name] for name in names] == [0.0] * 4
-    assert [found[name] for name in decayed] == [0.1] * 5
-
-
 @pytest.mark.parametrize("decay", ["linear", "cosine"])
 @pytest.mark.parametrize(("warmup", "total"), [(1.0, 20.0), (37, 1000), (0, 10), (5, 5)])
 def test_schedule_values(decay, warmup, total):
@@ -55,17 +48,6 @@ def test_schedule_values(decay, warmup, total):
     np.testing.assert_allclose(got, [by_hand(t) for t in times], rtol=2e-5, atol=1e-11)
     assert warmup == 0 or got[0] == 0.0
     assert total == warmup or got[-2] == pytest.approx(FLOOR)
-
-
-def test_the_schedule_of_a_run_is_the_same_in_epochs_and_in_steps():
-    config = toy_config(steps=200, optim={"warmup": 10, "decay": "cosine", "min_rate": 1e-3})
-    epochs = learning_rate(np.arange(201) / 10, peak=0.05, floor=1e-3, warmup=1, total=20, decay="cosine")
-    np.testing.assert_allclose(schedule(config)(np.arange(201)), epochs, rtol=1e-5, atol=1e-8)
-
-
-def test_an_unknown_decay_is_named():
-    with pytest.raises(ConfigError, match="unknown decay 'step'"):
-        learning_rate(0.0, peak=1.0, floor=0.0, warmup=1, total=2, decay="step")
 
 
 def adamw_by_hand(params, grads_of_steps, uses_of_steps, rates, *, b1=0.9, b2=0.99, eps=1e-8, decay):
@@ -149,18 +131,6 @@ def test_adamw_with_skipped_parameters_equals_plain_numpy():
     np.testing.assert_array_equal(got["idle"]["kernel"], params["idle"]["kernel"])
 
 
-def test_a_zero_gradient_still_decays_but_an_unused_parameter_does_not():
-    config = toy_config(optim={"warmup": 0, "learning_rate": 0.5, "weight_decay": 0.1})
-    ones, zeros = (
-        {"a": {"kernel": x}, "b": {"kernel": x}, "c": {"bias": x}} for x in np.array([[1.0] * 3, [0.0] * 3], "f4")
-    )
-    used = {"a": {"kernel": True}, "b": {"kernel": False}, "c": {"bias": True}}
-    got, _ = run_updates(config, ones, [zeros], [used])
-    np.testing.assert_allclose(got["a"]["kernel"], 0.95, rtol=1e-6)
-    np.testing.assert_array_equal(got["b"]["kernel"], 1.0)
-    np.testing.assert_array_equal(got["c"]["bias"], 1.0)
-
-
 def test_eps_is_outside_the_root():
     config = toy_config(optim={"warmup": 0, "learning_rate": 1.0, "weight_decay": 0.0, "eps": 1e-3})
     got, _ = run_updates(config, {"w": np.zeros(1, "f4")}, [{"w": np.full(1, 1e-3, "f4")}])
@@ -189,13 +159,6 @@ def test_the_rate_is_given_or_follows_the_step_never_a_counter():
     np.testing.assert_allclose(new["w"], 1 - 0.25 * (1 + 0.1), rtol=1e-5)
     with pytest.raises(TypeError, match="step or learning_rate"):
         update(config, params, start, params)
-
-
-def test_rules_come_from_the_config():
-    got, _ = run_updates(
-        toy_config(optim={"weight_decay": 0.0}), {"w": np.ones(2, "f4")}, [{"w": np.zeros(2, "f4")}] * 5
-    )
-    np.testing.assert_array_equal(got["w"], 1.0)
 
 
 # Layer decay ----------------------------------------------------------------------------------------------------------
@@ -238,3 +201,30 @@ def test_a_layer_decay_scales_the_step_and_none_is_no_change():
     np.testing.assert_array_equal(still["touch/blocks/mlp/up/kernel"][2], plain["touch/blocks/mlp/up/kernel"][2])
     np.testing.assert_array_equal(still["touch/projection/kernel"], plain["touch/projection/kernel"])
     np.testing.assert_array_equal(still["image/patch/kernel"], plain["image/patch/kernel"])
+
+
+# Packing --------------------------------------------------------------------------------------------------------------
+
+
+TREE = {
+    "b": np.arange(6, dtype="f4").reshape(2, 3), "a": np.full(4, 7, "f4"),
+    "large": np.arange(40, dtype="f4").reshape(5, 8), "scalar": np.float32(3), "whole": np.arange(3, dtype="i4"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("small", [0, 5, 10, 1000])
+def test_unpacking_gives_the_tree_back(small):
+    layout = packing(TREE, small)
+    arrays, back = jax.jit(lambda tree: ((arrays := layout.pack(tree)), layout.unpack(arrays)))(TREE)
+    assert sum(array.size for array in arrays) == sum(leaf.size for leaf in jax.tree.leaves(TREE))
+    assert jax.tree.structure(back) == jax.tree.structure(TREE)
+    jax.tree.map(np.testing.assert_array_equal, back, TREE)
+    assert all(a.dtype == b.dtype for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(TREE), strict=True))
+
+
+def test_small_leaves_of_a_type_lie_together_and_large_ones_alone():
+    layout = packing(TREE, 10)
+    assert layout.groups == ((0, 1, 3), (2,), (4,))
+    vector, large, whole = layout.pack(TREE)
+    np.testing.assert_array_equal(vector, [7, 7, 7, 7, 0, 1, 2, 3, 4, 5, 3])
+    assert large is TREE["large"] and whole is TREE["whole"]

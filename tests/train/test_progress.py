@@ -3,7 +3,7 @@ from __future__ import annotations
 import io
 import sys
 
-from anytouch_jax.train.progress import chart, progress, silent, summary, to_stderr
+from anytouch_jax.train.progress import chart, progress, to_stderr
 
 
 class Terminal(io.StringIO):
@@ -28,20 +28,6 @@ def test_a_terminal_shows_a_bar_and_sentences_above_it(monkeypatch):
     assert "3/3" in shown and "loss 0.5000" in shown and "saved at step 1" in shown
 
 
-def test_a_curve_is_drawn_on_request(monkeypatch):
-    shown = {}
-    for curve in (False, True):
-        monkeypatch.setattr(sys, "stderr", Terminal())
-        monkeypatch.setenv("TERM", "xterm")
-        monkeypatch.setenv("COLUMNS", "120")
-        screen = sys.stderr
-        with progress(0, 3, to_stderr, curve=curve) as advance:
-            for step, loss in enumerate((3.0, None, 1.0)):
-                advance(row(step, loss=loss))
-        shown[curve] = screen.getvalue()
-    assert "█" in shown[True] and "3.0000" in shown[True] and "█" not in shown[False]
-
-
 def test_the_curve_falls_with_the_loss():
     lines = chart([8.0] * 50 + [1.0] * 50, width=10, height=4).splitlines()
     assert [line[10:] for line in lines] == ["█████     "] * 3 + ["█████▁▁▁▁▁"]
@@ -56,22 +42,3 @@ def test_elsewhere_some_twenty_lines_are_said():
             advance(row(step))
     assert len(said) == 21
     assert said[0] == "step 101/1100  loss 0.5000  30 samples/s" and said[-1].startswith("step 1100/1100")
-
-
-def test_a_silent_process_shows_no_bar_even_on_a_terminal(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    with progress(0, 1, silent) as advance:
-        advance(row(0))
-    assert sys.stderr.getvalue() == ""
-
-
-def test_the_summary_tells_of_waiting_for_data_when_it_is_much():
-    assert summary(row(3, wait_share=0.049)) == summary(row(3)) == "loss 0.5000  30 samples/s"
-    assert summary(row(3, wait_share=0.31)).endswith("  waits for data 31%")
-
-
-def test_the_summary_tells_of_trouble():
-    told = "  2 samples could not be read and were replaced"
-    assert summary(row(3, skipped_samples=2.0)) == "loss 0.5000  30 samples/s" + told
-    assert summary(row(3, skipped_samples=0.0)) == "loss 0.5000  30 samples/s"
-    assert summary(row(3, loss=None, skipped_batches=2)) == "loss not finite  30 samples/s  skipped 2"

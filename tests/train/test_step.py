@@ -12,7 +12,6 @@ from adam_moments import moments
 from train_toy import toy_batch, toy_config, toy_loss, toy_params, toy_trained
 
 from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch
-from anytouch_jax.config import preset
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.train.optim import optimizer, schedule
 from anytouch_jax.train.step import init_state, make_step, merge, micro_batches, split
@@ -47,22 +46,6 @@ def test_split_and_merge_are_inverse_and_disjoint():
     assert_same(merge(trainable, frozen), params)
     with pytest.raises(ValueError, match="kernel is both"):
         merge(params, frozen)
-
-
-def test_towers_freeze_as_the_recipe_says():
-    names = ["text/token", "image/blocks/norm1/scale", "image/pre_norm/scale", "lora/query/a", "decoder/position"]
-    params = {}
-    for name in names:
-        *folders, last = name.split("/")
-        functools.reduce(lambda node, folder: node.setdefault(folder, {}), folders, params)[last] = np.ones(1)
-    frozen = {
-        (recipe, towers): set(flatten(split(params, preset("tiny", stage=2, recipe=recipe, towers=towers).frozen)[1]))
-        for recipe in ("paper", "release")
-        for towers in ("scratch", "pretrained")
-    }
-    assert frozen["paper", "scratch"] == frozen["release", "scratch"] == {"decoder/position"}
-    assert frozen["paper", "pretrained"] == set(names) - {"lora/query/a"}
-    assert frozen["release", "pretrained"] == set(names) - {"lora/query/a", "image/pre_norm/scale"}
 
 
 def test_a_step_is_the_gradient_of_the_loss_through_adamw():
@@ -192,21 +175,6 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(what):
     assert np.isfinite(metrics["loss"]) == (what == "gradient")
     assert after.step == 2
     assert_same(after._replace(step=state.step), state)
-
-
-def test_a_skipped_step_does_not_shift_the_schedule():
-    state, step = build()
-    for index in range(4):
-        state, metrics = step(state, toy_batch(index, bad=index == 1), KEY)
-        assert metrics["learning_rate"] == pytest.approx(float(schedule(toy_config())(index)))
-
-
-def test_the_step_takes_any_optax_transformation():
-    state = init_state(toy_params(), toy_config())
-    tx = optax.adam(1e-2)
-    state = state._replace(opt_state=tx.init(state.trainable))
-    state, metrics = jax.jit(make_step(toy_loss, tx, total_steps=8))(state, toy_batch(0), KEY)
-    assert np.isnan(metrics["learning_rate"]) and metrics["update_norm"] > 0 and state.step == 1
 
 
 def test_frozen_parameters_are_not_differentiated():

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 from tiny_models import tiny_config
 
 from anytouch_jax.config import UNIVERSAL
-from anytouch_jax.errors import UserError
 from anytouch_jax.weights.compatible import (
-    check_activation,
-    check_form,
     match_sensors,
     resize_position,
     serve_unseen,
@@ -39,45 +33,10 @@ def test_equal_to_torch(expected):
     np.testing.assert_allclose(resized[1:], np.stack([flat, -flat], 1), atol=1e-6)
 
 
-@pytest.mark.parametrize(("old", "new"), [(4, 8), (16, 7), (1, 3), (5, 5)])
-def test_keeps_constants_and_itself(old, new):
-    constant = np.full((1 + old**2, 3), 2.5, "f4")
-    np.testing.assert_allclose(resize_position(constant, 1 + new**2), 2.5, rtol=1e-6)
-    table = np.random.default_rng(0).normal(size=(1 + old**2, 3)).astype("f4")
-    np.testing.assert_allclose(resize_position(table, 1 + old**2), table, rtol=1e-6)
-
-
-def test_turns_with_the_grid():
-    """Rows and columns are treated alike: the transposed grid gives the transposed result."""
-    grid = np.random.default_rng(0).normal(size=(5, 5, 2)).astype("f4")
-    first = np.zeros((1, 2), "f4")
-    upright = resize_position(np.concatenate([first, grid.reshape(25, 2)]), 65)[1:].reshape(8, 8, 2)
-    turned = resize_position(np.concatenate([first, grid.transpose(1, 0, 2).reshape(25, 2)]), 65)[1:].reshape(8, 8, 2)
-    np.testing.assert_allclose(upright, turned.transpose(1, 0, 2), rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize(("rows", "wanted"), [(9, 17), (17, 9), (1, 5), (5, 1)])
-def test_only_square_grids(rows, wanted):
-    with pytest.raises(ValueError, match="square"):
-        resize_position(np.zeros((rows, 2), "f4"), wanted)
-
-
 def test_rows_of_sensors_go_by_name():
     table = np.arange(6.0).reshape(3, 2)
     stored, wanted = ("digit", "gelsight", UNIVERSAL), ("gelsight", "my_gel", UNIVERSAL, "digit")
     np.testing.assert_array_equal(match_sensors(table, stored, wanted), table[[1, 2, 2, 0]])
-
-
-def test_every_missing_option_is_named():
-    config = tiny_config()
-    model = config.model
-    other = replace(model, embed=model.embed + 1, touch=replace(model.touch, heads=1), norm_eps=1e-3)
-    check_form(Path("run"), model, config)
-    with pytest.raises(UserError, match=r"add --model\.embed 13 --model\.touch\.heads 1 --model\.norm-eps 0\.001$"):
-        check_form(Path("run"), other, config)
-    check_activation(Path("run"), None, config)
-    with pytest.raises(UserError, match=r"add --model\.activation quick_gelu"):
-        check_activation(Path("run"), "quick_gelu", config)
 
 
 @pytest.mark.parametrize("drawn", [True, False])

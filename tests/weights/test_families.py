@@ -169,8 +169,7 @@ def refused(file: Path, named: Path, heads: int, words: str) -> None:
     assert named.name in text and "\n" not in text and len(text) < 600
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("title", SMALL)
+@pytest.mark.parametrize(("title", "kind"), [*zip(SMALL, KINDS * 2, strict=False)])  # the kinds take turns
 def test_a_whole_file_is_read_and_a_damaged_one_is_one_sentence(title, kind, tmp_path, monkeypatch):
     _, stack, patch, more, size, given = SMALL[title]
     family, _, arrays = made(title, stack, patch, more, size)

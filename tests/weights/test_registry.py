@@ -61,11 +61,6 @@ def test_damaged_weights_of_the_package_are_refused(packaged):
         at.load_encoder("little")
 
 
-def test_an_unknown_name_is_answered_with_the_known_ones(packaged):
-    with pytest.raises(at.UserError, match="one of little"):
-        at.load_encoder("litle")
-
-
 @pytest.mark.parametrize(
     ("address", "revision"), [("hf://user/repo", None), (Path("hf://user/repo"), None), ("hf://user/repo@v1", "v1")]
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anytouch_jax.errors import UserError
 from experiments.pouring import table as pouring_table
 from experiments.pouring.physics import Task
 from experiments.pouring.trials import Trials
@@ -42,27 +41,3 @@ def test_a_sign_is_decided_over_seeds_not_over_runs(tmp_path):
     assert (
         mean == pytest.approx(9 + 1 / 30) and low < 0 and high - mean == pytest.approx(4.303 * 7.95 / 3**0.5, rel=1e-3)
     )
-
-
-def test_a_broken_or_mixed_result_is_named(tmp_path):
-    with pytest.raises(UserError, match="no result"):
-        pouring_table.read_rows(tmp_path / RESULTS)
-    write(tmp_path, "static", "frozen", [60.0])
-    write(tmp_path, "static", "frozen", [60.0, 61.0], seed=1)
-    with pytest.raises(UserError, match="different settings"):
-        pouring_table.read_rows(tmp_path / RESULTS)
-    write(tmp_path, "static", "frozen", [60.0], seed=1)
-    write(tmp_path, "static", "fine-tuned", [60.0], tune_steps=9)
-    pouring_table.read_rows(tmp_path / RESULTS)
-    write(tmp_path, "anytouch", "frozen", [60.0], demonstrations=9)  # would be compared with static
-    with pytest.raises(UserError, match="different settings"):
-        pouring_table.read_rows(tmp_path / RESULTS)
-    write(tmp_path, "anytouch", "frozen", [60.0])
-    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=10)  # nor with a static one tuned for 9 steps
-    with pytest.raises(UserError, match="different settings"):
-        pouring_table.read_rows(tmp_path / RESULTS)
-    write(tmp_path, "anytouch", "fine-tuned", [60.0], tune_steps=9)
-    pouring_table.read_rows(tmp_path / RESULTS)
-    write_record(tmp_path / RESULTS, "static-frozen-1", {"row": "static"})
-    with pytest.raises(UserError, match="static-frozen-1"):
-        pouring_table.read_rows(tmp_path / RESULTS)

@@ -24,15 +24,6 @@ def test_a_perfect_depth_has_no_error_and_a_wrong_one_has_its_own():
     assert steep.centre == pytest.approx(0.3 * exact.true_centre, rel=0.25) and steep.radius < -0.1
 
 
-def test_slopes_of_a_ball_integrate_to_it():
-    slopes, known = balls.slopes(PRESS, MM)
-    _, _, r = balls.distance(PRESS)
-    assert known.reshape(r.shape)[r < 28].all() and not known.reshape(r.shape)[(r > 32) & (r < 50)].any()
-    slopes = slopes.reshape(120, 160, 2) * (r < PRESS.radius)[..., None]
-    surface = MM * balls.integrate(slopes)
-    assert balls.error_of(surface, PRESS, MM).profile < 0.03 and abs(np.median(surface)) < 1e-9
-
-
 @pytest.mark.parametrize("radii", [(20, 48), None])
 def test_the_circle_of_a_press_is_found(radii):
     x, y, r = balls.distance(PRESS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.real import features, scores, training
+from experiments.real import scores
 from experiments.real.recordings import Recordings
 
 RNG = np.random.default_rng(0)
@@ -41,13 +41,6 @@ def test_features_that_name_the_object_are_right_and_noise_is_not(data, head):
     assert clear.minus(clear) == (0.0, 0.0, 0.0)
 
 
-def test_a_recording_is_named_by_all_of_its_frames(data):
-    """One frame in four is wrong everywhere, and every recording is right: frames are averaged."""
-    x = planted(data, 0.05)
-    x[::4] = np.roll(x[::4], 1, axis=1)
-    assert scores.object_score(x, data).share == 1.0
-
-
 def test_the_other_finger_is_scored_on_the_camera_that_the_head_never_saw(data):
     """A feature that shows the object on one camera, and another object on the other, is always wrong there."""
     x = planted(data, 0.01)
@@ -61,36 +54,3 @@ def test_slip_is_scored_on_objects_that_the_head_never_saw(data):
     assert scores.slip_score(planted(data, 0.01), data).share < 0.7
     slipping = data.slip[:, None] + 0.01 * RNG.standard_normal((len(data.slip), 3))
     assert scores.slip_score(slipping.astype(np.float32), data).share == 1.0
-
-
-def test_more_labels_help(data):
-    few, many = (scores.label_curve(planted(data, 0.7), data, count) for count in (1, 5))
-    assert few < many
-
-
-def test_baselines_have_a_value_for_each_frame(data):
-    assert features.pixel_values(data).shape[0] == features.classical_values(data).shape[0] == len(data.frames)
-
-
-def test_binary_patterns_count_corners_and_flat_places():
-    assert features._UNIFORM.max() == 58 and len(set(features._UNIFORM)) == 59
-    flat = features._binary_patterns(np.full((34, 34), 7, np.uint8), 1)
-    assert flat[features._UNIFORM[255]] == 1.0 and flat.sum() == 1.0
-
-
-@pytest.mark.slow
-def test_a_small_network_learns_what_the_pictures_show(data, monkeypatch):
-    """Objects differ by their colour. A shift moves no colour."""
-    y = np.searchsorted(data.names, data.object)
-    x = np.broadcast_to(200 * np.eye(6, dtype=np.uint8)[y][:, None, None], (len(y), 16, 16, 6))
-    monkeypatch.setattr(training, "EPOCHS", (80,))
-    monkeypatch.setattr(training.SmallCnn.__init__, "__defaults__", (0, (8, 8)))
-    assert scores.object_score(x, data, training.cnn_scores).share == 1.0
-
-
-def test_shifted_pictures_keep_their_size_and_values():
-    pictures = np.arange(2 * 20 * 20 * 3, dtype=np.int64).reshape(2, 20, 20, 3)
-    moved = training._shifted(pictures, np.random.default_rng(3))
-    assert moved.shape == pictures.shape
-    assert all(np.isin(one, other).all() for one, other in zip(moved, pictures, strict=True))
-    assert not np.array_equal(moved, pictures)

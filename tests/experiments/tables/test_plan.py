@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 from experiments.tables import plan
-from experiments.tables.paper import TABLE1, TABLE6
 
 LEAVES = plan.leaves(plan.FULL)
 BY_NAME = {(leaf.question, leaf.name, leaf.seed): leaf for leaf in LEAVES}
@@ -28,35 +27,11 @@ def test_one_stage_1_serves_all_that_start_from_it():
     assert len(second) == 5
 
 
-def test_recipes_train_the_stages_that_they_say():
-    assert set(stages("q3", "t3")) == {1} and set(stages("q3", "unitouch")) == {2} == set(
-        stages("ablations", "no_stage1")
-    )
-    assert BY_NAME["q3", "no_pretraining", 0].tower and not stages("q3", "untrained")
-    for leaf in LEAVES:
-        for before, after in zip(leaf.trainings, leaf.trainings[1:], strict=False):
-            assert after.init is before and (before.config.stage, after.config.stage) == (1, 2)
-
-
 def test_the_unseen_sensor_is_in_no_training():
     for leaf in LEAVES:
         for one in leaf.trainings:
             names = [*one.config.data.manifests, *one.config.model.sensors]
             assert not any(plan.UNSEEN in name for name in names), leaf.key
-
-
-def test_table_1_adds_sensors_without_touches_felt_twice():
-    for name in list(TABLE1)[1:]:
-        one = BY_NAME["q1", name, 0].model
-        assert one.config.data.manifests == tuple(f"own/{sensor}" for sensor in name.split("+"))
-        assert one.config.model.sensors == (*name.split("+"), "universal")
-        assert not set(one.config.data.manifests) & set(plan.ALIGNED)
-
-
-def test_claims_have_three_seeds():
-    for question, names in (("ablations", TABLE6), ("q1", TABLE1), ("q2", ("masked", "aligned", "matched"))):
-        for name in names:
-            assert {seed for q, n, seed in BY_NAME if (q, n) == (question, name)} == {0, 1, 2}
 
 
 def test_files_and_identities_are_of_one_run_each():
@@ -75,10 +50,3 @@ def test_a_result_hangs_on_the_simulator_and_not_on_the_name_of_a_size(monkeypat
     monkeypatch.setattr("anytouch_jax.sim.dataset.VERSION", plan.simulator() + 1)
     later = {leaf.identity for leaf in plan.leaves(plan.FULL)}
     assert not later & set(again.values())
-
-
-def test_a_result_hangs_on_how_its_question_is_scored(monkeypatch):
-    again = {leaf.key: leaf.identity for leaf in LEAVES}
-    monkeypatch.setitem(plan.SCORING, "q2", 7)
-    for leaf in plan.leaves(plan.FULL):
-        assert (leaf.identity == again[leaf.key]) == (leaf.question != "q2")

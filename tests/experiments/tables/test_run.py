@@ -3,28 +3,13 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 import synthetic
-from places import ROOT
 
-from anytouch_jax.errors import UserError
 from experiments.records import read_records
-from experiments.tables import execute, plan, results, work
+from experiments.tables import plan, work
 from experiments.tables import run as matrix
-
-
-def test_the_plan_is_printed_with_what_is_done(tmp_path, capsys):
-    leaves = plan.leaves(plan.QUICK)
-    synthetic.write(tmp_path / "matrix.jsonl", leaves[:2])
-    words = ["--plan", "--quick", "--out", str(tmp_path)]
-    assert matrix.main(words) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(leaves)
-    assert [line.endswith("done") for line in lines[:3]] == [True, True, False]
-    assert matrix.main([*words, "--only", "q1", "q2"]) == 0
-    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == {"q1", "q2"}
 
 
 def test_tables_are_rendered_from_the_files_alone(tmp_path, capsys):
@@ -34,12 +19,6 @@ def test_tables_are_rendered_from_the_files_alone(tmp_path, capsys):
     text = (tmp_path / "sensors.md").read_text()
     assert str(tmp_path / "sensors.md") in capsys.readouterr().out and not (tmp_path / "never").exists()
     assert "| material | gelsight | 50.0 [50.0, 50.0] | - | - |" in text
-
-
-def test_sizes_can_be_changed():
-    size = matrix.size_of(False, ["steps1=7", "seeds=3,4", "rate1=0.01"])
-    assert (size.steps1, size.seeds, size.rate1, size.name) == (7, (3, 4), 0.01, "changed")
-    assert matrix.size_of(True, []) == plan.QUICK and matrix.size_of(False, []) == plan.FULL
 
 
 @pytest.mark.parametrize(
@@ -84,34 +63,6 @@ def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(t
         error = capsys.readouterr().err
         assert leaves[1].question in error and "OUT=" in error and len(error.splitlines()) == 1
         assert path.read_text() == before and not (tmp_path / "work").exists()
-
-
-def test_results_of_a_question_that_is_not_run_may_be_of_another_simulator(tmp_path):
-    leaves, path = plan.leaves(plan.QUICK), tmp_path / "matrix.jsonl"
-    synthetic.write(path, leaves[:1])
-    synthetic.change(path, leaves[0].key, simulator=1)
-    execute.check_results([leaf for leaf in leaves if leaf.question != leaves[0].question], path)
-    with pytest.raises(UserError, match=leaves[0].question):
-        execute.check_results(leaves, path)
-
-
-def test_seeds_alone_make_no_other_size():
-    assert matrix.size_of(False, ["seeds=2"]).name == "full"
-    assert matrix.size_of(False, ["seeds=2", "steps1=7"]).name == "changed"
-
-
-def test_the_committed_results_are_of_one_simulator():
-    runs = results.read(ROOT / "experiments" / "results" / "matrix.jsonl")
-    assert len({results.simulated(run.about) for run in runs}) == 1
-
-
-def test_changed_sizes_are_written_next_to_the_data():
-    default = ROOT / "experiments" / "results"
-    assert matrix.choose(matrix.options([])).out == default
-    for words in (["--quick"], ["--set", "steps1=7"]):
-        result = matrix.choose(matrix.options([*words, "--work", "there"]))
-        assert result.out == Path("there") / "results" and result.folder == Path("there")
-    assert matrix.choose(matrix.options(["--set", "steps1=7", "--out", "here"])).out == Path("here")
 
 
 @pytest.mark.slow

@@ -68,37 +68,3 @@ def test_a_training_on_other_data_is_not_finished_and_starts_again(work, trainer
     assert trainer.calls[-1] == (FIRST.key, False)  # nothing is left of the first one
     assert f"  {FIRST.key} was trained on other data: it starts again" in work.said
     assert work.ready(LEAF) == sets | {FIRST.key}
-
-
-def test_what_does_not_say_of_what_it_is_counts_for_nothing(work, trainer):
-    work.train(FIRST)
-    for path in (work.run_of(FIRST) / DONE, work.folder / "other" / DONE):
-        about = json.loads(path.read_text())
-        del about["of"]
-        path.write_text(json.dumps(about))
-    assert work.ready(LEAF) == {"own", "fine", "coarse"}
-
-
-def test_the_time_of_an_interrupted_training_is_that_of_all_its_parts(work, trainer):
-    trainer.stop = True
-    for _ in range(2):
-        with pytest.raises(KeyboardInterrupt):
-            work.train(FIRST)
-    trainer.stop = False
-    work.train(FIRST)
-    assert [there for _, there in trainer.calls] == [False, True, True]  # gone on with
-    about = json.loads((work.run_of(FIRST) / DONE).read_text())
-    assert (about["seconds"], about["parts"]) == (30.0, 3)
-
-
-def test_a_record_names_the_data_that_were_learned_from(work, trainer, monkeypatch):
-    monkeypatch.setattr(works.scores, "score", lambda leaf, work: {"rows": [], "data": ["own/digit"]})
-    for name in ("digit", "gelsight_mini"):  # scored alone
-        (work.folder / "own" / f"{name}.parquet").write_bytes((work.folder / "own" / "gelsight.parquet").read_bytes())
-    for one in LEAF.trainings:
-        work.train(one)
-    learned = work._contents(LEAF.model)
-    write_data(work.folder, "two")
-    result = work.score(LEAF)
-    assert {name: result["data"][name] for name in learned} == learned and "own/digit" in result["data"]
-    assert all("of" not in one and one["seconds"] == 10.0 for one in result["trained"])

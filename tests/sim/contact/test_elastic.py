@@ -51,23 +51,6 @@ def test_fft_and_matrix_products_agree(monkeypatch):
     np.testing.assert_allclose(convolved(), product, atol=2e-5)
 
 
-@pytest.mark.parametrize("least", [1, 2, 23, 97, 211, 223, 1021])
-def test_padding_is_even_smooth_and_enough(least):
-    size = elastic._smooth(least)
-    assert size >= least and size % 2 == 0 and size <= 1.1 * least + 4
-    for factor in (2, 3, 5, 7):
-        while size % factor == 0:
-            size //= factor
-    assert size == 1
-
-
-def test_own_coefficient_and_far_field():
-    normal = elastic.normal_coefficients(40, 40)
-    assert normal[0, 0] == pytest.approx(4 * np.log(1 + np.sqrt(2)) / np.pi)
-    assert normal[30, 20] == pytest.approx(1 / (np.pi * np.hypot(30, 20)), rel=1e-4)  # Boussinesq
-    np.testing.assert_allclose(normal, normal.T, atol=1e-13)
-
-
 def test_tangential_coefficients_are_cerrutis_in_the_far_field():
     xx, xy, yy = elastic.tangential_coefficients(40, 40, POISSON)
     x, y = 25, 12
@@ -77,24 +60,6 @@ def test_tangential_coefficients_are_cerrutis_in_the_far_field():
     assert xy[y, x] == pytest.approx(ratio * x * y / r**3 / np.pi, rel=1e-3)
     np.testing.assert_allclose(xx, yy.T, atol=1e-13)
     np.testing.assert_allclose(xy[0], 0, atol=1e-13)
-
-
-def test_tangential_without_poisson_is_twice_the_shear_compliance():
-    """At nu = 0 both directions are Boussinesq's: 1 / (2 pi G r) = 1 / (pi E* r)."""
-    xx, xy, yy = elastic.tangential_coefficients(8, 8, 0.0)
-    np.testing.assert_allclose(xx, elastic.normal_coefficients(8, 8))
-    np.testing.assert_allclose(yy, xx)
-    assert not xy.any()
-
-
-def test_layer_symbols_reach_the_thin_and_the_thick_limit():
-    thin = np.array([1e-4])
-    normal, along, across = (one[0] / 1e-4 for one in elastic.layer_symbols(thin, POISSON))
-    assert normal == pytest.approx((1 - 2 * POISSON) / (2 * (1 - POISSON) ** 2), rel=1e-3)  # confined compression
-    assert along == pytest.approx(1 / (1 - POISSON), rel=1e-3)  # plain shear h / G
-    assert across == pytest.approx(1.0, rel=1e-3)
-    for one in elastic.layer_symbols(np.array([30.0, 800.0]), POISSON):
-        np.testing.assert_allclose(one, 1, atol=1e-6)
 
 
 def moved_by_a_wave(thickness, poisson):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -139,13 +138,6 @@ def test_moves_and_turns_with_the_object(solve):
     assert moved.force == pytest.approx(float(first.force), rel=1e-3)
 
 
-@pytest.mark.parametrize("solve", [exact, fast])
-def test_force_grows_with_depth(solve):
-    for surface in (ball(0.1), rough(0.1), ball(0.1) + 20 * rough(0.1, 1)):
-        forces = [float(solve(jnp.asarray(surface, jnp.float32), depth, 0.1).force) for depth in (0.05, 0.1, 0.2, 0.4)]
-        assert forces[0] > 0 and np.all(np.diff(forces) > 0)
-
-
 def test_batch_equals_single():
     surfaces = jnp.asarray(np.stack([ball(0.1), rough(0.1), np.full((N, N), -INF)]), jnp.float32)
     depths = jnp.array([0.2, 0.1, 0.3])
@@ -188,20 +180,6 @@ def test_hard_cases_converge_and_stay_finite(shape, depth):
         assert (float(result.force) > 0) == (highest > 0)
 
 
-def test_hundreds_of_islands():
-    surface = rough(0.1, spread=0.3)
-    outcome = solved(surface, -1.2 * surface.mean(), 0.1)
-    islands = cv2.connectedComponents((outcome.pressure > 0).astype(np.uint8), connectivity=4)[0] - 1
-    assert islands > 200
-    assert outcome.iterations < 100
-
-
-def test_says_when_it_did_not_converge():
-    outcome = press(jnp.asarray(rough(0.1), jnp.float32), 0.1, Gel(), 0.1, iterations=2)
-    assert not outcome.converged and outcome.residual > 1e-4 and outcome.iterations == 2
-    assert np.isfinite(np.asarray(outcome.displacement)).all()
-
-
 def test_double_precision_in_double_precision_out():
     with jax.enable_x64(True):
         outcome = press(jnp.asarray(ball(0.1)), 0.2, Gel(), 0.1, tolerance=1e-10)
@@ -210,24 +188,6 @@ def test_double_precision_in_double_precision_out():
     single = exact(jnp.asarray(ball(0.1), jnp.float32), 0.2, 0.1)
     assert single.pressure.dtype == single.displacement.dtype == single.force.dtype == jnp.float32
     np.testing.assert_allclose(single.displacement, np.asarray(outcome.displacement), atol=2e-5)
-
-
-def test_an_elastic_object_shares_the_deformation():
-    rigid, soft = solved(ball(0.1), 0.3, 0.1), solved(ball(0.1), 0.3, 0.1, PLANE)
-    np.testing.assert_allclose(soft.pressure, rigid.pressure / 2, atol=2e-2)
-    np.testing.assert_allclose(soft.displacement, rigid.displacement / 2, atol=1e-5)
-
-
-def test_a_thinner_layer_is_stiffer():
-    def on(thickness):
-        return press(surface, 0.3, Gel(thickness=thickness), 0.1, tolerance=1e-4)
-
-    surface = jnp.asarray(ball(0.1), jnp.float32)
-    force = jax.jit(lambda thickness: on(thickness).force)
-    forces = [float(force(thickness)) for thickness in (1.0, 2.0, 4.0, 400.0)]
-    assert np.all(np.diff(forces) < 0)
-    assert forces[-1] == pytest.approx(float(exact(surface, 0.3, 0.1).force), rel=5e-3)
-    assert np.asarray(on(2.0).displacement)[0, 0] < 0.1 * np.asarray(exact(surface, 0.3, 0.1).displacement)[0, 0]
 
 
 def test_on_a_bonded_layer_an_elastic_object_moves_as_a_half_space_and_the_gel_as_a_layer():
@@ -249,13 +209,6 @@ def test_on_a_bonded_layer_an_elastic_object_moves_as_a_half_space_and_the_gel_a
     assert np.sqrt(np.mean((quick - layer) ** 2)) < 0.02 * layer.max()
 
 
-def test_force_scales_with_the_modulus_and_the_units():
-    base = solved(ball(0.1), 0.3, 0.1).force
-    stiff = press(jnp.asarray(ball(0.1), jnp.float32), 0.3, Gel(modulus=300.0), 0.1, tolerance=2e-5).force
-    assert stiff == pytest.approx(2 * base, rel=1e-4)
-    assert solved(10 * ball(0.1), 3.0, 1.0).force == pytest.approx(100 * base, rel=1e-4)  # everything ten times larger
-
-
 @pytest.mark.parametrize(
     ("surface", "rms", "force"), [(ball(0.1), 2e-3, 0.01), (rough(0.1), 0.03, 0.05), (square(0.1), 0.01, 0.02)]
 )
@@ -270,45 +223,25 @@ def test_fast_is_near_exact(surface, rms, force):
     assert np.linalg.norm(quick.pressure - right.pressure) < 0.35 * np.linalg.norm(right.pressure)
 
 
-def test_centroid_and_area():
-    pressure = np.zeros((N, N), np.float32)
-    pressure[10, 40] = 100.0
-    x, y = (40 - 31.5) * 0.1, (10 - 31.5) * 0.1
-    np.testing.assert_allclose(mechanics.centroid(pressure, 0.1), [x, y], rtol=1e-5)
-    assert mechanics.area(pressure, 0.1) == pytest.approx(0.01)
-    assert not np.asarray(mechanics.centroid(np.zeros((N, N), np.float32), 0.1)).any()
-
-
 @pytest.mark.parametrize(
-    ("surface", "depth", "pitch", "options", "word"),
+    ("change", "word"),
     [
-        (np.zeros((8, 8)), -0.1, 0.1, {}, "depth"),
-        (np.zeros((8, 8)), float("nan"), 0.1, {}, "depth"),
-        (np.zeros((8, 8)), 0.1, 0.0, {}, "pitch"),
-        (np.full((8, 8), np.nan), 0.1, 0.1, {}, "NaN"),
-        (np.zeros((2, 8, 8)), 0.1, 0.1, {}, "vmap"),
-        (np.zeros((8, 8)), 0.1, 0.1, {"fidelity": "exactly"}, "fidelity"),
-        (np.zeros((8, 8)), float("inf"), 0.1, {}, "depth"),
-        (np.zeros((8, 8)), 0.1, float("inf"), {}, "pitch"),
-        (np.zeros((8, 8)), 0.1, 0.1, {"modulus_object": 0.0}, "modulus_object must be above 0"),
+        ({"depth": -0.1}, "depth"),
+        ({"depth": float("nan")}, "depth"),
+        ({"depth": float("inf")}, "depth"),
+        ({"pitch": 0.0}, "pitch"),
+        ({"pitch": float("inf")}, "pitch"),
+        ({"surface": np.full((8, 8), np.nan)}, "NaN"),
+        ({"surface": np.zeros((2, 8, 8))}, "vmap"),
+        ({"fidelity": "exactly"}, "fidelity"),
+        ({"modulus_object": 0.0}, "modulus_object must be above 0"),
+        ({"gel": Gel(modulus=float("nan"))}, "modulus must be above 0"),
+        ({"gel": Gel(thickness=0.0)}, "thickness must be above 0"),
+        ({"gel": Gel(poisson=1.0)}, "Poisson ratio is 0 to 0.5"),
+        ({"gel": Gel(thickness=0.09)}, "too thin for this grid: 0.1 mm is the least"),
+        ({"gel": Gel(thickness=0.25), "fidelity": "fast"}, "too thin for this grid: 0.3 mm is the least"),
     ],
 )
-def test_mistakes_are_named(surface, depth, pitch, options, word):
+def test_mistakes_are_named(change, word):
     with pytest.raises(UserError, match=word):
-        press(surface, depth, Gel(), pitch, **options)
-
-
-@pytest.mark.parametrize(
-    ("gel", "fidelity", "word"),
-    [
-        (Gel(modulus=-1.0), "exact", "modulus must be above 0"),
-        (Gel(modulus=float("nan")), "exact", "modulus must be above 0"),
-        (Gel(thickness=0.0), "exact", "thickness must be above 0"),
-        (Gel(poisson=1.0), "exact", "Poisson ratio is 0 to 0.5"),
-        (Gel(thickness=0.09), "exact", "too thin for this grid: 0.1 mm is the least"),
-        (Gel(thickness=0.25), "fast", "too thin for this grid: 0.3 mm is the least"),
-    ],
-)
-def test_gels_that_cannot_be_are_named(gel, fidelity, word):
-    with pytest.raises(UserError, match=word):
-        press(np.zeros((64, 64)), 0.05, gel, 0.1, fidelity=fidelity)
+        press(**{"surface": np.zeros((64, 64)), "depth": 0.05, "gel": Gel(), "pitch": 0.1} | change)

@@ -158,12 +158,6 @@ def test_no_motion_changes_nothing_and_lifting_off_lets_go(step):
     assert free.slip_fraction == 0 and free.twist_torque == 0 and free.converged
 
 
-def test_without_friction_nothing_is_dragged():
-    state = walk(exact, [(0.2, 0.1, 0.1)], friction=0.0)[0]
-    assert not state.traction.any() and not state.displacement.any()
-    assert state.slip_fraction == 1
-
-
 @pytest.mark.parametrize("size", [1e-6, 5.0])
 def test_tiny_and_huge_motions(size):
     for step in (exact, fast):
@@ -171,13 +165,6 @@ def test_tiny_and_huge_motions(size):
         assert all(np.isfinite(field).all() for field in state)
         linear = 8 * A * STIFFNESS * size * 1e-3
         assert state.force[0] == pytest.approx(min(linear, MU * LOAD), rel=0.1 if step is fast else 0.02)
-
-
-def test_a_twist_about_another_centre_is_a_twist_and_a_shift():
-    centre, turn = (0.4, -0.3), 0.05
-    about = jax.jit(lambda: shear_step(None, CONTACT, (0, 0, turn), GEL, PITCH, MU, centre=centre, tolerance=3e-4))()
-    moved = walk(exact, [(turn * centre[1], -turn * centre[0], turn)])[0]
-    np.testing.assert_allclose(about.traction, moved.traction, atol=0.02)
 
 
 def test_fast_is_near_exact_on_a_path():
@@ -203,16 +190,6 @@ def test_scan_and_batch_equal_steps():
         for number, state in enumerate(walk(fast, sign * motions, [contact] * 3)):
             np.testing.assert_allclose(batch.traction[row, number], state.traction, atol=2e-3)
             np.testing.assert_allclose(batch.displacement[row, number], state.displacement, atol=2e-5)
-
-
-def test_a_pressed_object_is_dragged_along():
-    """From `press` to `shear_step`, double precision throughout."""
-    with jax.enable_x64(True):
-        contact = press(jnp.asarray(-(R**2) / (2 * RADIUS)), DEPTH, GEL, PITCH, tolerance=1e-7)
-        state = shear_step(None, contact, (0.05, 0, 0), GEL, PITCH, MU, tolerance=1e-5)
-        assert state.traction.dtype == jnp.float64 and state.converged
-    single = walk(exact, [(0.05, 0, 0)])[0]
-    np.testing.assert_allclose(state.force, single.force, atol=0.01 * MU * LOAD)
 
 
 def test_mistakes_are_named():

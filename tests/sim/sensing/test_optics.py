@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.recorder import stack_trees
 from anytouch_jax.sim.sensing import optics, sensors
 from anytouch_jax.sim.sensing.sensors import SENSORS, Markers
 
@@ -57,12 +56,6 @@ def test_no_displacement_is_the_background():
     assert behind.shape == (*SIZE, 3) and behind.dtype == jnp.uint8
 
 
-def test_a_skin_pushed_in_evenly_looks_untouched():
-    np.testing.assert_allclose(
-        levels(draw(FLAT + 0.7, STILL, PLAIN, KEY)), levels(draw(FLAT, STILL, PLAIN, KEY)), atol=1
-    )
-
-
 def test_a_dent_changes_the_picture_where_it_is():
     for x, y in ((0.0, 0.0), (5.0, -3.0), (-6.0, 4.0)):
         change = np.abs(levels(draw(bump(x, y), STILL, PLAIN, KEY)) - levels(draw(FLAT, STILL, PLAIN, KEY))).sum(-1)
@@ -75,37 +68,11 @@ def test_a_dent_changes_the_picture_where_it_is():
         assert change[np.hypot((columns - 31.5) * pitch - x, (rows - 23.5) * pitch - y) > 7].max() <= 12
 
 
-def test_the_gelslims_green_lamp_lights_the_left_flank():
-    change = levels(draw(bump(), STILL, PLAIN, KEY)) - levels(draw(FLAT, STILL, PLAIN, KEY))
-    left, right = change[22:26, 20:29].mean((0, 1)), change[22:26, 35:44].mean((0, 1))
-    assert left[1] > right[1] + 10
-
-
-def test_deeper_is_stronger_and_shadow_can_be_left_out():
-    base = levels(draw(FLAT, STILL, PLAIN, KEY))
-    shallow, deep = (np.abs(levels(draw(bump(height=h), STILL, PLAIN, KEY)) - base).sum() for h in (0.2, 0.8))
-    assert deep > 2 * shallow > 0
-    plain = levels(draw(bump(), STILL, PLAIN, KEY, shadow=False))
-    assert np.abs(plain - levels(draw(bump(), STILL, PLAIN, KEY))).mean() > 0.5
-    np.testing.assert_array_equal(draw(FLAT, STILL, PLAIN, KEY, shadow=False), base)
-
-
 def test_mirror_turns_the_picture_over():
     for axis, mirror in ((1, [-1, 1]), (0, [1, -1])):
         unit = PLAIN._replace(mirror=np.array(mirror, np.float32))
         flipped = np.flip(levels(draw(bump(3.0, 2.0), STILL, PLAIN, KEY)), axis)
         np.testing.assert_allclose(levels(draw(bump(3.0, 2.0), STILL, unit, KEY)), flipped, atol=1)
-
-
-def test_zoom_and_window_choose_the_part_of_the_field_that_is_shown():
-    unit = PLAIN._replace(zoom=np.float32(0.5), window=np.array([2.5, -1.0], np.float32))
-    seen = optics.picture_view(SLIM, unit, SIZE)
-    np.testing.assert_allclose([seen.x[0], seen.x[-1]], 2.5 + np.array([-5, 5]) * (1 - 1 / 64), rtol=1e-5)
-    np.testing.assert_allclose(np.mean(seen.y), -1, atol=1e-5)
-    np.testing.assert_allclose(seen.u, seen.x / 10, rtol=1e-6)
-    square = optics.picture_view(SLIM, PLAIN, (40, 40))  # another shape: a centred square without stretching
-    np.testing.assert_allclose(np.diff(square.x), np.diff(square.y), rtol=1e-4)
-    assert abs(float(square.y[-1]) - SLIM.field[0] / 2) < 0.5
 
 
 def test_tint_gain_and_light_angle_act():
@@ -122,18 +89,6 @@ def test_tint_gain_and_light_angle_act():
     turned = PLAIN._replace(light_angle=np.float32(0.5))
     assert np.abs(levels(draw(bump(), STILL, turned, KEY)) - dent).max() > 10
     np.testing.assert_array_equal(draw(FLAT, STILL, turned, KEY), base)
-
-
-def test_turned_lights_shade_and_shadow_a_slope_as_they_would_a_turned_one():
-    x, y = grid()
-    across, down = 0.1 * x + 0 * y, 0.1 * y + 0 * x  # at the middle of the picture neither is deeper than the other
-    turned = PLAIN._replace(light_angle=np.float32(-np.pi / 2))
-    one, other = (levels(draw(*seen, None))[23:25, 31:33].mean((0, 1)) for seen in
-                  ((across, STILL, PLAIN), (down, STILL, turned)))  # fmt: skip
-    np.testing.assert_allclose(other, one, atol=1.5)
-    flat, unturned = (levels(draw(*seen, None))[23:25, 31:33].mean((0, 1)) for seen in
-                      ((FLAT, STILL, PLAIN), (down, STILL, PLAIN)))  # fmt: skip
-    assert np.abs(one - flat).max() > 10 and np.abs(unturned - one).max() > 10
 
 
 def test_markers_follow_the_skin_and_come_back_after_one_step_of_the_lattice():
@@ -168,34 +123,6 @@ def test_noise_has_the_stated_spread_and_is_a_function_of_the_key():
     assert np.abs(np.corrcoef(planes.T) - np.eye(3)).max() < 0.06
 
 
-def test_a_batch_is_its_frames():
-    rng = np.random.default_rng(3)
-    several = [sensors.draw_unit(SLIM, rng) for _ in range(2)]
-    dents, keys = jnp.stack([bump(2.0), bump(0, -2.0)]), jax.random.split(KEY, 2)
-    together = jax.vmap(draw)(dents, jnp.stack([STILL, STILL]), stack_trees(several), keys)
-    for i in range(2):
-        np.testing.assert_allclose(levels(together[i]), levels(draw(dents[i], STILL, several[i], keys[i])), atol=1)
-
-
-def test_a_backdrop_made_beforehand_gives_the_same_picture():
-    unit = sensors.draw_unit(SLIM, np.random.default_rng(4))
-    behind = optics.backdrop(SLIM, unit, SIZE)
-    given = optics.render(bump(), None, PITCH, SLIM, unit, KEY, resolution=SIZE, behind=behind)
-    made = optics.render(bump(), None, PITCH, SLIM, unit, KEY, resolution=SIZE)
-    np.testing.assert_allclose(levels(given), levels(made), atol=1)
-
-
-def test_the_default_size_has_a_short_side_of_224():
-    assert optics.picture_size(DIGIT) == (299, 224)
-    assert optics.picture_size(SENSORS["gelsight"], 112) == (112, 149)
-    assert optics.picture_size(DIGIT, 0) == DIGIT.resolution == (320, 240)
-
-
-def test_a_field_sensor_has_no_picture():
-    with pytest.raises(UserError, match="tac3d has no camera"):
-        optics.render(FLAT, None, PITCH, SENSORS["tac3d"], PLAIN, resolution=SIZE)
-
-
 def test_the_field_adds_up_to_the_load():
     rng = np.random.default_rng(5)
     pressure, traction = rng.uniform(0, 50, (48, 48)), rng.normal(0, 9, (48, 48, 2))
@@ -223,16 +150,6 @@ def test_the_noise_of_a_field_is_in_mm_and_in_what_the_gel_makes_of_it():
     np.testing.assert_allclose(seen.std((0, 1)), [0.02] * 3 + [newton] * 3, rtol=0.15)
     assert np.abs(seen.mean((0, 1)) / seen.std((0, 1))).max() < 0.2
     assert not np.asarray(noisy()).any() and np.array_equal(noisy(key=jax.random.key(3)), seen)
-
-
-def test_steep_and_broken_surfaces_stay_pictures():
-    gx, _ = grid()
-    wall = jnp.where(gx > 0, 5.0, 0.0) + jnp.zeros(GRID)
-    image = levels(draw(wall, STILL, MARKED, KEY))
-    assert image.std() > 1
-    np.testing.assert_array_equal(image[:, :20], levels(draw(wall, STILL, MARKED, KEY))[:, :20])
-    spikes = jnp.asarray(np.random.default_rng(6).choice([0.0, 1e4], GRID).astype(np.float32))
-    assert np.isfinite(levels(draw(spikes, STILL, PLAIN, KEY))).all()
 
 
 def test_a_gel_pressed_deeply_all_over_is_no_darker_than_the_deepest_dent_of_the_calibration():
@@ -268,37 +185,3 @@ def test_dirt_and_the_fixed_pattern_lie_on_every_picture_of_a_unit():
     assert dirt[23:25, 47:49].mean() < -20 and abs(dirt[:, :24].mean()) < 1 and 1.5 < dirt[:, :24].std() < 2.6
     behind = levels(optics.background(SLIM, dirty, KEY, resolution=SIZE))
     np.testing.assert_allclose(levels(draw(FLAT, STILL, dirty, KEY)), behind, atol=1)
-
-
-def test_drift_changes_the_light_of_the_whole_picture():
-    plain = levels(draw(FLAT, STILL, PLAIN, KEY)).astype(float)
-    drift = jnp.zeros((3, 3)).at[0, 0].set(0.1).at[1, 1].set(-0.1)
-    drifted = levels(optics.render(FLAT, None, PITCH, SLIM, PLAIN, resolution=SIZE, drift=drift))
-    np.testing.assert_allclose(drifted[..., 0], plain[..., 0] * 1.1, atol=1)
-    np.testing.assert_allclose(drifted[..., 1], plain[..., 1] * (1 - 0.1 * np.linspace(-1, 1, 64)), atol=2)
-    np.testing.assert_allclose(drifted[..., 2], plain[..., 2], atol=1)
-
-
-def test_a_lens_out_of_focus_blurs_dents_and_markers():
-    blurred = MARKED._replace(focus=np.float32(0.6))
-    sharp, soft = (levels(draw(bump(width=0.6), STILL, unit, KEY)) for unit in (MARKED, blurred))
-    assert np.abs(np.diff(soft, axis=1)).max() < 0.7 * np.abs(np.diff(sharp, axis=1)).max()
-
-
-def test_a_bent_lattice_shrinks_outwards():
-    ink = Markers(pitch=1.25, radius=0.1, bend=0.12)
-    x = jnp.linspace(0, 9.9, 4001)[None]
-    spots = np.asarray(optics.ink_coverage(ink, x, jnp.zeros((1, 1)), jnp.zeros(2), 1.0, 0.02, 10.0))[0] > 0.5
-    edges = np.flatnonzero(np.diff(spots.astype(int)))  # the first spot, at 0, ends at the first
-    middles = (edges[1:-1:2] + edges[2::2]) / 2 * 9.9 / 4000
-    gaps = np.diff(np.concatenate([[0.0], middles]))
-    assert (np.diff(gaps) < 0).all() and gaps[0] == pytest.approx(1.25 / 0.88, rel=0.01)
-
-
-def test_tilt_is_the_sine_and_is_cut():
-    nx, ny = optics.tilt(jnp.array([0.0, 3.0, 1e6]), jnp.array([0.0, 4.0, 0.0]), 0.99)
-    np.testing.assert_allclose(nx, [0, 3 / np.sqrt(26), 0.99], rtol=1e-6)
-    np.testing.assert_allclose(ny, [0, 4 / np.sqrt(26), 0], rtol=1e-6)
-    np.testing.assert_allclose(optics.tilt(jnp.array([3.0]), jnp.array([4.0]), 0.5), [[0.3], [0.4]], rtol=1e-6)
-    slope = jax.grad(lambda g: optics.tilt(g, jnp.array(0.0), 0.9)[0])(0.0)
-    assert slope == 1.0  # no NaN at rest

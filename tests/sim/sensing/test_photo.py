@@ -5,7 +5,6 @@ import cv2
 import numpy as np
 import pytest
 
-from anytouch_jax.errors import UserError
 from anytouch_jax.sim.sensing import photo
 from anytouch_jax.sim.sensing.photo import EXTENT, photograph
 from anytouch_jax.sim.world.objects import catalogue, draw_object
@@ -32,7 +31,7 @@ def middle(mask):
     return np.array([columns.mean(), rows.mean()]) / mask.shape[0] - 0.5
 
 
-@pytest.mark.parametrize("thing", catalogue(2, 27), ids=lambda thing: thing.name)
+@pytest.mark.parametrize("thing", catalogue(2, 27)[::3], ids=lambda thing: thing.name)
 def test_a_photograph_is_a_picture_that_is_neither_black_nor_burnt(thing):
     for place in ((-2.0, 2.0), (2.1, -2.1)):  # touches lie within 3 mm of the middle
         image = photograph(thing, place, np.random.default_rng(3), 64)
@@ -41,17 +40,7 @@ def test_a_photograph_is_a_picture_that_is_neither_black_nor_burnt(thing):
         assert (image.min(-1) > 252).mean() < 0.15 and (image.max(-1) < 4).mean() < 0.15
 
 
-def test_the_draw_makes_the_view():
-    one, same, other = (photograph(BALL, (0, 0), np.random.default_rng(s), 64) for s in (1, 1, 2))
-    np.testing.assert_array_equal(one, same)
-    assert np.abs(one.astype(int) - other).mean() > 10
-    rng = np.random.default_rng(1)
-    np.testing.assert_array_equal(photograph(BALL, (0, 0), rng, 64), one)
-    assert not np.array_equal(photograph(BALL, (0, 0), rng, 64), one)
-    assert photograph(BALL, (0, 0), rng).shape == (224, 224, 3)
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_place_is_in_the_middle_and_the_scale_is_right(seed):
     mask = outline(BALL, (0.0, 0.0), seed)
     # The top of the ball is in the middle; from aside, its body leans away by at most its radius times the tilt.
@@ -61,22 +50,12 @@ def test_the_place_is_in_the_middle_and_the_scale_is_right(seed):
     assert 0.8 * math.pi * 64 / EXTENT[1] ** 2 < share < 1.25 * math.pi * 64 / EXTENT[0] ** 2
 
 
-def test_another_place_moves_the_object_the_other_way():
-    for seed in range(4):
-        here, right, below = (middle(outline(BALL, p, seed)) for p in ((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)))
-        shift = np.array([right - here, below - here])
-        lengths = np.hypot(*shift.T) * np.mean(EXTENT)
-        assert (lengths > 1.0).all() and (lengths < 3.0).all()
-        # x to y is a turn of the same sense as from right to down: the picture is not mirrored.
-        assert np.linalg.det(shift) > 0
-
-
 def fineness(image):
     grey = image.astype(np.float32).mean(-1)
     return (grey - cv2.GaussianBlur(grey, (0, 0), 3))[40:-40, 40:-40].std()
 
 
-@pytest.mark.parametrize("texture", ["ridges", "dots", "grid", "weave", "knit", "sand", "bark"])
+@pytest.mark.parametrize("texture", ["ridges", "weave", "sand"])
 def test_textures_can_be_seen(texture):
     plain, structured = (
         dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, size=60.0))
@@ -85,39 +64,6 @@ def test_textures_can_be_seen(texture):
     for seed in range(3):
         received = [fineness(photograph(t, (0.0, 0.0), np.random.default_rng(seed), 160)) for t in (plain, structured)]
         assert received[1] > 1.6 * received[0]
-
-
-@pytest.mark.parametrize("colour", [(0.8, 0.15, 0.1), (0.1, 0.6, 0.15), (0.15, 0.2, 0.8)])
-def test_the_material_gives_its_colour(colour):
-    thing = painted(draw_object("flat", "weave", "fabric", 4), *colour)
-    for seed in range(4):
-        received = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 64)[24:40, 24:40].mean((0, 1))
-        assert np.argmax(received) == np.argmax(colour) and received.max() > 1.5 * received.min()
-
-
-def test_gloss_makes_highlights():
-    def brightest(material, seed):
-        thing = painted(draw_object("sphere", "smooth", material, 5), 0.3, 0.3, 0.3)
-        image = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 96)[36:60, 36:60].max(-1)
-        return float(image.max() - np.median(image))
-
-    assert np.mean([brightest("glass", s) - brightest("fabric", s) for s in range(5)]) > 30
-
-
-def test_impossible_photographs_are_named():
-    rng = np.random.default_rng(0)
-    for place, size in (((0.0, math.nan), 64), ((0.0, 0.0, 0.0), 64), ((0.0, 0.0), 4)):
-        with pytest.raises(UserError, match="photograph"):
-            photograph(BALL, place, rng, size)
-
-
-def test_the_border_of_the_picture_is_shaded_like_its_inside():
-    thing = draw_object("flat", "smooth", "plastic", 4)
-    thing = dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, size=90.0))
-    for seed in range(3):
-        image = photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 96).astype(np.float32).mean(-1)
-        for turned in (image, image[::-1], image.T, image.T[::-1]):
-            assert abs(turned[0].mean() - turned[3].mean()) < 3
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (4.0, -3.0), (-2.0, 5.0)])

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from anytouch_jax import config
-from anytouch_jax.errors import UserError
-from anytouch_jax.sim.recorder import stack_trees
 from anytouch_jax.sim.sensing import optics, sensors
 from anytouch_jax.sim.sensing.sensors import SENSORS
 
@@ -27,11 +24,6 @@ def test_the_records_are_whole_and_known_to_the_model():
         assert abs(aspect - 1) < 0.02, "square pixels"
         assert sensor.gel.modulus > 0 and 0 < sensor.gel.thickness < 10 and 0 < sensor.gel.poisson < 0.5
     assert [s.name for s in SENSORS.values() if s.kind == "field"] == ["tac3d"]
-
-
-def test_a_sensor_without_pictures_is_named():
-    with pytest.raises(UserError, match=r"tac3d has no camera"):
-        sensors.look(SENSORS["tac3d"])
 
 
 @pytest.mark.parametrize("name", CAMERAS)
@@ -68,15 +60,6 @@ def test_a_digit_shades_as_in_real_pictures():
     assert not colour(0, 0).any()
 
 
-def test_a_9dtact_darkens_where_it_is_pressed():
-    halo = sensors.look(SENSORS["9dtact"]).halo
-    assert (halo[2, 0] < -0.2).all() and not halo[:2].any()
-
-
-def test_a_sensor_without_a_camera_has_a_black_gel():
-    assert not sensors.bases(SENSORS["tac3d"]).any()
-
-
 def test_a_unit_follows_from_the_seed_alone():
     first, again, other = (sensors.draw_unit(DIGIT, np.random.default_rng(s)) for s in (3, 3, 4))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
@@ -104,13 +87,6 @@ def test_units_stay_inside_the_field_and_carry_markers_by_share():
     assert np.std([u.base.mean() for u in drawn]) > 0.005, "units are untouched gels of several real ones"
 
 
-def test_the_light_drifts_little_from_frame_to_frame_and_more_from_the_background():
-    drawn = np.stack([sensors.draw_drift(10, np.random.default_rng(seed)) for seed in range(300)])
-    assert drawn.shape == (300, 10, 3, 3) and drawn.dtype == np.float32
-    since, steps = np.median(np.abs(drawn[:, 0])), np.median(np.abs(np.diff(drawn, axis=1)))
-    assert 0.005 < since < 0.02 and 0.001 < steps < 0.4 * since
-
-
 def test_the_mounting_and_its_inverse():
     unit = sensors.draw_unit(DIGIT, np.random.default_rng(7))
     x, y = jnp.array([0.0, 3.0, -2.0]), jnp.array([0.0, 1.0, 5.0])
@@ -121,12 +97,3 @@ def test_the_mounting_and_its_inverse():
     quarter = sensors.identity_unit(DIGIT)._replace(rotation=np.float32(np.pi / 2))
     np.testing.assert_allclose(sensors.gel_to_object(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
     np.testing.assert_array_equal(sensors.gel_to_object(sensors.identity_unit(DIGIT), x, y), [x, y])
-
-
-def test_stacked_units_vmap():
-    rng = np.random.default_rng(8)
-    several = [sensors.draw_unit(DIGIT, rng) for _ in range(3)]
-    stacked = stack_trees(several)
-    assert stacked.uneven.shape == (3, 5, 3)
-    moved = jax.vmap(lambda u: jnp.stack(sensors.gel_to_object(u, jnp.array(1.0), jnp.array(2.0))))(stacked)
-    np.testing.assert_allclose(moved[2], sensors.gel_to_object(several[2], 1.0, 2.0), rtol=1e-6)

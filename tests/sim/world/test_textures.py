@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 
-from anytouch_jax.sim.world import textures
 from anytouch_jax.sim.world.shapes import Shape, height
 from anytouch_jax.sim.world.textures import GRAINS, TEXTURES
 
@@ -69,27 +68,3 @@ def falls(line):
     line = line / line[0]
     at = int(np.argmax(line < 1 / math.e))
     return at - 1 + (line[at - 1] - 1 / math.e) / (line[at - 1] - line[at])
-
-
-def test_a_gaussian_field_is_of_unit_deviation_and_stretched_as_asked():
-    x, y = axes(120, 0.25)
-    fields = [textures.gaussian_field(x, y, (0.5, 2.0), seed) for seed in range(4)]
-    assert np.mean([f.std() for f in fields]) == pytest.approx(1, rel=0.05)
-    assert abs(np.mean([f.mean() for f in fields])) < 0.1
-    slopes = [[np.diff(f, axis=a).std() for a in (0, 1)] for f in fields]
-    ratio = np.mean(slopes, axis=0)
-    assert 3.0 < ratio[1] / ratio[0] < 4.5
-
-
-def test_normal_cdf():
-    n = np.linspace(-4, 4, 41)
-    want = [0.5 * (1 + math.erf(a / math.sqrt(2))) for a in n]
-    np.testing.assert_allclose(textures.normal_cdf(n), want, atol=4e-4)
-
-
-def test_irregularity_bends_a_pattern_by_what_it_says():
-    x, y = axes(200, 0.3)
-    u, v = textures.warp(x, y, 1.5, 0.1, 3)
-    assert np.std(u - x) == pytest.approx(0.15, rel=0.2) and np.std(v - y) == pytest.approx(0.15, rel=0.2)
-    assert not np.array_equal(u - x, v - y)
-    assert textures.warp(x, y, 1.5, 0.0, 3)[0] is x

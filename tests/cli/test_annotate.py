@@ -118,14 +118,6 @@ def test_a_limit_and_a_family_of_ones_own(anytouch, touches, tmp_path):
         assert anytouch(*words, "--family", "tacquad", "smell").status == 2  # the parser's answer
 
 
-def test_mistakes_are_one_sentence(mistake, touches, monkeypatch):
-    assert str(touches) in mistake("data", "annotate", touches, "--out", touches, "--yes")
-    monkeypatch.delenv("OPENAI_API_KEY")
-    assert "OPENAI_API_KEY" in mistake("data", "annotate", touches, "--yes")
-    assert "http" in mistake("data", "annotate", touches, "--url", "example", "--yes")
-    assert "threads" in mistake("data", "annotate", touches, "--url", "http://localhost:1", "--threads", 0, "--yes")
-
-
 def test_captions_of_a_table_are_attached_and_nobody_is_asked(anytouch, tmp_path):
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((32, 32, 3), np.uint8))
     columns = {"path": ["0.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"],

@@ -51,12 +51,6 @@ def test_mistakes_are_one_sentence(mistake, slides, tmp_path, monkeypatch):
     assert "--out" in mistake("data", "index", "ycb_slide", slides)
 
 
-def test_what_is_left_out_is_counted_with_its_first_file(anytouch, slides):
-    (slides / "real/mug/dataset_0/frames/frame_0000009.jpg").symlink_to(slides / "elsewhere.jpg")
-    out = anytouch("data", "index", "ycb_slide", slides).out
-    assert "left out or noted, " in out and "frame_0000009.jpg" in out
-
-
 def test_the_help_names_every_reader_and_the_defaults_are_the_readers():
     names = (DatasetOptions.__doc__ or "").replace(".", ",")
     assert [name for name in READERS if f"{name}," not in names] == []

@@ -257,7 +257,7 @@ def test_strips_and_tiffs_that_opencv_would_read_wrong_are_refused(tmp_path):
         "strip": "that is a strip",
     }
     for name, sentence in sentences.items():
-        with pytest.raises(images.ImageError, match=rf"{name}\.tif cannot be read: .*{sentence}"):
+        with pytest.raises(images.ImageError, match=rf"{name}\.tif .*{sentence}"):
             images.decode(tmp_path / f"{name}.tif")
 
 

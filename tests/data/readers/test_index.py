@@ -22,17 +22,6 @@ def test_every_reader_says_what_it_is():
     assert abs(total - 2_481_703) < 450_000  # the paper's table sums to 2.9 million, its text says 2,481,703
 
 
-def test_an_unknown_name_suggests_the_nearest(tmp_path):
-    with pytest.raises(UserError, match=r"no reader is called 'Touch-and-go'; did you mean touch_and_go"):
-        index("Touch-and-go", tmp_path)
-
-
-def test_an_unused_option_is_an_error(tmp_path):
-    fill_ycb(tmp_path)
-    with pytest.raises(UserError, match="the reader ycb_slide does not use the option fold; it uses val, test"):
-        index("ycb_slide", tmp_path, options=IndexOptions(fold=1))
-
-
 def test_the_manifest_may_lie_above_the_data_but_not_elsewhere(tmp_path, read):
     fill_ycb(tmp_path / "a b" / "ycb")
     table = read("ycb_slide", tmp_path / "a b" / "ycb", tmp_path / "all.csv")

@@ -10,8 +10,6 @@ import pytest
 from reader_world import fill
 
 from anytouch_jax.data.images import decode
-from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.manifest import replace_column
 from anytouch_jax.data.readers import IndexOptions, index
 from anytouch_jax.data.readers.recordings import ranked_split
 from anytouch_jax.errors import UserError
@@ -350,19 +348,3 @@ def test_what_is_no_recording(tmp_path, read):
     assert [path for path in table.rows if "mug" in path] == ["mug/1700000000.1234567.png", "mug/1700000000.5.png"]
     assert table.reasons == {"folder called background or photo, where one picture is expected": 1}
     assert set(table["sequence"]) == {".", "mug", tmp_path.name}
-
-
-@pytest.fixture
-def edited(tmp_path, read):
-    """edited(ending): the manifest of two objects, to which somebody added label.material and changed a split."""
-
-    def make(ending):
-        fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
-        out = tmp_path / f"hand{ending}"
-        table = read("recordings", out=out, sensor="digit", val=0, test=0).manifest
-        split = ["test" if path.startswith("mug") else "train" for path in table.column("path").to_pylist()]
-        material = [None, *["clay"] * 5]
-        manifests.write(replace_column(replace_column(table, "split", split), "label.material", material), out)
-        return out
-
-    return make

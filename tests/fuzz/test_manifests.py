@@ -162,45 +162,7 @@ def long(rng, rows):
     return f"{name} of {len(value)} letters", csv_bytes(rows), wrong, wrong
 
 
-def frames(rng, rows):
-    kind = pick(rng, ("same", "far", "negative", "farther"))
-    values = {
-        "same": [0] * 12,
-        "far": [0, 1 << 62] * 6,
-        "negative": range(-12, 0),
-        "farther": [-(1 << 63), (1 << 63) - 1] * 6,
-    }
-    for row, value in zip(rows, values[kind], strict=True):
-        row["frame_index"] = value
-    return f"frames {kind}", csv_bytes(rows), False, False
-
-
-def labels(rng, rows):
-    """Numbers that are none, and classes written in two ways."""
-    kind = pick(rng, "two spellings, number and word, infinite, huge, not a number, mixed")
-    values = {
-        "two spellings": ["Ball", "ball"] * 6, "number and word": ["1"] * 11 + ["O"], "infinite": ["1", "inf"] * 6,
-        "huge": ["1e400", "2"] * 6, "not a number": ["nan", "3"] * 6, "mixed": ["1", "true", "x", "2.5"] * 3,
-    }[kind]  # fmt: skip
-    for row, value in zip(rows, values, strict=True):
-        row["label.object"] = value
-    wrong = kind in ("two spellings", "number and word")
-    return f"label {kind}", csv_bytes(rows), wrong, wrong
-
-
-def bytes_of_another(rng, rows):
-    data = pick(
-        rng,
-        (
-            b"PK\3\4" + rng.bytes(300), b"<!doctype html><html></html>", b"PAR1" + bytes(50) + b"PAR1",
-            b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 2\n", rng.bytes(2000), b"\xef\xbb\xbf",
-            b"{}", b"PAR1",
-        ),
-    )  # fmt: skip
-    return f"bytes {data[:9]!r}", data, True, True
-
-
-CSV = (cell, cell, cell, encoding, separators, line_ends, shape, shape, columns, long, frames, labels, bytes_of_another)
+CSV = (cell, cell, cell, encoding, separators, line_ends, shape, shape, columns, long)
 
 
 # Parquet -------------------------------------------------------------------------------------------------------------
@@ -238,29 +200,6 @@ def typed(rng, arrays):
     return f"{name} of {kind}", arrays, wrong
 
 
-def legal(rng, arrays):
-    """Other types for the same values."""
-    name = pick(rng, ("path", "sensor", "sequence", "split", "frame_index", "touch", "text"))
-    kinds = (
-        (pa.int32(), pa.float64(), pa.uint8())
-        if name == "frame_index"
-        else (pa.large_string(), pa.dictionary(pa.int8(), pa.string()), pa.string_view())
-    )
-    kind = pick(rng, kinds)
-    arrays[name] = arrays[name].dictionary_encode() if pa.types.is_dictionary(kind) else arrays[name].cast(kind)
-    return f"{name} as {kind}", arrays, None
-
-
-def invalid_text(rng, arrays):
-    name = pick(
-        rng, ("path", "sensor", "sequence", "split", "text", "touch", "object", "label.object", "note", "dataset")
-    )
-    values = [b"\xff\xfe", b"\xc3\x28", b"\xed\xa0\x80", b"a\x80b"] * 3
-    data = pa.array(values)
-    arrays[name] = pa.StringArray.from_buffers(len(values), data.buffers()[1], data.buffers()[2])
-    return f"invalid UTF-8 in {name}", arrays, True
-
-
 def value(rng, arrays):
     name = pick(rng, WRONG)
     wrong = pick(rng, WRONG[name])
@@ -274,15 +213,7 @@ def value(rng, arrays):
     return f"{name} is {wrong[:20]!r}", arrays, is_wrong
 
 
-def wide(rng, arrays):
-    count = int(rng.integers(1000, 8000))
-    arrays.update({f"label.c{i}": pa.array([0] * 12) for i in range(count)})
-    if missing := rng.random() < 0.3:
-        del arrays["split"]
-    return f"{count} columns", arrays, True if missing else None
-
-
-PARQUET = (typed, typed, typed, legal, invalid_text, value, value, wide)
+PARQUET = (typed, typed, value)
 
 
 def parquet(rng, things, file: Path) -> tuple[str, bool]:

@@ -269,7 +269,8 @@ def test_frames_out_of_order_and_frames_twice(make):
 
 def test_values_are_counted_by_data_set_and_lists_are_named(make):
     rows = [{"dataset": "a" if i < 4 else "b", "text": "t" if i % 4 == 0 else None, "sequence": f"s{i}",
-             "image_path": "v.png" if i < 2 else None, "label.force": [None, "2.5"][i % 2]} for i in range(6)]  # fmt: skip
+             "image_path": "v.png" if i < 2 else None,
+             "label.force": [None, 2.5][i % 2]} for i in range(6)]  # fmt: skip
     manifest, window = make(rows), pa.array([[1.0], None, [2.0, 3.0], [4.0], None, None])
     report = verify(replace(manifest, table=manifest.table.append_column("label.window", window)))
     assert report.shares["a"]["text"] == 0.25 and report.shares["b"]["text"] == 0.5

@@ -9,16 +9,14 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from runs import run_config, train
 
 from anytouch_jax.encoder.linear_head import load_head
 
 
 def write_video(path, frames, codec="MJPG"):
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 10, frames[0].shape[1::-1])
-    for frame in frames:
-        writer.write(frame)
-    writer.release()
+    write_film(path, frames, code=codec)
     return path
 
 

@@ -9,6 +9,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from films import write_film
 from tiny_models import touch_model
 
 from anytouch_jax.config import SENSORS, to_json
@@ -74,10 +75,7 @@ def test_a_file_for_engines_embeds_and_streams_like_the_run(anytouch, tmp_path, 
             assert np.abs(file["features"] - live).max() < tolerance * np.abs(live).max()
             assert str(file["about/weights"]) == load_encoder(tiny_run).fingerprint
     film = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10, (28, 28))
-    for number in range(3):
-        writer.write(cv2.imread(str(tmp_path / f"{number}.png")))
-    writer.release()
+    write_film(film, (cv2.imread(str(tmp_path / f"{number}.png")) for number in range(3)))
     found = []
     for words in (("--model", tiny_run), ("--model", tiny_run, "--engine", "onnxruntime"), ("--model", out)):
         made = tmp_path / f"stream{len(found)}.npz"

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from PIL import Image
 
 from anytouch_jax.data import images
@@ -127,10 +128,7 @@ def test_decoders_print_nothing_and_no_thread_loses_a_line(capfd, tmp_path):
 @pytest.mark.parametrize(("code", "ending"), [("MJPG", "avi"), ("mp4v", "mp4")])
 def test_videos_print_nothing(capfd, tmp_path, code, ending):
     path = tmp_path / f"film.{ending}"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), 10, (64, 48))
-    for _ in range(12):
-        writer.write(cv2.resize(RGB, (64, 48)))
-    writer.release()
+    write_film(path, (cv2.resize(RGB, (64, 48)) for _ in range(12)), code=code)
     data, rng = path.read_bytes(), np.random.default_rng(0)
     capfd.readouterr()
     for number in range(12):

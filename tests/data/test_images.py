@@ -5,6 +5,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from PIL import Image, ImageOps
 
 from anytouch_jax.data import images
@@ -169,19 +170,13 @@ def test_a_folder_comes_in_natural_order(tmp_path):
 
 def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
     path = tmp_path / "v.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 24))
-    for level in (0, 100, 200):
-        writer.write(np.full((24, 32, 3), (0, 0, level), np.uint8))  # BGR: red
-    writer.release()
+    write_film(path, (np.full((24, 32, 3), (0, 0, level), np.uint8) for level in (0, 100, 200)))
     frames = list(images.frames_from_video(path))
     assert [frame.shape for frame in frames] == [(24, 32, 3)] * 3
     assert [round(float(frame[..., 0].mean()) / 100) for frame in frames] == [0, 1, 2]
     assert max(frame[..., 2].mean() for frame in frames) < 10
     monkeypatch.chdir(tmp_path)
-    timed = cv2.VideoWriter(str(tmp_path / "10:30.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (32, 24))
-    for _ in range(3):
-        timed.write(np.zeros((24, 32, 3), np.uint8))
-    timed.release()
+    write_film(tmp_path / "10:30.mp4", (np.zeros((24, 32, 3), np.uint8) for _ in range(3)))
     assert len(list(images.frames_from_video("10:30.mp4"))) == images.count_frames("10:30.mp4") == 3  # no protocol
     (tmp_path / "bad.avi").write_bytes(b"not a video")
     for name, words in (("bad.avi", "not a video"), ("none.avi", "there is no video")):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from films import write_film
 from PIL import Image
 
 from anytouch_jax.data.images import decode
@@ -147,12 +147,7 @@ def make(rng, folder: Path, things) -> Case:
 
 def film(rng, folder: Path, things) -> Case:
     file = folder / f"film.{pick(rng, ('avi', 'mp4'))}"
-    writer = cv2.VideoWriter(
-        str(file), cv2.VideoWriter_fourcc(*("MJPG" if file.suffix == ".avi" else "mp4v")), 10, (32, 32)
-    )
-    for _ in range(8):
-        writer.write(rng.integers(0, 256, (32, 32, 3), np.uint8))
-    writer.release()
+    write_film(file, (rng.integers(0, 256, (32, 32, 3), np.uint8) for _ in range(8)))
     data, kind = file.read_bytes(), pick(rng, ("cut", "flipped", "header", "nothing"))
     file.write_bytes(
         {

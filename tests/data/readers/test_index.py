@@ -44,28 +44,15 @@ def test_a_failed_write_is_an_error_and_leaves_the_old_file(tmp_path, monkeypatc
     assert sorted(os.listdir(tmp_path)) == ["real", "ycb_slide.parquet"]
 
 
-def test_a_folder_that_leads_elsewhere_is_refused(tmp_path):
-    away = tmp_path / "big" / "real" / "apple" / "dataset_0" / "frames"
-    away.mkdir(parents=True)
-    for number in range(4):
-        (away / f"frame_{number:07d}.jpg").write_bytes(b"x")
-    (tmp_path / "root").mkdir()
+def test_folders_that_lead_elsewhere_are_refused(tmp_path):
+    fill_ycb(tmp_path / "big")
+    fill(tmp_path, ["root/ssvtp/images_tac/image_0_tac.jpg", "images_rgb/image_0_rgb.jpg"])
     (tmp_path / "root" / "real").symlink_to(tmp_path / "big" / "real")
-    with pytest.raises(UserError, match="leads out of"):
-        index("ycb_slide", tmp_path / "root")
+    (tmp_path / "root" / "ssvtp" / "images_rgb").symlink_to(tmp_path / "images_rgb")  # of photographs
+    for name, folder in (("ycb_slide", "real"), ("ssvtp", "images_rgb")):
+        with pytest.raises(UserError, match=f"{folder} leads out of"):
+            index(name, tmp_path / "root")
     assert not list((tmp_path / "root").glob("*.parquet"))
-
-
-def test_photographs_that_lie_elsewhere_are_refused(tmp_path):
-    for name in ("tac", "rgb"):
-        (tmp_path / f"images_{name}").mkdir()
-        (tmp_path / f"images_{name}" / f"image_0_{name}.jpg").write_bytes(b"x")
-    root = tmp_path / "root" / "ssvtp"
-    root.mkdir(parents=True)
-    (tmp_path / "images_tac").rename(root / "images_tac")
-    (root / "images_rgb").symlink_to(tmp_path / "images_rgb")
-    with pytest.raises(UserError, match="images_rgb leads out of"):
-        index("ssvtp", tmp_path / "root")
 
 
 @pytest.mark.parametrize(

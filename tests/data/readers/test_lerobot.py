@@ -7,11 +7,11 @@ import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from films import write_film
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.images import decode, frames_from_video
@@ -78,10 +78,7 @@ def make(root):
         for key in (FILM, SCENE):
             target = root / "videos" / key / "chunk-000" / f"file-{home:03d}.mp4"
             target.parent.mkdir(parents=True, exist_ok=True)
-            film = cv2.VideoWriter(str(target), cv2.VideoWriter_fourcc(*"mp4v"), FPS, (32, 32))
-            for value in films[home]:
-                film.write(np.full((32, 32, 3), value, np.uint8))
-            film.release()
+            write_film(target, (np.full((32, 32, 3), value, np.uint8) for value in films[home]), FPS)
         target = root / "data" / "chunk-000" / f"file-{home:03d}.parquet"
         target.parent.mkdir(parents=True, exist_ok=True)
         table = pa.Table.from_pylist(rows[home]).replace_schema_metadata({b"huggingface": b"{}"})
@@ -291,10 +288,7 @@ def test_films_recorded_again_replace_their_pictures(root):
     _, before = rows_of(root, export=True, keys=(FILM,))
     grey = {row["path"]: int(decode(root / row["path"])[0, 0, 0]) for row in before}
     film = root / "videos" / FILM / "chunk-000" / "file-000.mp4"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"mp4v"), FPS, (32, 32))
-    for _ in range(9):
-        writer.write(np.full((32, 32, 3), 250, np.uint8))
-    writer.release()
+    write_film(film, (np.full((32, 32, 3), 250, np.uint8) for _ in range(9)), FPS)
     _, after = rows_of(root, export=True, keys=(FILM,))
     for row in after:
         shown = int(decode(root / row["path"])[0, 0, 0])

@@ -7,6 +7,7 @@ import os
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from reader_world import fill
 
 from anytouch_jax.data.images import decode
@@ -194,10 +195,7 @@ def test_the_side_may_stand_anywhere_in_the_name(tmp_path, read, form, sides):
 
 def _film(path, frames=5):
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
-    for number in range(frames):
-        writer.write(np.full((32, 32, 3), (200, 20 * number, 10), np.uint8))  # blue first
-    writer.release()
+    write_film(path, (np.full((32, 32, 3), (200, 20 * number, 10), np.uint8) for number in range(frames)))
 
 
 def test_videos_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, monkeypatch):

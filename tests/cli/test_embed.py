@@ -15,11 +15,6 @@ from runs import run_config, train
 from anytouch_jax.encoder.linear_head import load_head
 
 
-def write_video(path, frames, codec="MJPG"):
-    write_film(path, frames, code=codec)
-    return path
-
-
 @pytest.fixture
 def embed(anytouch, tiny_run, tmp_path):
     """embed(data, *words): the arrays of the features file, which must be written."""
@@ -70,7 +65,7 @@ def test_several_manifests_are_read_together(anytouch, tiny_run, world, tmp_path
 def test_clips_of_a_manifest_and_of_a_video(embed, mistake, tmp_path, world, tiny_run):
     of_manifest = embed(world, "--frames", 3)
     assert of_manifest["rows"].tolist() == [2, 3, 6, 7] and "8 of 12" in of_manifest["done"].err
-    video = write_video(tmp_path / "touch.avi", [np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(5)])
+    video = write_film(tmp_path / "touch.avi", [np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(5)])
     of_video = embed(video, "--frames", 3)
     assert of_video["features"].shape == (3, 12) and of_video["key/frame_index"].tolist() == [2, 3, 4]
     words = ("embed", "--model", tiny_run, "--data", video, "--out", tmp_path / "f.npz")
@@ -216,7 +211,7 @@ def test_the_head_of_a_probe_names_the_rows_of_a_manifest(embed, anytouch, world
 
 
 def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
-    video = write_video(tmp_path / "touch.avi", [np.full((32, 32, 3), value, np.uint8) for value in (40, 180)])
+    video = write_film(tmp_path / "touch.avi", [np.full((32, 32, 3), value, np.uint8) for value in (40, 180)])
     words = ("stream", "--model", tiny_run, "--data", video, "--head", head)  # whose pooling is taken
     lines = [json.loads(line) for line in anytouch(*words, "--out", "-").out.splitlines()]
     labels, p = load_head(head)(np.array([line["features"] for line in lines], np.float32))

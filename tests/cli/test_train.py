@@ -13,18 +13,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import jax
 import numpy as np
 import pytest
-from gel_pictures import press
 from places import ROOT, SUPPORT
 from runs import SIZES, arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 
 from anytouch_jax.cli import train as command
 from anytouch_jax.config import preset
-from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.files import close_shards
 from anytouch_jax.train.mesh import make_mesh
 
 
@@ -160,40 +156,6 @@ def test_a_termination_before_the_first_step_is_polite(anytouch, tmp_path, world
     assert signal.getsignal(signal.SIGTERM) is before
     assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {"config.json", ".lock"}
     assert anytouch(*words, "--stop-after", 0).status == 0
-
-
-@pytest.fixture
-def mixture(tmp_path, anytouch):
-    """Four manifests: two sensors, three loose and one packed, with different columns."""
-    files = []
-    for number, (name, ending) in enumerate({"a": "csv", "b": "parquet", "c": "csv", "d": "parquet"}.items()):
-        folder = tmp_path / name
-        folder.mkdir()
-        for i in range(4):
-            cv2.imwrite(str(folder / f"{i}.png"), press(20 * i))
-        columns = {
-            "path": [f"{i}.png" for i in range(4)], "sensor": [("digit", "gelsight")[number % 2]] * 4,
-            "sequence": ["s"] * 4, "frame_index": list(range(4)), "split": ["train"] * 4,
-            "dataset": [f"set {name}"] * 4,
-            f"label.{name}": [1] * 4,
-        }  # fmt: skip
-        files.append(folder / f"touch.{ending}")
-        manifests.write(manifests.from_columns(columns, files[-1]), files[-1])
-    assert anytouch("data", "pack", files[3]).status == 0
-    yield [*files[:3], files[3].with_name("touch_packed") / "manifest.parquet"]
-    close_shards()
-
-
-@pytest.mark.slow
-def test_four_datasets_in_one_run(anytouch, mistake, mixture, tmp_path):
-    words = ["train", "--stage", 1, "--data", *mixture, "--run", tmp_path / "run", "--steps", 2, "--batch", 8, *SMALL]
-    done = anytouch(*words, "--data.weights", "set a", 3)
-    assert done.status == 0, done.err
-    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [0, 1] and all(line["loss"] > 0 for line in lines)
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert len(config["data"]["manifests"]) == 4 and config["data"]["weights"] == [["set a", 3.0]]
-    assert "weights" in mistake(*words)  # another mixture is another run
 
 
 # Several processes ----------------------------------------------------------------------------------------------------

@@ -16,6 +16,6 @@ def write_film(path: str | Path, frames: Iterable[np.ndarray], rate: float = 10,
     code = code or ("MJPG" if path.suffix == ".avi" else "mp4v")
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), rate, frames[0].shape[1::-1])
     for frame in frames:
-        writer.write(frame)
+        writer.write(np.ascontiguousarray(frame))
     writer.release()
     return path

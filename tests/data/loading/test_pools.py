@@ -167,9 +167,7 @@ def changed(config, name):
         ("no_text", set(range(8)), None, 0, True), ("no_vision", set(range(8)), 0, None, True),
     ],
 )  # fmt: skip
-def test_a_baseline_draws_the_modalities_that_it_needs(
-    make, settings, read_back, name, recordings, images, texts, matches
-):
+def test_a_baseline_draws_what_it_needs(make, settings, read_back, name, recordings, images, texts, matches):
     loader, collected = Loader(make(world()), changed(settings(2), name)), set()
     for batch in batches(loader):
         align = batch.align

@@ -130,9 +130,7 @@ class _Group(dict):
     """Stands for an HDF5 group: keys, values, attributes; values answer [()]."""
 
     def __init__(self, content, **attrs):
-        super().__init__(
-            {name: value if isinstance(value, dict) else np.asarray(value) for name, value in content.items()}
-        )
+        super().__init__((name, one if isinstance(one, dict) else np.asarray(one)) for name, one in content.items())
         self.attrs = attrs
 
 

@@ -77,7 +77,6 @@ def make(root):
     for home in (0, 1):
         for key in (FILM, SCENE):
             target = root / "videos" / key / "chunk-000" / f"file-{home:03d}.mp4"
-            target.parent.mkdir(parents=True, exist_ok=True)
             write_film(target, (np.full((32, 32, 3), value, np.uint8) for value in films[home]), FPS)
         target = root / "data" / "chunk-000" / f"file-{home:03d}.parquet"
         target.parent.mkdir(parents=True, exist_ok=True)

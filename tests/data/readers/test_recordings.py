@@ -194,7 +194,6 @@ def test_the_side_may_stand_anywhere_in_the_name(tmp_path, read, form, sides):
 
 
 def _film(path, frames=5):
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_film(path, (np.full((32, 32, 3), (200, 20 * number, 10), np.uint8) for number in range(frames)))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -21,24 +20,13 @@ from tests.fuzz.harness import Case, cut, flipped, pick
 Arrays = dict[str, Any]
 
 
-def member(array, *, shape=None, descr=None, body: bytes | None = None) -> bytes:
-    """The bytes of a .npy, whose header may say something else."""
-    array = np.asarray(array)
-    head = {
-        "descr": descr or np.lib.format.dtype_to_descr(array.dtype),
-        "fortran_order": False,
-        "shape": array.shape if shape is None else shape,
-    }
-    text = repr(head).encode()
-    text += b" " * (-(len(text) + 11) % 64) + b"\n"
-    return b"\x93NUMPY\1\0" + struct.pack("<H", len(text)) + text + (array.tobytes() if body is None else body)
-
-
-def packed(members: dict[str, bytes], *, compress: bool = False, twice: str | None = None) -> bytes:
+def packed(arrays: Arrays, *, compress: bool = False, twice: str | None = None) -> bytes:
+    """The bytes of a .npz file of arrays that hold no objects."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED) as archive:
-        for name, data in members.items():
-            archive.writestr(f"{name}.npy", data)
+        for name, array in arrays.items():
+            np.save(member := io.BytesIO(), np.asarray(array), allow_pickle=False)
+            archive.writestr(f"{name}.npy", member.getvalue())
         if twice:
             archive.filelist.append(archive.getinfo(f"{twice}.npy"))
     return stream.getvalue()
@@ -50,29 +38,17 @@ def packed(members: dict[str, bytes], *, compress: bool = False, twice: str | No
 def dropped(rng, arrays: Arrays, needed):
     name = pick(rng, needed)
     rest = {key: value for key, value in arrays.items() if key != name}
-    if rng.random() < 0.5:
-        rest[name + "_"] = arrays[name]
-    return f"no {name}", packed({key: member(value) for key, value in rest.items()}), True
+    return f"no {name}", packed(rest | ({name + "_": arrays[name]} if rng.random() < 0.5 else {})), True
 
 
 def other_type(rng, arrays: Arrays, needed):
     name = pick(rng, needed)
     array = np.asarray(arrays[name])
-    kinds = {
-        "text": array.astype(str), "complex": np.zeros(array.shape, complex), "flags": np.zeros(array.shape, bool),
-        "times": np.zeros(array.shape, "M8[s]"), "bytes": np.zeros(array.shape, "S3"),
-        "long": np.zeros(array.shape, np.int64), "records": np.zeros(array.shape, [("a", "f4"), ("b", "i2")]),
-        "void": np.zeros(array.shape, "V7"), "half": np.zeros(array.shape, np.float16),
-        "nothing": np.zeros(array.shape, "U0"), "spans": np.zeros(array.shape, "m8[D]"),
-    }  # fmt: skip
-    kind = pick(rng, kinds)
+    kind = pick(rng, (str, complex, bool, "M8[s]", "S3", "i8", [("a", "f4"), ("b", "i2")], "V7", "f2", "U0", "m8[D]"))
+    changed = array.astype(str) if kind is str else np.zeros(array.shape, kind)
     like = {"f": "fiub", "i": "iufb", "u": "iuf", "U": "U"}[array.dtype.kind]
-    wrong = kinds[kind].dtype.kind not in like or (array.dtype.kind == "U" and kind == "nothing")
-    return (
-        f"{name} of {kind}",
-        packed({key: member(kinds[kind] if key == name else value) for key, value in arrays.items()}),
-        wrong,
-    )
+    wrong = changed.dtype.kind not in like or kind == "U0"
+    return f"{name} of {kind}", packed(arrays | {name: changed}), wrong
 
 
 def other_shape(rng, arrays: Arrays, needed):
@@ -85,41 +61,30 @@ def other_shape(rng, arrays: Arrays, needed):
     if array.ndim:
         shapes += [array[:-1], np.concatenate([array, array]), array.reshape(-1)[0]]
     changed = pick(rng, [one for one in shapes if one.shape != array.shape])
-    return (
-        f"{name} of shape {changed.shape}",
-        packed({k: member(changed if k == name else v) for k, v in arrays.items()}),
-        True,
-    )
+    return f"{name} of shape {changed.shape}", packed(arrays | {name: changed}), True
 
 
 def not_finite(rng, arrays: Arrays, needed):
-    floats = [name for name in arrays if np.asarray(arrays[name]).dtype.kind == "f" and np.size(arrays[name])]
-    name = pick(rng, floats)
+    name = pick(rng, [one for one in arrays if np.asarray(arrays[one]).dtype.kind == "f" and np.size(arrays[one])])
     array = np.array(arrays[name], copy=True)
     array.reshape(-1)[int(rng.integers(array.size))] = wrong = pick(rng, (np.nan, np.inf, -np.inf))
-    return f"{name} has {wrong}", packed({k: member(array if k == name else v) for k, v in arrays.items()}), True
+    return f"{name} has {wrong}", packed(arrays | {name: array}), True
 
 
 def damaged(rng, arrays: Arrays, needed):
-    data = packed({key: member(value) for key, value in arrays.items()}, compress=bool(rng.integers(2)))
-    kind = pick(rng, "cut, flipped, directory, random, empty, html, twice, npy, text, encrypted")
-    if kind == "twice":
-        data = packed({key: member(value) for key, value in arrays.items()}, twice=pick(rng, needed))
-    elif kind == "encrypted":
-        at = data.find(b"PK\1\2")
-        data = data[: at + 8] + b"\1\0" + data[at + 10 :]
-    else:
-        data = {
-            "cut": cut(rng, data), "flipped": flipped(rng, data, count=30), "random": rng.bytes(1000), "empty": b"",
-            "directory": flipped(rng, data, data.rfind(b"PK\1\2"), None, 5), "html": b"<!doctype html><html></html>",
-            "npy": member(np.zeros(3)), "text": packed({}) + b"x",
-        }[kind]  # fmt: skip
-    return f"bytes {kind}", data, kind not in ("flipped", "directory")
+    data = packed(arrays, compress=bool(rng.integers(2)))
+    at = data.find(b"PK\1\2")
+    made = {
+        "cut": cut(rng, data), "flipped": flipped(rng, data, count=30), "random": rng.bytes(1000), "empty": b"",
+        "directory": flipped(rng, data, data.rfind(b"PK\1\2"), None, 5), "html": b"<!doctype html><html></html>",
+        "text": packed({}) + b"x", "twice": packed(arrays, twice=pick(rng, needed)),
+        "encrypted": data[: at + 8] + b"\1\0" + data[at + 10 :],
+    }  # fmt: skip
+    kind = pick(rng, made)
+    return f"bytes {kind}", made[kind], kind not in ("flipped", "directory")
 
 
-CHANGES = (
-    dropped, other_type, other_type, other_shape, other_shape, not_finite, damaged, damaged,
-)  # fmt: skip
+CHANGES = (dropped, other_type, other_type, other_shape, other_shape, not_finite, damaged, damaged)
 
 
 def arrays_of(path: Path) -> Arrays:

@@ -145,12 +145,6 @@ def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
     assert str(first) in source and str(second) in source
 
 
-def test_a_run_between_itself_is_itself(tiny_run, tmp_path, weights):
-    out = weights("release", tiny_run, tmp_path / "w.safetensors", "--between", tiny_run)
-    clip = np.random.default_rng(0).integers(0, 256, (1, 3, 28, 28, 3), np.uint8)
-    np.testing.assert_array_equal(load_encoder(out).encode_touch(clip), load_encoder(tiny_run).encode_touch(clip))
-
-
 @pytest.mark.parametrize(
     ("words", "named"),
     [
@@ -190,8 +184,3 @@ def test_mistakes_write_nothing(two, tmp_path, mistake, monkeypatch, words, name
     model = [] if "--model" in words else ["--model", "b.safetensors"]
     assert named in mistake("export", *model, *words)
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_an_unknown_platform_is_a_usage_error(anytouch, tiny_run, tmp_path):
-    done = anytouch("export", "--model", tiny_run, "--out", tmp_path / "m.bin", "--platforms", "cpu", "gpu")
-    assert done.status == 2 and "gpu" in done.err and not list(tmp_path.iterdir())

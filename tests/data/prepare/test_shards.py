@@ -238,27 +238,17 @@ def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
 
 
 def _harm(shard, harm, row):
-    entry = packed.read_shard_index(shard)[row]
-    if harm == "flip":
-        with shard.open("r+b") as file:
-            file.seek(int(entry["offset"]) + 30)
-            byte = file.read(1)
-            file.seek(-1, 1)
-            file.write(bytes([byte[0] ^ 1]))
-    elif harm == "cut":
-        os.truncate(shard, int(entry["offset"]) + 10)
-    elif harm == "gone":
-        shard.unlink()
-    elif harm == "short":
-        with zipfile.ZipFile(shard, "w") as archive:
-            for number in range(row):
-                archive.writestr(f"{number:06d}.png", b"x")
-    elif harm == "compressed":
-        with zipfile.ZipFile(shard, "w", zipfile.ZIP_DEFLATED) as archive:
-            for number in range(30):
+    at, data = int(packed.read_shard_index(shard)[row]["offset"]), bytearray(shard.read_bytes())
+    if harm in ("short", "compressed"):
+        kind, count = (zipfile.ZIP_STORED, row) if harm == "short" else (zipfile.ZIP_DEFLATED, 30)
+        with zipfile.ZipFile(shard, "w", kind) as archive:
+            for number in range(count):
                 archive.writestr(f"{number:06d}.png", bytes(999))
-    elif harm == "garbage":
-        shard.write_bytes(b"PK garbage")
+        return
+    data[at + 30] ^= harm == "flip"
+    shard.write_bytes({"cut": data[: at + 10], "garbage": b"PK garbage"}.get(harm, data))
+    if harm == "gone":
+        shard.unlink()
 
 
 @pytest.mark.parametrize(

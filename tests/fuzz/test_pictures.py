@@ -35,58 +35,16 @@ def encoded(pixels: np.ndarray, ending: str, **options) -> bytes:
     return stream.getvalue()
 
 
-# Each returns (name, bytes, ending, may be accepted, pixels that it must then have or None). ------------------------
-
-
-def whole(rng):
+def changed(rng) -> tuple[str, bytes, str, bool, np.ndarray | None]:
+    """Return (name, bytes, ending, may be accepted, pixels that it must then have or None)."""
     pixels, ending = picture(rng), pick(rng, FORMATS)
-    return f"whole {ending}", encoded(pixels, ending), ending, True, pixels
-
-
-def wrong_ending(rng):
-    pixels, ending = picture(rng), pick(rng, FORMATS[:5])
-    other = pick(rng, FORMATS[:5])
-    return f"{ending} as {other}", encoded(pixels, ending), other, True, pixels
-
-
-def padded(rng):
-    pixels, ending = picture(rng), pick(rng, FORMATS[:5])
-    tail = pick(rng, (b"\0", b"\xff", b"\xff\xd9", b"IEND", b"\x89PNG\r\n")) * int(rng.integers(1, 200_000))
-    return f"{ending} with {len(tail)} bytes more", encoded(pixels, ending) + tail, ending, True, pixels
-
-
-def shortened(rng):
-    ending = pick(rng, FORMATS)
-    # An end of a JPEG may be a few bytes of nothing, and a TIFF ends with its directory.
-    data = encoded(picture(rng), ending)
-    return f"{ending} cut", cut(rng, data, 1, 24), ending, False, None
-
-
-def bytes_lost(rng):
-    """A block of zeros where the disk lost a page; only PNG has checksums."""
-    data = encoded(picture(rng), "png")
+    kind = pick(rng, "whole, other, padded, cut, cut, hole, flipped, flipped, header, header, array")
+    ending = {"hole": "png", "array": "npy"}.get(kind, ending)
+    if kind in ("other", "padded") and ending == "npy":
+        ending = "png"
+    data, size = encoded(pixels, ending), int(rng.integers(20, 60))
     at = int(rng.integers(8, len(data) - 80))
-    size = int(rng.integers(20, 60))
-    lost = data[:at] + bytes(size) + data[at + size :]
-    return "png with a hole", lost, "png", False, None
-
-
-def scrambled(rng):
-    ending = pick(rng, FORMATS)
-    data = encoded(picture(rng), ending)
-    changed = flipped(rng, data, count=int(rng.integers(1, 12)))
-    return f"{ending} with flipped bytes", changed, ending, True, None
-
-
-def header(rng):
-    """Flipped bytes in the first hundred."""
-    ending = pick(rng, FORMATS)
-    data = encoded(picture(rng), ending)
-    return f"{ending} with a damaged header", flipped(rng, data, 0, 100, int(rng.integers(1, 4))), ending, True, None
-
-
-def odd_array(rng):
-    pixels = picture(rng)
+    tail = pick(rng, (b"\0", b"\xff", b"\xff\xd9", b"IEND", b"\x89PNG\r\n")) * int(rng.integers(1, 200_000))
     wrong = {
         "NaN": np.full((30, 30, 3), np.nan, np.float32), "above 1": pixels.astype(np.float32),
         "below 0": pixels / -255.0 - 0.1, "infinite": np.full((30, 30), np.inf), "signed": pixels.astype(np.int8),
@@ -95,19 +53,21 @@ def odd_array(rng):
         "two channels": pixels[..., :2], "scalar": np.uint8(3), "strip": np.zeros((1, 5000, 3), np.uint8),
         "times": np.array([["2020-01-01"]], "M8[D]"), "records": np.zeros((30, 30), [("a", "u1"), ("b", "f4")]),
     }  # fmt: skip
-    name = pick(rng, wrong)
-    return f"array: {name}", encoded(wrong[name], "npy"), "npy", False, None
-
-
-KINDS = (
-    whole, wrong_ending, padded, shortened, shortened, bytes_lost, scrambled, scrambled, header, header, odd_array,
-)  # fmt: skip
+    made = {
+        "padded": data + tail, "hole": data[:at] + bytes(size) + data[at + size :],  # only PNG has checksums
+        "cut": cut(rng, data, 1, 24),  # the end of a JPEG may be a few bytes of nothing, and a TIFF ends with a directory
+        "flipped": flipped(rng, data, count=int(rng.integers(1, 12))),
+        "header": flipped(rng, data, 0, 100, int(rng.integers(1, 4))), "array": encoded(wrong[pick(rng, wrong)], "npy"),
+    }.get(kind, data)  # fmt: skip
+    is_whole, is_lost = kind in ("whole", "other", "padded"), kind in ("cut", "hole", "array")
+    stored = pick(rng, FORMATS[:5]) if kind == "other" else ending
+    return f"{ending} {kind}", made, stored, not is_lost, pixels if is_whole else None
 
 
 def make(rng, folder: Path, things) -> Case:
     if rng.random() < 0.05:
         return film(rng, folder, things)
-    name, data, ending, fine, pixels = pick(rng, KINDS)(rng)
+    name, data, ending, fine, pixels = changed(rng)
     file = folder / "frames" / f"1.{ending}"
     file.parent.mkdir()
     file.write_bytes(data)
@@ -149,20 +109,11 @@ def film(rng, folder: Path, things) -> Case:
     file = folder / f"film.{pick(rng, ('avi', 'mp4'))}"
     write_film(file, (rng.integers(0, 256, (32, 32, 3), np.uint8) for _ in range(8)))
     data, kind = file.read_bytes(), pick(rng, ("cut", "flipped", "header", "nothing"))
-    file.write_bytes(
-        {
-            "cut": cut(rng, data),
-            "flipped": flipped(rng, data, count=20),
-            "nothing": rng.bytes(2000),
-            "header": flipped(rng, data, 0, 200, 6),
-        }[kind]
-    )
+    changes = {"cut": cut(rng, data), "flipped": flipped(rng, data, count=20), "nothing": rng.bytes(2000)}
+    file.write_bytes(changes.get(kind, flipped(rng, data, 0, 200, 6)))
     command = pick(rng, ("embed", "stream"))
-    return Case(
-        f"film, {kind}, {command}",
-        (command, "--model", things.run, "--data", file, "--out", folder / "f.npz"),
-        kind == "nothing",
-    )
+    words = (command, "--model", things.run, "--data", file, "--out", folder / "f.npz")
+    return Case(f"film, {kind}, {command}", words, kind == "nothing")
 
 
 @pytest.mark.parametrize("count", [25, pytest.param(0.24, marks=pytest.mark.slow)])

@@ -55,7 +55,7 @@ def changed(rng) -> tuple[str, bytes, str, bool, np.ndarray | None]:
     }  # fmt: skip
     made = {
         "padded": data + tail, "hole": data[:at] + bytes(size) + data[at + size :],  # only PNG has checksums
-        "cut": cut(rng, data, 1, 24),  # the end of a JPEG may be a few bytes of nothing, and a TIFF ends with a directory
+        "cut": cut(rng, data, 1, 24),  # the end of a JPEG may be some bytes of nothing
         "flipped": flipped(rng, data, count=int(rng.integers(1, 12))),
         "header": flipped(rng, data, 0, 100, int(rng.integers(1, 4))), "array": encoded(wrong[pick(rng, wrong)], "npy"),
     }.get(kind, data)  # fmt: skip

@@ -49,7 +49,7 @@ def test_folders_that_lead_elsewhere_are_refused(tmp_path):
     fill(tmp_path, ["root/ssvtp/images_tac/image_0_tac.jpg", "images_rgb/image_0_rgb.jpg"])
     (tmp_path / "root" / "real").symlink_to(tmp_path / "big" / "real")
     (tmp_path / "root" / "ssvtp" / "images_rgb").symlink_to(tmp_path / "images_rgb")  # of photographs
-    for name, folder in (("ycb_slide", "real"), ("ssvtp", "images_rgb")):
+    for name, folder in (("ycb_slide", "frames"), ("ssvtp", "images_rgb")):
         with pytest.raises(UserError, match=f"{folder} leads out of"):
             index(name, tmp_path / "root")
     assert not list((tmp_path / "root").glob("*.parquet"))

@@ -63,15 +63,6 @@ def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
     )
 
 
-def test_an_object_is_never_on_two_sides(tmp_path, read):
-    fill(tmp_path, [f"thing {n}/take {k}/0.png" for n in range(30) for k in range(3)])
-    table = read("recordings", sensor="digit", val=0.3, test=0.3)
-    sides = {}
-    for row in table.rows.values():
-        sides.setdefault(row["object"], set()).add(row["split"])
-    assert all(len(one) == 1 for one in sides.values()) and set.union(*sides.values()) == {"train", "val", "test"}
-
-
 def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, read):
     splits = []
     for name in ("mine", "renamed"):

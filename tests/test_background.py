@@ -210,20 +210,11 @@ def test_training_leaves_out_the_rows_of_a_sensor_of_few_frames(touches):
 def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
     config = replace(tiny_config(1), data=settings(touches).data)
     pretrain(replace(config, run=replace(config.run, steps=2, save_every=2, figure_every=0)), tmp_path / "r", log=str)
-    assert (
-        main(["export", "--to", "release", "--model", str(tmp_path / "r"), "--out", str(tmp_path / "w.safetensors")])
-        == 0
-    )
-    assert (
-        main(
-            [
-                "export", "--to", "safetensors", "--model", str(tmp_path / "w.safetensors"), "--out",
-                str(tmp_path / "o.safetensors"),
-            ]
-        )
-        == 0
-    )  # fmt: skip
-    run, *files = (load_encoder(tmp_path / name) for name in ("r", "w.safetensors", "o.safetensors"))
+    names = ("r", "w.safetensors", "o.safetensors")
+    for to, model, out in zip(("release", "safetensors"), names[:2], names[1:], strict=True):
+        words = ["export", "--to", to, "--model", str(tmp_path / model), "--out", str(tmp_path / out)]
+        assert main(words) == 0
+    run, *files = (load_encoder(tmp_path / name) for name in names)
     clips = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
     for one in files:
         assert one.subtracts and run.subtracts
@@ -232,17 +223,12 @@ def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
             np.testing.assert_allclose(one.encode_touch(clips, sensor), run.encode_touch(clips, sensor), atol=1e-6)
 
 
-def test_the_pouring_policy_is_tuned_on_what_it_sees(encoder):
+def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
     frames = RNG.integers(100, 150, (9, 2, 28, 28, 3), np.uint8)
-    where = np.array([[0, 1], [3, 0]])
-    clips = policy.segments(encoder, frames, where, 3)
+    clips = policy.segments(encoder, frames, np.array([[0, 1], [3, 0]]), 3)  # what it is tuned on
     np.testing.assert_array_equal(clips[1, 2], frames[5, 0].astype(int) - frames[0, 0] + 128)
     np.testing.assert_array_equal(clips[0, 0], np.full_like(GEL, 128))
-
-
-def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
-    frames = RNG.integers(100, 150, (3, 2, 28, 28, 3), np.uint8)
-    shown = policy.subtracted(encoder, frames, frames[0])
+    shown = policy.subtracted(encoder, frames[:3], frames[0])
     assert (shown[0] == 128).all() and shown.dtype == np.uint8
     np.testing.assert_array_equal(shown[2, 1], frames[2, 1].astype(int) - frames[0, 1] + 128)
     plain = Encoder(replace(encoder.config, data=DataConfig()), encoder.params, "")

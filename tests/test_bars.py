@@ -31,17 +31,12 @@ def test_a_terminal_shows_a_bar_with_the_time_left(monkeypatch):
     assert "letters" in screen.getvalue() and "3/3" in screen.getvalue() and "0:00:00" in screen.getvalue()
 
 
-def test_short_work_shows_nothing(monkeypatch):
+def test_short_work_shows_nothing_and_elsewhere_nothing_is_shown(monkeypatch):
     screen = screen_of(monkeypatch)
-    assert list(bars.tracked("abc", "letters")) == ["a", "b", "c"]
-    assert "letters" not in screen.getvalue()
-
-
-def test_elsewhere_nothing_is_shown(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    assert list(bars.tracked("abc", "letters")) == ["a", "b", "c"] and "letters" not in screen.getvalue()
+    monkeypatch.setattr(sys, "stderr", io.StringIO())  # no terminal
     monkeypatch.setattr(bars, "WAIT", 0.0)
-    assert list(bars.tracked(iter("abc"), "letters")) == ["a", "b", "c"]
-    assert sys.stderr.getvalue() == ""
+    assert list(bars.tracked(iter("abc"), "letters")) == ["a", "b", "c"] and sys.stderr.getvalue() == ""
 
 
 def test_an_error_takes_the_bar_away(monkeypatch):

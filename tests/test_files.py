@@ -35,19 +35,13 @@ def test_a_failed_write_leaves_the_old_file_and_names_it(tmp_path, monkeypatch, 
     def full(*_):
         raise OSError(28, "No space left on device")
 
+    with pytest.raises(KeyboardInterrupt), atomic_path(path) as part:
+        part.write_bytes(b"half")
+        raise KeyboardInterrupt
     monkeypatch.setattr(failing, full)
     with pytest.raises(OSError, match=r"No space left on device: '.*config\.json'"):
         atomic_write(path, "new")
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
-
-
-def test_any_other_error_leaves_the_old_file_too(tmp_path):
-    path = tmp_path / "a"
-    atomic_write(path, b"old")
-    with pytest.raises(KeyboardInterrupt), atomic_path(path) as part:
-        part.write_bytes(b"half")
-        raise KeyboardInterrupt
-    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_a_leftover_of_a_killed_process_is_overwritten(tmp_path):
@@ -117,16 +111,14 @@ def test_arrays_are_read_only_if_they_are_as_their_headers_say(tmp_path):
 
 def test_an_array_is_read_only_if_it_is_as_its_header_says():
     def npy(array: np.ndarray) -> bytes:
-        file = io.BytesIO()
-        np.save(file, array)
+        np.save(file := io.BytesIO(), array)
         return file.getvalue()
 
     whole = npy(np.arange(6.0).reshape(2, 3))
     np.testing.assert_array_equal(files.read_array(whole), [[0, 1, 2], [3, 4, 5]])
     huge = io.BytesIO()
     np.lib.format.write_array_header_1_0(huge, {"descr": "<f4", "fortran_order": False, "shape": (1 << 30, 1 << 10)})
-    for damaged in (
-        whole[:-1], whole + b"x", whole[:20] + b"\xff" * 9 + whole[29:], b"", huge.getvalue(), npy(np.array([{}])),
-    ):  # fmt: skip
+    damaged = whole[:20] + b"\xff" * 9 + whole[29:]
+    for bad in (whole[:-1], whole + b"x", damaged, b"", huge.getvalue(), npy(np.array([{}]))):
         with pytest.raises(ValueError):
-            files.read_array(damaged)
+            files.read_array(bad)

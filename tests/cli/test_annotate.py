@@ -103,27 +103,14 @@ def test_an_estimate_needs_no_key(anytouch, mistake, touches, monkeypatch):
 
 
 def test_failures_are_reported_counted_and_the_rest_is_kept(anytouch, touches, tmp_path):
-    (tmp_path / "see1.png").write_bytes(b"no picture")
     with serve() as server:
-        done = anytouch("data", "annotate", touches, "--url", server.url, "--yes", "--out", tmp_path / "c.csv")
+        words = ("data", "annotate", touches, "--url", server.url)
+        assert anytouch(*words, "--yes", "--limit", "1").status == 0 and len(server.heads) == 1
+        assert anytouch(*words, "--estimate", "--family", "tacquad", "object").status == 0
+        (tmp_path / "see1.png").write_bytes(b"no picture")
+        done = anytouch(*words, "--yes", "--out", tmp_path / "c.csv")
     assert done.status == 1 and "2 captions" in done.out and f"no caption for row 0 of {touches}" in done.err
     assert manifests.read(tmp_path / "c.csv").column("text").to_pylist() == [None] * 2 + [GOOD["caption"]] * 4
-
-
-def test_a_limit_and_a_family_of_ones_own(anytouch, touches, tmp_path):
-    with serve() as server:
-        words = ["data", "annotate", touches, "--url", server.url, "--yes", "--limit", "1"]
-        assert anytouch(*words).status == 0 and len(server.heads) == 1
-        assert anytouch(*words[:3], "--url", server.url, "--estimate", "--family", "tacquad", "object").status == 0
-        assert anytouch(*words, "--family", "tacquad", "smell").status == 2  # the parser's answer
-
-
-def test_mistakes_are_one_sentence(mistake, touches, monkeypatch):
-    assert str(touches) in mistake("data", "annotate", touches, "--out", touches, "--yes")
-    monkeypatch.delenv("OPENAI_API_KEY")
-    assert "OPENAI_API_KEY" in mistake("data", "annotate", touches, "--yes")
-    assert "http" in mistake("data", "annotate", touches, "--url", "example", "--yes")
-    assert "threads" in mistake("data", "annotate", touches, "--url", "http://localhost:1", "--threads", 0, "--yes")
 
 
 def test_captions_of_a_table_are_attached_and_nobody_is_asked(anytouch, tmp_path):

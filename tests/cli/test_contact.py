@@ -8,7 +8,6 @@ import cv2
 import pytest
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.prepare import contact
 
 
 def contacts(path):
@@ -102,25 +101,6 @@ def test_marks_that_are_kept_are_reported_and_cannot_be_moved(anytouch, mistake,
     monkeypatch.undo()
     done = anytouch("data", "contact", marked)
     assert done.status == 0 and "10 rows keep the label.contact that they had" in done.out
-
-
-def test_what_is_compared_with_is_looked_for_before_the_work(mistake, pressed, monkeypatch):
-    monkeypatch.setattr(contact, "contact_scores", lambda *_, **__: pytest.fail("the work was begun"))
-    assert "label.depth" in mistake("data", "contact", pressed, "--check", "--reference", "label.depth")
-    assert "license" in mistake("data", "contact", pressed, "--check", "--reference", "license")
-
-
-def test_a_missing_manifest_is_one_sentence(mistake, tmp_path):
-    assert "no.parquet" in mistake("data", "contact", tmp_path / "no.parquet")
-
-
-@pytest.mark.parametrize(("out", "words"), [("touch.txt", "touch.txt"), ("deep/x.csv", "deep")])
-def test_a_place_that_cannot_be_written_is_named_before_the_work(anytouch, pressed, tmp_path, monkeypatch, out, words):
-    from anytouch_jax.data.prepare import contact
-
-    monkeypatch.setattr(contact, "contact_scores", lambda *a, **k: pytest.fail("hours of work began"))
-    done = anytouch("data", "contact", pressed, "--out", tmp_path / out)
-    assert done.status == 2 and words in done.err and len(done.err.strip().splitlines()) == 1
 
 
 def test_backgrounds_are_named_on_the_command_line(anytouch, mistake, pressed, tmp_path):

@@ -8,6 +8,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from places import ROOT
 from safetensors.numpy import save_file
 from touch_world import make_touches
@@ -84,10 +85,7 @@ def test_the_regression_tasks_of_a_family(anytouch, family, files, touches):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_streamed_film_gives_the_features_of_embed(anytouch, family, files, tmp_path):
     film, gel = tmp_path / "film.avi", tmp_path / "gel.png"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10, (48, 40))
-    for frame in range(9):
-        writer.write(np.full((40, 48, 3), 25 * frame, np.uint8))
-    writer.release()
+    write_film(film, (np.full((40, 48, 3), 25 * frame, np.uint8) for frame in range(9)))
     cv2.imwrite(str(gel), np.full((40, 48, 3), 90, np.uint8))
     words = ["--model", files[family], "--data", film, "--sensor", "digit", "--background", gel]
     words += ["--frames", load_encoder(files[family]).form.model.frames]

@@ -23,16 +23,15 @@ def slides(tmp_path):
 def test_a_manifest_is_written_and_the_counts_are_compared_with_the_papers(anytouch, slides, tmp_path):
     done = anytouch("data", "index", "ycb_slide", slides, "--out", tmp_path / "slides.csv", "--val", "0", "--test", "0")
     assert (done.status, done.err) == (0, "")
-    assert f"{tmp_path / 'slides.csv'}: 20 rows of 5 sequences (train 20)" in done.out
-    assert "183,000 in the paper" in done.out and "licence: " in done.out and "content hash " in done.out
     manifest = manifests.read(tmp_path / "slides.csv")
+    for words in (
+        f"{tmp_path / 'slides.csv'}: 20 rows of 5 sequences (train 20)", "183,000 in the paper", "licence: ",
+        f"content hash {manifest.content_hash}",
+    ):  # fmt: skip
+        assert words in done.out
     assert manifest.value(0, "path") == "my data/real/mug/dataset_0/frames/frame_0000000.jpg"
-    assert manifest.content_hash in done.out
-
-
-def test_without_out_it_lies_in_the_folder(anytouch, slides):
     assert anytouch("data", "index", "ycb_slide", slides).status == 0
-    assert len(manifests.read(slides / "ycb_slide.parquet")) == 20
+    assert len(manifests.read(slides / "ycb_slide.parquet")) == 20  # in the folder
 
 
 def test_mistakes_are_one_sentence(mistake, slides, tmp_path, monkeypatch):
@@ -49,12 +48,6 @@ def test_mistakes_are_one_sentence(mistake, slides, tmp_path, monkeypatch):
     assert "m.txt" in mistake("data", "index", "ycb_slide", slides, "--out", slides / "m.txt")
     monkeypatch.setattr(os, "access", lambda *_: False)  # as for a folder of somebody else
     assert "--out" in mistake("data", "index", "ycb_slide", slides)
-
-
-def test_what_is_left_out_is_counted_with_its_first_file(anytouch, slides):
-    (slides / "real/mug/dataset_0/frames/frame_0000009.jpg").symlink_to(slides / "elsewhere.jpg")
-    out = anytouch("data", "index", "ycb_slide", slides).out
-    assert "left out or noted, " in out and "frame_0000009.jpg" in out
 
 
 def test_the_help_names_every_reader_and_the_defaults_are_the_readers():

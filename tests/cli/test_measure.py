@@ -7,6 +7,7 @@ import csv
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from measuring import gel, measuring_weights
 
 from anytouch_jax.cli.app import main
@@ -22,16 +23,16 @@ def frames(tmp_path):
     """A folder of five pictures of a DIGIT and of its untouched gel, and the same as a film and as a manifest."""
     folder = tmp_path / "frames"
     folder.mkdir()
-    film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (48, 64))
+    pictures = []
     lines = ["path,sensor,sequence,frame_index,split,background_path"]
     for number in range(5):
         picture = gel(64, 48)
         picture[10:30, 10 : 20 + 5 * number] += 60
         cv2.imwrite(str(folder / f"{number}.png"), picture[..., ::-1])
-        film.write(picture[..., ::-1])
+        pictures.append(picture[..., ::-1])
         lines.append(f"frames/{number}.png,digit,press,{number},train,frames/background.png")
     cv2.imwrite(str(folder / "background.png"), gel(64, 48)[..., ::-1])
-    film.release()
+    write_film(tmp_path / "film.avi", pictures, 30)
     lines.append("frames/background.png,gelsight_mini,other,0,train,")
     (tmp_path / "manifest.csv").write_text("\n".join(lines) + "\n")
     return tmp_path

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 
 import pytest
 from reader_world import fill
 
-from anytouch_jax.cli.output import check_apart, check_folder, check_home, refuse_unused
+from anytouch_jax.cli.output import check_folder, check_home
 from anytouch_jax.errors import UserError
 
 WORK = {
@@ -46,48 +45,22 @@ def test_a_file_that_is_read_is_not_written_over(tmp_path):
         check_folder(tmp_path / "pipe")
 
 
-def test_two_outputs_are_two_files(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    check_apart(out=tmp_path / "a", report=None, sheet=tmp_path / "b", other=None)
-    with pytest.raises(UserError, match="--out and --commercial-only"):
-        check_apart(out=tmp_path / "a", commercial_only=tmp_path / "b" / ".." / "a")
-
-
 def test_the_folder_of_an_output_is_made_where_it_can_be(tmp_path, monkeypatch):
     check_folder(tmp_path / "a" / "b" / "c.json")
-    assert (tmp_path / "a" / "b").is_dir()
-    with pytest.raises(UserError, match=r"b is a folder.*--out"):
-        check_folder(tmp_path / "a" / "b")
-    with pytest.raises(UserError, match=r"\.npz.*--save"):
-        check_folder(tmp_path / "a.json", "--save", suffix=".npz")
-    with pytest.raises(UserError, match="--sheet"):
-        check_folder(tmp_path / ("x" * 300) / "c.json", "--sheet")
     check_home(tmp_path / "c" / "d")
-    assert (tmp_path / "c").is_dir() and not (tmp_path / "c" / "d").exists()
     check_home(tmp_path / "c")
+    assert (tmp_path / "a" / "b").is_dir() and (tmp_path / "c").is_dir() and not (tmp_path / "c" / "d").exists()
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"file .*--cache"):
-        check_home(tmp_path / "file", "--cache")
+    for check, path, more, words in (
+        (check_folder, "a/b", (), r"b is a folder.*--out"), (check_home, "file", ("--cache",), r"file .*--cache"),
+        (check_folder, f"{'x' * 300}/c.json", ("--sheet",), "--sheet"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=words):
+            check(tmp_path / path, *more)
     monkeypatch.setattr(os, "access", lambda *_: False)  # as for a folder of another user
-    for check in (check_folder, check_home):
+    for check, path in ((check_folder, "c/c.json"), (check_home, "c/c.json"), (check_home, "c")):
         with pytest.raises(UserError, match="--out"):
-            check(tmp_path / "c" / "c.json")
-    with pytest.raises(UserError, match="--out"):
-        check_home(tmp_path / "c")
-
-
-def test_only_changed_options_are_refused():
-    @dataclass(frozen=True)
-    class Options:
-        model: str
-        max_rows: int = 3
-        join: str = "mean"
-
-    refuse_unused(Options("m"), ("max_rows", "join"), "here")
-    with pytest.raises(UserError, match=r"^--max-rows has"):
-        refuse_unused(Options("m", 4), ("max_rows", "join"), "here")
-    with pytest.raises(UserError, match=r"^--max-rows, --join have"):
-        refuse_unused(Options("m", 4, "sum"), ("max_rows", "join"), "here")
+            check(tmp_path / path)
 
 
 @pytest.mark.parametrize(

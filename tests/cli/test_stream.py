@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from faulty_camera import FaultyCamera, write_uneven_video
+from films import write_film
 from measuring import measuring_weights
 
 from anytouch_jax.encoder import stream as streams
@@ -17,10 +18,7 @@ from anytouch_jax.encoder import stream as streams
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "touch.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
-    for frame in range(6):
-        writer.write(np.full((32, 32, 3), 40 * frame, np.uint8))
-    writer.release()
+    write_film(path, (np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(6)))
     return path
 
 
@@ -125,12 +123,7 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
         (tmp_path / name).mkdir()
         for number, frame in enumerate(frames):
             cv2.imwrite(str(tmp_path / name / f"{number}.png"), frame)
-        writer = cv2.VideoWriter(
-            str(tmp_path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 10, frames[0].shape[1::-1]
-        )
-        for frame in frames:
-            writer.write(frame)
-        writer.release()
+        write_film(tmp_path / f"{name}.avi", frames, code="FFV1")
         turn = ("--rotate", 90, "--flip", "across") if name == "lying" else ()
         for form, command in ((name, "embed"), (f"{name}.avi", "stream")):
             out = tmp_path / "f.npz"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -63,11 +64,16 @@ def test_what_no_repair_can_decide_stays_an_error(anytouch, distinct, tmp_path):
     assert "left to you: 1 rows whose path" not in done.out
 
 
-def test_objects_on_both_sides_are_an_error_on_request(anytouch, distinct):
-    splits = ["background"] * 2 + ["train"] * 4 + ["test"] * 4
+def test_objects_and_files_on_both_sides_of_a_split_are_errors(anytouch, distinct, tmp_path):
+    splits, other = ["background"] * 2 + ["train"] * 4 + ["test"] * 4, tmp_path / "other.parquet"
+    shutil.copy(distinct, other)
+    edit(other, split=["test"] * 10)
+    assert anytouch("data", "verify", distinct).status == anytouch("data", "verify", other).status == 0
+    done = anytouch("data", "verify", distinct, other)
+    assert done.status == 1 and "leak_file" in done.out  # the same pictures in train and test
     edit(distinct, object=["mug"] * 10, split=splits, sequence=[f"{name} 1" for name in splits])
     assert anytouch("data", "verify", distinct).status == 0
-    assert anytouch("data", "verify", distinct, "--objects").status == 1
+    assert anytouch("data", "verify", distinct, "--objects").status == 1  # on request
 
 
 def test_swapped_folders_are_exchanged_when_the_user_says_so(anytouch, distinct, tmp_path):
@@ -85,16 +91,6 @@ def test_commercial_rows_only_also_of_the_repaired_copy(anytouch, distinct, tmp_
     done = anytouch("data", "verify", distinct, *words)
     assert "free.parquet: 5 rows" in done.out and " 3 " in done.out and " 1 " in done.out
     assert manifests.read(tmp_path / "free.parquet").column("license").to_pylist() == ["MIT"] * 5
-
-
-def test_several_manifests_are_looked_at_together(anytouch, distinct, tmp_path):
-    other = tmp_path / "other.parquet"
-    table = manifests.read(distinct).table
-    columns = {name: table[name].to_pylist() for name in table.column_names}
-    manifests.write(manifests.from_columns(columns | {"split": ["test"] * 10}, other), other)
-    assert anytouch("data", "verify", distinct).status == anytouch("data", "verify", other).status == 0
-    done = anytouch("data", "verify", distinct, other)
-    assert done.status == 1 and "leak_file" in done.out  # the same pictures in train and test
 
 
 def test_mistakes_are_one_sentence(mistake, distinct, tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ import threading
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 
 from anytouch_jax.data import cameras
 from anytouch_jax.data.cameras import CameraSettings, camera_of, list_cameras, open_source
@@ -142,10 +143,7 @@ def test_a_camera_is_asked_and_what_it_gives_is_reported(system, monkeypatch, as
 
 def test_an_address_is_a_camera_and_a_film_at_an_address_is_a_film(tmp_path):
     film = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
-    for number in range(5):
-        writer.write(np.full((48, 64, 3), 40 * number, np.uint8))
-    writer.release()
+    write_film(film, (np.full((48, 64, 3), 40 * number, np.uint8) for number in range(5)))
     picture = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
 
     class Answer(http.server.BaseHTTPRequestHandler):

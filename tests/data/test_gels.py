@@ -44,15 +44,6 @@ def test_the_median_of_pressed_frames_is_the_untouched_gel(look):
         gels.untouched_gel([*frames, frames[0][:50]])
 
 
-def test_items_of_any_number_are_spread_evenly():
-    for count in (3, gels.FRAMES, gels.FRAMES + 1, 5 * gels.FRAMES):
-        spread = gels.Spread(np.asarray)
-        for number in range(count):
-            spread.add(number)
-        steps = set(np.diff(spread.items))
-        assert spread.items[0] == 0 and len(steps) == 1 and min(count, 50) <= len(spread.items) <= gels.FRAMES
-
-
 @pytest.fixture
 def world(tmp_path):
     """world([(frames, cells)]): a manifest of frames with equal cells; "gel.png" is a stored picture, all grey."""
@@ -127,8 +118,7 @@ def test_the_same_unit_gets_the_picture_of_a_head_and_another_one_warning(world)
         assert gels.same_unit(known, frame)[1] == ""
 
 
-@pytest.mark.parametrize("look", LOOKS)
-@pytest.mark.parametrize("share", [0.0, 0.4, 0.6])
+@pytest.mark.parametrize(("look", "share"), list(zip(LOOKS, (0.0, 0.4, 0.6), strict=True)))
 def test_a_live_source_that_begins_with_a_press_settles_on_the_free_gel(look, share):
     frames, contact = press_film(look, share, frames=60)
     begin = int(np.argmax(contact))  # the first frame is pressed, if any is

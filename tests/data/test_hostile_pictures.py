@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from PIL import Image
 
 from anytouch_jax.data import images
@@ -127,10 +128,7 @@ def test_decoders_print_nothing_and_no_thread_loses_a_line(capfd, tmp_path):
 @pytest.mark.parametrize(("code", "ending"), [("MJPG", "avi"), ("mp4v", "mp4")])
 def test_videos_print_nothing(capfd, tmp_path, code, ending):
     path = tmp_path / f"film.{ending}"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), 10, (64, 48))
-    for _ in range(12):
-        writer.write(cv2.resize(RGB, (64, 48)))
-    writer.release()
+    write_film(path, (cv2.resize(RGB, (64, 48)) for _ in range(12)), code=code)
     data, rng = path.read_bytes(), np.random.default_rng(0)
     capfd.readouterr()
     for number in range(12):
@@ -140,4 +138,25 @@ def test_videos_print_nothing(capfd, tmp_path, code, ending):
         path.write_bytes(bad)
         with contextlib.suppress(ImageError):
             list(images.timed_frames(path))
+    assert capfd.readouterr() == ("", "")
+
+
+def _png(rows: bytes, *, depth: int = 8, colour: int = 2, lace: int = 0) -> bytes:
+    head = (24).to_bytes(4, "big") + (16).to_bytes(4, "big") + bytes([depth, colour, 0, 0, lace])
+    return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", head) + _chunk(b"IDAT", rows) + _chunk(b"IEND")
+
+
+ROWS = zlib.compress(b"".join(b"\0" + row.tobytes() for row in RGB))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [_png(ROWS[: len(ROWS) // 2]), _png(b""), _png(ROWS, depth=7), _png(ROWS, colour=5), _png(ROWS, colour=3),
+     _png(ROWS, lace=9), _png(zlib.compress(b"".join(b"\x09" + row.tobytes() for row in RGB))), _png(bytes(500))],
+    ids=["few rows", "no rows", "depth", "colour", "no palette", "lace", "filter", "noise"],
+)  # fmt: skip
+def test_a_png_that_contradicts_itself_is_an_error(data, capfd):
+    np.testing.assert_array_equal(decode_bytes(_png(ROWS), "x"), RGB)
+    with pytest.raises(ImageError, match="x cannot be read"):
+        decode_bytes(data, "x")
     assert capfd.readouterr() == ("", "")

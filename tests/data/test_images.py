@@ -1,15 +1,15 @@
 import io
-import struct
 import sys
 import zlib
 
 import cv2
 import numpy as np
 import pytest
-from places import SHARED
+from films import write_film
+from PIL import Image, ImageOps
 
 from anytouch_jax.data import images
-from anytouch_jax.data.images import MAX_PIXELS, ImageError, decode, decode_bytes, encode
+from anytouch_jax.data.images import ImageError, decode, decode_bytes, encode
 from anytouch_jax.data.names import frame_numbers, frame_order, split_series
 from anytouch_jax.errors import UserError
 
@@ -25,32 +25,18 @@ def _encoded(suffix, image=RGB):
     return data.tobytes()
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff"])
-def test_lossless_formats_give_the_exact_rgb(tmp_path, suffix):
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".jpg", ".webp"])
+def test_every_format_gives_rgb(tmp_path, suffix):
     path = tmp_path / f"x{suffix}"
-    path.write_bytes(_encoded(suffix))
+    is_lossy = suffix in (".jpg", ".webp")
+    picture = np.full((40, 60, 3), (200, 100, 50), np.uint8) if is_lossy else RGB
+    path.write_bytes(_encoded(suffix, picture))
     got = images.decode(path)
     assert got.dtype == np.uint8 and got.flags.c_contiguous
-    np.testing.assert_array_equal(got, RGB)
-
-
-def test_an_encoded_picture_is_decoded_again():
-    picture = np.random.default_rng(0).integers(0, 256, (9, 7, 3), np.uint8)
-    np.testing.assert_array_equal(decode_bytes(encode(picture), "p"), picture)
-    smooth = np.full((32, 32, 3), (200, 100, 50), np.uint8)
-    coded = encode(smooth, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
-    np.testing.assert_allclose(decode_bytes(coded, "p"), smooth, atol=4)
-    assert len(encode(smooth, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 10)) < len(coded)
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
-def test_lossy_formats_are_close(tmp_path, suffix):
-    smooth = np.stack([np.add.outer(np.arange(40), np.arange(60)) * 2, *[np.full((40, 60), 90)] * 2], -1).astype(
-        np.uint8
-    )
-    path = tmp_path / f"x{suffix}"
-    path.write_bytes(_encoded(suffix, smooth))
-    assert np.abs(images.decode(path).astype(int) - smooth).mean() < 3
+    np.testing.assert_allclose(got, picture, atol=4 * is_lossy)
+    np.testing.assert_allclose(decode_bytes(encode(picture, suffix), "p"), picture, atol=4 * is_lossy)
+    fine, coarse = (encode(RGB, ".jpg", cv2.IMWRITE_JPEG_QUALITY, quality) for quality in (90, 10))
+    assert len(coarse) < len(fine)
 
 
 def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
@@ -98,26 +84,16 @@ def test_bad_arrays_are_named(tmp_path, array, words):
     assert str(path) in str(error.value) and isinstance(error.value, UserError)
 
 
-def test_nan_in_a_tiff_is_named(tmp_path):
-    path = tmp_path / "nan.tiff"
-    path.write_bytes(cv2.imencode(".tiff", _nan())[1].tobytes())
-    with pytest.raises(images.ImageError, match=r"nan\.tiff has NaN pixels"):
-        images.decode(path)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", ".npy"])
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.95])
-def test_cut_files_are_named(tmp_path, suffix, share):
-    image = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8)
-    path = tmp_path / f"cut{suffix}"
+def test_cut_files_are_named(tmp_path, suffix):
+    image, path = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8), tmp_path / f"cut{suffix}"
     if suffix == ".npy":
         np.save(path, image)
-        data = path.read_bytes()
-    else:
-        data = _encoded(suffix, image)
-    path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(images.ImageError, match=f"cut{suffix}"):
-        images.decode(path)
+    data = path.read_bytes() if suffix == ".npy" else _encoded(suffix, image)
+    for share in (0.0, 0.02, 0.3, 0.6, 0.95):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(images.ImageError, match=f"cut{suffix}"):
+            images.decode(path)
 
 
 def test_a_jpeg_with_a_trailer_or_a_thumbnail_is_whole(tmp_path):
@@ -154,52 +130,20 @@ def test_files_that_are_no_pictures_are_named(tmp_path):
         images.decode(tmp_path)
 
 
-def _bombs():
-    def chunk(kind, body):
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    head = struct.pack(">IIBBBBB", 60000, 60000, 8, 2, 0, 0, 0)
-    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
-    jpeg = bytearray(_encoded(".jpg"))
-    at = jpeg.index(b"\xff\xc0")
-    jpeg[at + 5 : at + 9] = struct.pack(">HH", 60000, 60000)
-    bmp = bytearray(_encoded(".bmp"))
-    bmp[18:26] = struct.pack("<ii", 60000, -60000)
-    tiff = (
-        b"II*\0"
-        + struct.pack("<IH", 8, 2)
-        + struct.pack("<HHII", 256, 4, 1, 60000)
-        + struct.pack("<HHIII", 257, 4, 1, 60000, 0)
-    )
-    webp = b"RIFF\0\0\0\0WEBPVP8X" + bytes(8) + (59999).to_bytes(3, "little") * 2
-    return {"png": png, "jpg": bytes(jpeg), "bmp": bytes(bmp), "tiff": tiff, "webp": webp}
-
-
-@pytest.mark.parametrize("suffix", list(_bombs()))
-def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, suffix, monkeypatch):
-    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
-    path = tmp_path / f"bomb.{suffix}"
-    path.write_bytes(_bombs()[suffix])
-    with pytest.raises(images.ImageError, match=r"60000 x 60000|3600000000 pixels"):
-        images.decode(path)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", "lossless.webp"])
-def test_the_limit_is_that_of_the_declared_size(suffix, monkeypatch):
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", "down.bmp", ".tiff", ".webp", "lossless.webp", "tags.webp"])
+def test_a_declared_size_beyond_the_limit_is_refused_before_it_is_unpacked(suffix, monkeypatch):
     options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix.startswith("lossless") else []
-    data = cv2.imencode(suffix[-5:] if options else suffix, RGB, options)[1].tobytes()
+    data = cv2.imencode(f".{suffix.rpartition('.')[2]}", RGB, options)[1].tobytes()
+    if suffix == "down.bmp":  # its rows come from the top
+        data = data[:22] + (-9).to_bytes(4, "little", signed=True) + data[26:]
+    if suffix == "tags.webp":  # another header
+        Image.fromarray(RGB).save(stream := io.BytesIO(), "webp", exif=b"Exif\0\0")
+        data = stream.getvalue()
     assert images.decode_bytes(data, "x").shape == (9, 13, 3)
     monkeypatch.setattr(images, "MAX_PIXELS", 9 * 13 - 1)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
     with pytest.raises(images.ImageError, match="it declares 13 x 9 pixels"):
         images.decode_bytes(data, "x")
-
-
-def test_an_npy_that_declares_too_much_is_refused(tmp_path):
-    path = tmp_path / "bomb.npy"
-    np.save(path, np.zeros((4, 4, 3), np.uint8))
-    path.write_bytes(path.read_bytes().replace(b"(4, 4, 3)", b"(9999999, 9999999, 3)"))
-    with pytest.raises(images.ImageError, match="cannot be read"):
-        images.decode(path)
 
 
 def test_a_folder_comes_in_natural_order(tmp_path):
@@ -226,19 +170,13 @@ def test_a_folder_comes_in_natural_order(tmp_path):
 
 def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
     path = tmp_path / "v.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 24))
-    for level in (0, 100, 200):
-        writer.write(np.full((24, 32, 3), (0, 0, level), np.uint8))  # BGR: red
-    writer.release()
+    write_film(path, (np.full((24, 32, 3), (0, 0, level), np.uint8) for level in (0, 100, 200)))
     frames = list(images.frames_from_video(path))
     assert [frame.shape for frame in frames] == [(24, 32, 3)] * 3
     assert [round(float(frame[..., 0].mean()) / 100) for frame in frames] == [0, 1, 2]
     assert max(frame[..., 2].mean() for frame in frames) < 10
     monkeypatch.chdir(tmp_path)
-    timed = cv2.VideoWriter(str(tmp_path / "10:30.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (32, 24))
-    for _ in range(3):
-        timed.write(np.zeros((24, 32, 3), np.uint8))
-    timed.release()
+    write_film(tmp_path / "10:30.mp4", (np.zeros((24, 32, 3), np.uint8) for _ in range(3)))
     assert len(list(images.frames_from_video("10:30.mp4"))) == images.count_frames("10:30.mp4") == 3  # no protocol
     (tmp_path / "bad.avi").write_bytes(b"not a video")
     for name, words in (("bad.avi", "not a video"), ("none.avi", "there is no video")):
@@ -249,8 +187,6 @@ def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["jpg", "png", "webp", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_picture_is_turned_as_its_tag_says(tmp_path, kind, orientation):
-    from PIL import Image, ImageOps
-
     stored = Image.fromarray(np.add.outer(np.arange(40) * 2, np.arange(60)).astype(np.uint8)).convert("RGB")
     tags = Image.Exif()
     tags[274] = orientation
@@ -290,16 +226,6 @@ def test_a_video_is_turned_as_its_tag_says(tmp_path):
     assert frame.shape == (64, 48, 3) and frame[5, 40].min() > 200 and frame[5, 5].max() < 50
 
 
-REAL = SHARED / "real_touch"
-
-
-@pytest.mark.parametrize("folder", [REAL] if REAL.is_dir() else [])
-def test_a_real_video(folder):
-    path, *_ = sorted(folder.glob("*/**/videos/*.avi"))
-    frame = next(images.frames_from_video(path))
-    assert frame.shape == (240, 320, 3) and frame.std() > 5
-
-
 @pytest.mark.parametrize("kind", [np.float64, np.int32, np.int16, np.int8])
 def test_a_tiff_of_an_unusual_type_is_a_picture_or_a_sentence(tmp_path, kind):
     path = tmp_path / "odd.tiff"
@@ -313,23 +239,20 @@ def test_a_tiff_of_an_unusual_type_is_a_picture_or_a_sentence(tmp_path, kind):
             images.decode(path)
 
 
-def test_a_strip_is_no_picture(tmp_path):
-    path = tmp_path / "strip.png"
-    path.write_bytes(cv2.imencode(".png", np.zeros((1, 2000, 3), np.uint8))[1].tobytes())
-    with pytest.raises(images.ImageError, match="that is a strip, not a picture"):
-        images.decode(path)
-
-
-def test_a_tiff_that_opencv_would_read_wrong_is_refused(tmp_path):
-    from PIL import Image
-
+def test_strips_and_tiffs_that_opencv_would_read_wrong_are_refused(tmp_path):
     plain, clear = Image.fromarray(RGB), Image.fromarray(np.dstack([RGB, np.full(RGB.shape[:2], 128, np.uint8)]))
     plain.save(tmp_path / "one.tif")
     np.testing.assert_array_equal(images.decode(tmp_path / "one.tif"), RGB)
     plain.save(tmp_path / "several.tif", save_all=True, append_images=[plain, plain])
     clear.save(tmp_path / "clear.tif")
-    for name, sentence in (("several", "holds several pictures"), ("clear", "colours would be multiplied")):
-        with pytest.raises(images.ImageError, match=rf"{name}\.tif cannot be read: .*{sentence}"):
+    Image.fromarray(np.zeros((1, 2000, 3), np.uint8)).save(tmp_path / "strip.tif")
+    sentences = {
+        "several": "holds several pictures",
+        "clear": "colours would be multiplied",
+        "strip": "that is a strip",
+    }
+    for name, sentence in sentences.items():
+        with pytest.raises(images.ImageError, match=rf"{name}\.tif .*{sentence}"):
             images.decode(tmp_path / f"{name}.tif")
 
 
@@ -338,13 +261,7 @@ def test_frames_are_numbered_by_what_counts_them():
     assert frame_numbers(["a10.png", "a20.png"]) == [0, 1]  # no neighbours: they do not count frames
     assert frame_numbers(["a.png", "b2.png"]) == [0, 1] and frame_numbers([]) == []
     assert frame_numbers(["1.png", "2.png", "4.png", "6.png"]) == [1, 2, 4, 6]  # a third of the steps
-    for form in (
-        "{}_left.png",
-        "{:05d}_D20012.png",
-        "img_{:04d}_left_raw.png",
-        "frame{:04d}_cam0.png",
-        "{}_320x240.png",
-    ):
+    for form in ("{}_left.png", "{:05d}_D20012.png", "img_{:04d}_left_raw.png", "{}_320x240.png"):
         assert frame_numbers([form.format(number) for number in (3, 4, 9)]) == [3, 4, 9], form
     stamps = [1700000000000 + 33 * i - 32 * (i == 13) for i in range(30)]  # milliseconds, one frame early
     assert frame_numbers([f"{stamp}.png" for stamp in stamps]) == list(range(30))
@@ -377,21 +294,15 @@ def test_frames_come_in_the_order_of_the_numbers_in_their_names(names):
     ("names", "series"),
     [
         (["left_0.png", "left_1.png", "right_0.png"], {"left": ["left_0.png", "left_1.png"], "right": ["right_0.png"]}),
-        (["cam0_1.png", "cam1_1.png"], {"cam0": ["cam0_1.png"], "cam1": ["cam1_1.png"]}),
         (["0.png", "right 0.png"], {"": ["0.png"], "right": ["right 0.png"]}),
         (["left_0.png", "right_1.png"], None),  # no number twice: it may be one series
         (["1.5.png", "2.5.png", "10.5.png"], None),  # seconds
-        (["at_12-00-05.png", "at_12-01-05.png"], None),
         (["2024_05.png", "2025_05.png"], None),
         (["1.png", "1.jpg"], None),
         (["0_left.png", "0_right.png", "1_left.png", "1_right.png"], ("left", "right")),
-        (["0_A.png", "0_B.png", "1_A.png", "1_B.png"], ("A", "B")),
-        (["0A.png", "0B.png"], ("A", "B")),
         (["L0001.png", "L0002.png", "R0001.png", "R0002.png"], ("L", "L", "R", "R")),
-        (["000000-L.jpg", "000000-R.jpg"], ("L", "R")),
         (["D20012_00000.png", "D20345_00000.png"], ("D20012", "D20345")),
         (["00000_D20012.png", "00000_D20345.png", "00001_D20012.png"], ("D20012", "D20345", "D20012")),
-        (["frame0000_left.png", "frame0000_right.png"], ("frame_left", "frame_right")),
         (["frame0_cam0.png", "frame0_cam1.png", "frame1_cam0.png", "frame1_cam1.png"], ("frame_cam0", "frame_cam1")),
         (["img_0000_left_raw.png", "img_0000_right_raw.png"], ("img_left_raw", "img_right_raw")),
         ([f"1_touch{i}_{side}.png" for i in range(6) for side in "LR"], ("touch_L", "touch_R")),
@@ -400,7 +311,6 @@ def test_frames_come_in_the_order_of_the_numbers_in_their_names(names):
         ([f"{'LR'[i % 2]}_170.{i}.png" for i in range(8)], ("L", "R")),
         ([f"{i}_{('contact', 'free')[i % 2]}.png" for i in range(8)], None),  # one recording with labels in its names
         ([f"2024-05-01T1{i}-00-05.png" for i in range(8)], None),
-        ([f"1{i}h00m05s.png" for i in range(8)], None),
         ([f"{i}_t{33 * i}.png" for i in range(9)], None),
         (["a3f9.png", "b3c1.png", "3d3e.png", "c9f9.png", "7f3.png", "e1.png"], None),
     ],
@@ -410,47 +320,6 @@ def test_series_that_share_numbers_are_apart(names, series):
         keys = [series[i % len(series)] for i in range(len(names))]
         series = {key: [name for name, of in zip(names, keys, strict=True) if of == key] for key in series}
     assert split_series(names) == (series or {"": names})
-
-
-IMAGE = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
-
-
-def _mutants(data, rng):
-    data = bytearray(data)
-    for _ in range(int(rng.integers(1, 6))):
-        at = int(rng.integers(min(len(data), 64 if rng.random() < 0.5 else len(data))))
-        kind = rng.integers(4)
-        if kind == 0:
-            data[at] = int(rng.integers(256))
-        elif kind == 1:
-            data[at : at + 4] = b"\xff\xff\xff\x7f"
-        elif kind == 2:
-            del data[at : at + int(rng.integers(1, 40))]
-        else:
-            data[at:at] = bytes(rng.integers(0, 256, int(rng.integers(1, 40)), np.uint8))
-        if not data:
-            break
-    return bytes(data)
-
-
-def _npy():
-    stream = io.BytesIO()
-    np.save(stream, IMAGE)
-    return stream.getvalue()
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tiff", ".bmp", ".webp", ".npy"])
-def test_spoiled_bytes_are_a_picture_or_an_error(suffix, capfd):
-    whole = _npy() if suffix == ".npy" else _encoded(suffix)
-    rng, refused = np.random.default_rng(7), 0
-    for _ in range(150):
-        try:
-            got = decode_bytes(_mutants(whole, rng), f"x{suffix}")
-            assert got.dtype == np.uint8 and got.ndim == 3 and got.shape[2] == 3 and got.size <= 3 * MAX_PIXELS
-        except ImageError as error:
-            refused += 1
-            assert f"x{suffix}" in str(error) and "\n" not in str(error)
-    assert refused > 5
 
 
 def _chunk(kind, body, length=None):

@@ -62,92 +62,45 @@ def cell(rng, rows):
     return f"{name} is {shown!r}", csv_bytes(rows), wrong and name not in FILES_ONLY, wrong
 
 
-def encoding(rng, rows):
+def text(rng, rows):
+    """Another encoding, separator or line end, or lines that are lost, cut and repeated."""
     rows[2]["object"] = rows[2]["label.object"] = "küche"
-    text = csv_bytes(rows).decode()
-    kind = pick(rng, "latin-1, utf-16, utf-32, utf-8-sig, invalid, header, surrogate")
-    if kind == "invalid":
-        return kind, text.encode().replace("ü".encode(), b"\xc3\x28"), True, True
-    if kind == "header":
-        return kind, text.encode().replace(b"label.object", b"label.\xff\xfe"), True, True
-    if kind == "surrogate":
-        return kind, text.encode().replace("ü".encode(), b"\xed\xa0\x80"), True, True
-    return kind, text.encode(kind), kind != "utf-8-sig", kind != "utf-8-sig"
-
-
-def separators(rng, rows):
-    by = pick(rng, (";", "\t", "|", " "))
-    return f"separated by {by!r}", csv_bytes(rows, delimiter=by), True, True
-
-
-def line_ends(rng, rows):
-    lines = csv_bytes(rows).decode().splitlines()
-    ends = pick(
-        rng,
-        (("\n", "\r\n"), ("\r",), ("\r\n",), ("\n", "\n\n"), ("\n", "\r", "\r\n"), ("\u2028",), ("\x0b",), ("\n\r",)),
-    )
-    text = "".join(line + ends[i % len(ends)] for i, line in enumerate(lines))
-    return f"line ends {ends!r}", text.encode(), ends in (("\u2028",), ("\x0b",)), ends in (("\u2028",), ("\x0b",))
-
-
-def shape(rng, rows):
-    lines = csv_bytes(rows).decode().splitlines()
-    at = int(rng.integers(1, len(lines)))
-    kind = pick(
-        rng,
-        "cell more, cell less, no header, header only, empty, spaces, quote, commas, zeros, twice, header again",
-    )
-    if kind == "cell more":
-        lines[at] += ",x"
-    elif kind == "cell less":
-        lines[at] = lines[at].rpartition(",")[0]
-    elif kind == "no header":
-        del lines[0]
-    elif kind == "header only":
-        del lines[1:]
-    elif kind == "quote":
-        lines[at] = '"' + lines[at]
-    elif kind == "commas":
-        lines[at] = "," * lines[0].count(",")
-    elif kind == "zeros":
-        lines[at] = "\0" * 200
-    elif kind == "twice":
-        lines += lines[1:]  # every frame twice; verify reports it, and a single frame may be embedded
-    elif kind == "header again":
-        lines.insert(at, lines[0])
-    text = {"empty": "", "spaces": "  \n \n"}.get(kind, "\n".join(lines) + "\n")
-    return kind, text.encode(), kind != "twice", kind != "twice"
+    whole = csv_bytes(rows).decode()
+    head, *lines = whole.splitlines()
+    at, data, ends = int(rng.integers(len(lines))), whole.encode(), pick(rng, LINE_ENDS)
+    changed = {
+        "cell more": lines[at] + ",x", "cell less": lines[at].rpartition(",")[0], "quote": '"' + lines[at],
+        "commas": "," * head.count(","), "zeros": "\0" * 200, "header again": head,
+    }  # fmt: skip
+    made = {
+        **{name: "\n".join([head, *lines[:at], line, *lines[at + 1 :]]).encode() for name, line in changed.items()},
+        **{name: whole.encode(name) for name in ("latin-1", "utf-16", "utf-32", "utf-8-sig")},
+        **{f"separated by {by!r}": csv_bytes(rows, delimiter=by) for by in (";", "\t", "|", " ")},
+        "invalid": data.replace("ü".encode(), b"\xc3\x28"), "surrogate": data.replace("ü".encode(), b"\xed\xa0\x80"),
+        "header": data.replace(b"label.object", b"label.\xff\xfe"), "no header": "\n".join(lines).encode(),
+        "header only": head.encode(), "empty": b"", "spaces": b"  \n \n",
+        "line ends": "".join(line + ends[i % len(ends)] for i, line in enumerate([head, *lines])).encode(),
+        "twice": "\n".join([head, *lines, *lines]).encode(),  # verify reports it, a single frame may be embedded
+    }  # fmt: skip
+    kind = pick(rng, made)
+    wrong = kind not in ("utf-8-sig", "twice", "line ends") or (kind == "line ends" and ends in WRONG_ENDS)
+    return kind, made[kind], wrong, wrong
 
 
 def columns(rng, rows):
-    kind = pick(rng, "twice, missing, thousands, thousands wrong, unnamed, long name, case, odd names")
-    names = list(rows[0])
+    kind, name = pick(rng, "twice, missing, thousands, unnamed, long name, case, odd names"), pick(rng, REQUIRED)
     if kind == "twice":
-        name = pick(rng, names)
-        text = csv_bytes(rows).decode().splitlines()
-        lines = [f"{line},{name if i == 0 else 'x'}" for i, line in enumerate(text)]
-        return f"{name} twice", "\n".join(lines).encode(), True, True
+        lines = csv_bytes(rows).decode().splitlines()
+        text = "\n".join([f"{lines[0]},{name}", *(f"{line},x" for line in lines[1:])])
+        return f"{name} twice", text.encode(), True, True
     if kind in ("missing", "case"):
-        name = pick(rng, REQUIRED)
         other = name.upper() if kind == "case" else "other"
         rows = [{(other if key == name else key): value for key, value in row.items()} for row in rows]
         return f"{name} {kind}", csv_bytes(rows), True, True
-    if kind.startswith("thousands"):
-        count = int(rng.integers(1000, 20_000))
-        for row in rows:
-            row.update({f"{'label.' if i % 3 else ''}c{i}": "1" for i in range(count)})
-            if kind == "thousands wrong":
-                row.pop("split")
-        wrong = kind == "thousands wrong"
-        return f"{count} columns", csv_bytes(rows), wrong, wrong
-    name = {
-        "unnamed": "",
-        "long name": "n" * 200_000,
-        "odd names": pick(rng, ("label.", "label. ", "a\nb", "\u202e", "=1+1")),
-    }[kind]
-    for row in rows:
-        row[name] = "x"
-    return f"column {name[:12]!r}", csv_bytes(rows), False, False
+    count = int(rng.integers(1000, 20_000)) if kind == "thousands" else 0
+    odd = {"unnamed": "", "long name": "n" * 200_000}.get(kind, pick(rng, ("label.", "a\nb", "\u202e", "=1+1")))
+    more = {f"{'label.' if i % 3 else ''}c{i}": "1" for i in range(count)} or {odd: "x"}
+    return f"{kind} {odd[:12]!r}", csv_bytes([row | more for row in rows]), False, False
 
 
 def long(rng, rows):
@@ -162,45 +115,9 @@ def long(rng, rows):
     return f"{name} of {len(value)} letters", csv_bytes(rows), wrong, wrong
 
 
-def frames(rng, rows):
-    kind = pick(rng, ("same", "far", "negative", "farther"))
-    values = {
-        "same": [0] * 12,
-        "far": [0, 1 << 62] * 6,
-        "negative": range(-12, 0),
-        "farther": [-(1 << 63), (1 << 63) - 1] * 6,
-    }
-    for row, value in zip(rows, values[kind], strict=True):
-        row["frame_index"] = value
-    return f"frames {kind}", csv_bytes(rows), False, False
-
-
-def labels(rng, rows):
-    """Numbers that are none, and classes written in two ways."""
-    kind = pick(rng, "two spellings, number and word, infinite, huge, not a number, mixed")
-    values = {
-        "two spellings": ["Ball", "ball"] * 6, "number and word": ["1"] * 11 + ["O"], "infinite": ["1", "inf"] * 6,
-        "huge": ["1e400", "2"] * 6, "not a number": ["nan", "3"] * 6, "mixed": ["1", "true", "x", "2.5"] * 3,
-    }[kind]  # fmt: skip
-    for row, value in zip(rows, values, strict=True):
-        row["label.object"] = value
-    wrong = kind in ("two spellings", "number and word")
-    return f"label {kind}", csv_bytes(rows), wrong, wrong
-
-
-def bytes_of_another(rng, rows):
-    data = pick(
-        rng,
-        (
-            b"PK\3\4" + rng.bytes(300), b"<!doctype html><html></html>", b"PAR1" + bytes(50) + b"PAR1",
-            b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 2\n", rng.bytes(2000), b"\xef\xbb\xbf",
-            b"{}", b"PAR1",
-        ),
-    )  # fmt: skip
-    return f"bytes {data[:9]!r}", data, True, True
-
-
-CSV = (cell, cell, cell, encoding, separators, line_ends, shape, shape, columns, long, frames, labels, bytes_of_another)
+WRONG_ENDS = (("\u2028",), ("\x0b",))
+LINE_ENDS = (("\n", "\r\n"), ("\r",), ("\r\n",), ("\n", "\n\n"), ("\n", "\r", "\r\n"), ("\n\r",), *WRONG_ENDS)
+CSV = (cell, cell, cell, text, text, text, columns, long)
 
 
 # Parquet -------------------------------------------------------------------------------------------------------------
@@ -238,58 +155,11 @@ def typed(rng, arrays):
     return f"{name} of {kind}", arrays, wrong
 
 
-def legal(rng, arrays):
-    """Other types for the same values."""
-    name = pick(rng, ("path", "sensor", "sequence", "split", "frame_index", "touch", "text"))
-    kinds = (
-        (pa.int32(), pa.float64(), pa.uint8())
-        if name == "frame_index"
-        else (pa.large_string(), pa.dictionary(pa.int8(), pa.string()), pa.string_view())
-    )
-    kind = pick(rng, kinds)
-    arrays[name] = arrays[name].dictionary_encode() if pa.types.is_dictionary(kind) else arrays[name].cast(kind)
-    return f"{name} as {kind}", arrays, None
-
-
-def invalid_text(rng, arrays):
-    name = pick(
-        rng, ("path", "sensor", "sequence", "split", "text", "touch", "object", "label.object", "note", "dataset")
-    )
-    values = [b"\xff\xfe", b"\xc3\x28", b"\xed\xa0\x80", b"a\x80b"] * 3
-    data = pa.array(values)
-    arrays[name] = pa.StringArray.from_buffers(len(values), data.buffers()[1], data.buffers()[2])
-    return f"invalid UTF-8 in {name}", arrays, True
-
-
-def value(rng, arrays):
-    name = pick(rng, WRONG)
-    wrong = pick(rng, WRONG[name])
-    if name in ("frame_index", "stride") or wrong == "\ud83d":
-        arrays["frame_index"] = pa.array([None, *range(11)])
-        return "a null frame_index", arrays, True
-    values = arrays[name].to_pylist()
-    values[int(rng.integers(len(values)))] = wrong
-    arrays[name] = pa.array(values)
-    is_wrong = wrong not in LENIENT.get(name, ()) and name not in FILES_ONLY
-    return f"{name} is {wrong[:20]!r}", arrays, is_wrong
-
-
-def wide(rng, arrays):
-    count = int(rng.integers(1000, 8000))
-    arrays.update({f"label.c{i}": pa.array([0] * 12) for i in range(count)})
-    if missing := rng.random() < 0.3:
-        del arrays["split"]
-    return f"{count} columns", arrays, True if missing else None
-
-
-PARQUET = (typed, typed, typed, legal, invalid_text, value, value, wide)
-
-
 def parquet(rng, things, file: Path) -> tuple[str, bool]:
     arrays = table(rows_of(things))
     kind = pick(rng, ("values",) * 6 + ("cut", "flipped", "footer", "empty", "twice", "csv"))
     if kind == "values":
-        name, arrays, wrong = pick(rng, PARQUET)(rng, arrays)
+        name, arrays, wrong = typed(rng, arrays)
         pq.write_table(pa.table(arrays), file)
         return name, bool(wrong)
     whole = pa.table(arrays)
@@ -297,15 +167,13 @@ def parquet(rng, things, file: Path) -> tuple[str, bool]:
         whole = pa.Table.from_arrays([*whole.columns, whole[0]], names=[*whole.column_names, whole.column_names[0]])
     pq.write_table(whole.slice(0, 0) if kind == "empty" else whole, file)
     data = file.read_bytes()
-    if kind == "csv":
-        data = csv_bytes(rows_of(things))
-    elif kind == "cut":
-        data = cut(rng, data)
-    elif kind == "flipped":  # a page may have no checksum
-        data = flipped(rng, data, count=int(rng.integers(1, 30)))
-    elif kind == "footer":
-        data = flipped(rng, data, len(data) - 400, len(data), int(rng.integers(1, 8)))
-    file.write_bytes(data)
+    file.write_bytes(
+        {
+            "csv": csv_bytes(rows_of(things)), "cut": cut(rng, data),
+            "flipped": flipped(rng, data, count=int(rng.integers(1, 30))),  # a page may have no checksum
+            "footer": flipped(rng, data, len(data) - 400, len(data), int(rng.integers(1, 8))),
+        }.get(kind, data)
+    )  # fmt: skip
     return f"Parquet {kind}", kind not in ("flipped", "footer")
 
 

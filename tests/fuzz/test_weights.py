@@ -1,4 +1,4 @@
-"""Hostile weights: .pth pickles that call, claim or repeat, safetensors with wrong headers, shards, and NaN."""
+"""Hostile weights: pickles that flood the machine of .pth files, safetensors with wrong headers, shards, and NaN."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 from anytouch_jax.weights.safetensors import read_safetensors
 from tests.fuzz.harness import Case, cut, flipped, pick
-from tests.weights.conftest import Call, Global, Tensor, legacy_bytes, tensor, zip_bytes
+from tests.weights.conftest import legacy_bytes, tensor, zip_bytes
 
 SIZES = {"F32": 4, "F16": 2, "BF16": 2, "F64": 8, "I64": 8, "I8": 1, "BOOL": 1, "U8": 1, "F8_E4M3": 1}
 
@@ -40,51 +40,37 @@ def safetensors(
 
 
 def header(rng, arrays, metadata):
+    """A header with one wrong entry, or of another length."""
     name = pick(rng, arrays)
-    kind = pick(
-        rng,
-        "offset, overlap, shape, dtype, dtype name, missing, negative, huge, "
-        "more, twice, deep, digits, metadata, empty, length, list",
-    )
+    other = pick(rng, [one for one in arrays if one != name])
+    kind = pick(rng, "offset, overlap, shape, dtype, missing, more, twice, deep, digits, metadata, empty, length, list")
 
     def edit(header):
-        entry = header[name]
+        entry, another = header[name], header[other]
         start, end = entry["data_offsets"]
-        other = pick(rng, [one for one in arrays if one != name])
-        if kind == "offset":
-            entry["data_offsets"] = [start + int(rng.integers(1, 1 << 40)), end + int(rng.integers(1, 1 << 40))]
-        elif kind == "overlap":
-            entry["data_offsets"] = header[other]["data_offsets"]
-            entry["shape"] = [*header[other]["shape"][::-1], 1]
-        elif kind == "shape":
-            entry["shape"] = pick(rng, ([0], [1 << 40, 1 << 40], [*entry["shape"], 2], [(1 << 64) - 1], [10**10, 1]))
-        elif kind == "dtype":
-            entry["dtype"] = pick(rng, [one for one in SIZES if SIZES[one] != 4])
-        elif kind == "dtype name":
-            entry["dtype"] = pick(rng, ("F31", "", None, 3, "f" * 10_000, "C64"))
-        elif kind == "missing":
+        far = [start + int(rng.integers(1, 1 << 40)), end + int(rng.integers(1, 1 << 40))]
+        shapes = ([0], [-1], [1 << 40, 1 << 40], [*entry["shape"], 2], [(1 << 64) - 1], [10**10, 1], [10**10])
+        dtypes = [one for one in SIZES if SIZES[one] != 4] + ["F31", "", None, 3, "f" * 10_000, "C64"]
+        changes = {
+            "offset": {"data_offsets": far}, "dtype": {"dtype": pick(rng, dtypes)}, "digits": {"shape": 0},
+            "overlap": {"data_offsets": another["data_offsets"], "shape": [*another["shape"][::-1], 1]},
+            "shape": {"shape": pick(rng, shapes)},
+        }  # fmt: skip
+        entry.update(changes.get(kind, {}))
+        if kind == "missing":
             del entry[pick(rng, entry)]
-        elif kind == "negative":
-            entry["shape"] = [-1]
-        elif kind == "huge":
-            entry["shape"], entry["data_offsets"] = [10**10], [start, start + 4 * 10**10]
         elif kind == "more":
             header["n" * 100_000] = {"dtype": "F32", "shape": [], "data_offsets": [0, 0]}
-        elif kind == "twice":
-            text = json.dumps(header)
-            return text[:-1] + f', "{name}": {json.dumps(header[other])}' + "}"
-        elif kind == "deep":
-            return '{"a":' + "[" * 100_000 + "]" * 100_000 + "}"
-        elif kind == "digits":
-            entry["shape"] = 0
-            return json.dumps(header).replace('"shape": 0', '"shape": [' + "9" * 5000 + "]")
         elif kind == "metadata":
             header["__metadata__"] = pick(rng, (3, [], {"a": 1}, {"a": {"b": "c"}}, "x"))
         elif kind == "empty":
             header.clear()
-        elif kind == "list":
-            return json.dumps([header])
-        return None
+        text = json.dumps(header)
+        return {
+            "twice": f'{text[:-1]}, "{name}": {json.dumps(another)}}}', "list": f"[{text}]",
+            "digits": text.replace('"shape": 0', '"shape": [' + "9" * 5000 + "]"),
+            "deep": '{"a":' + "[" * 99_999 + "]" * 99_999 + "}",
+        }.get(kind)  # fmt: skip
 
     length = int(pick(rng, (0, 1, 7, 1 << 40, (1 << 64) - 1))) if kind == "length" else None
     return f"header: {kind} of {name}", safetensors(arrays, metadata, edit, length), "safetensors", True, True
@@ -135,85 +121,40 @@ def not_finite(rng, arrays, metadata):
 
 def other_arrays(rng, arrays, metadata):
     name = pick(rng, arrays)
-    array = arrays[name]
-    kind = pick(
-        rng,
-        "missing, more, shape, zero, transposed, prefix, two prefixes, scalar, none, type, many",
-    )
-    rest = {key: one for key, one in arrays.items() if key != name}
-    changed = {
+    array, rest = arrays[name], {key: one for key, one in arrays.items() if key != name}
+    made = {
         "missing": rest, "more": arrays | {"x" * 300: np.zeros(2, np.float32)},
         "shape": rest | {name: np.zeros((3, 5, 7))}, "zero": rest | {name: np.zeros((0, *array.shape))},
-        "transposed": rest | {name: np.concatenate([array, array])},
+        "long": rest | {name: np.concatenate([array, array]) if array.ndim else array},
         "prefix": {f"module.{key}": one for key, one in arrays.items()}, "scalar": rest | {name: np.float32(1)},
         "two prefixes": {("module." if i % 2 else "model.") + key: one for i, (key, one) in enumerate(arrays.items())},
         "none": {"a": np.zeros(3)}, "type": rest | {name: array.astype(np.int64)},
         "many": {f"k{i}": np.zeros(1) for i in range(20_000)},
-    }[kind]  # fmt: skip
+    }  # fmt: skip
+    kind = pick(rng, made)
+    changed = {key: np.asarray(one) for key, one in made[kind].items()}
     # The authors' files do not name their sensors, so that a longer table of tokens is another whole file.
-    wrong = kind not in ("prefix", "type") and not (
-        kind == "transposed" and (array.ndim == 0 or name == "sensor_token")
-    )
-    name = f"arrays: {kind} {name}"
+    wrong = kind not in ("prefix", "type") and not (kind == "long" and (array.ndim == 0 or name == "sensor_token"))
     if rng.random() < 0.5 or kind == "type":
-        return (
-            name, zip_bytes({key: tensor(np.asarray(one)) for key, one in changed.items()}), "pth", False,
-            wrong and kind != "more",
-        )  # fmt: skip
-    return name, safetensors({k: np.asarray(one) for k, one in changed.items()}, metadata), "safetensors", False, wrong
+        data, ending = zip_bytes({key: tensor(one) for key, one in changed.items()}), "pth"
+        wrong = wrong and kind != "more"
+    else:
+        data, ending = safetensors(changed, metadata), "safetensors"
+    return f"arrays: {kind} {name}", data, ending, False, wrong
 
 
 def bytes_damaged(rng, arrays, metadata):
-    ending = pick(rng, ("pth", "legacy", "safetensors"))
+    ending = pick(rng, ("pth", "pt", "ckpt", "bin", "safetensors", "safetensors"))
     tensors = {key: tensor(one) for key, one in arrays.items()}
-    data = (
-        {"pth": zip_bytes, "legacy": legacy_bytes}[ending](tensors)
-        if ending != "safetensors"
-        else safetensors(arrays, metadata)
-    )
-    kind = pick(rng, "cut, cut, header, random, empty, html, lfs, zeros")
-    data = {
+    packed = pick(rng, (zip_bytes, legacy_bytes))(tensors)
+    data = safetensors(arrays, metadata) if ending == "safetensors" else packed
+    made = {
         "cut": cut(rng, data), "header": flipped(rng, data, 0, 60, 4), "random": rng.bytes(3000), "empty": b"",
         "html": b"\n <!DOCTYPE html><html>sign in</html>", "zeros": bytes(len(data)),
         "lfs": b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 12\n",
-    }[kind]  # fmt: skip
-    ending = pick(rng, ("pth", "pt", "ckpt", "bin")) if ending in ("pth", "legacy") else ending
-    wrong = kind != "header"
-    return f"{ending} {kind}", data, ending, wrong, wrong
-
-
-def hostile_pickle(rng, arrays, metadata):
-    some = {key: tensor(one) for key, one in arrays.items()}
-    name = pick(rng, some)
-    data = np.zeros(8, np.float32)
-    side = int(pick(rng, (10**10, 1 << 40, 1 << 62, 1 << 66)))
-    kind = pick(
-        rng,
-        "call, expanded, many expanded, beyond, length, negative, kind, "
-        "object, list, nested, keys, state, shape, numbers",
-    )
-    wrong: Any = {
-        "call": some
-        | {
-            "x": Call(
-                Global(*pick(rng, (("os", "system"), ("builtins", "eval"), ("numpy", "load")))), ("touch hacked",)
-            )
-        },
-        "expanded": some | {name: Tensor(data, (side,), (0,))},
-        "many expanded": {f"k{i}": Tensor(data, (1 << 14,), (0,)) for i in range(int(rng.integers(1000, 5000)))},
-        "beyond": some | {name: Tensor(data, (4, 4), (4, 1))},
-        "length": some | {name: Tensor(data, (8,), (1,), length=side)},
-        "negative": some | {name: Tensor(data, (-1,), (1,))},
-        "kind": some | {name: Tensor(data, (8,), (1,), kind="Quantised")},
-        "object": Call(Global("torch.nn.modules.linear", "Linear"), ()),
-        "list": list(some.values()),
-        "state": {"model": {}, "epoch": 3},
-        "nested": {"model": {"model": {"model": {"model": {"model": {"model": some}}}}}},
-        "keys": {3: tensor(np.zeros(2)), **some},
-        "shape": some | {name: Tensor(data, (1,) * 40, (1,) * 40)},
-        "numbers": {"state_dict": {"a": 3.5, "b": "x"}},
-    }[kind]
-    return f"pickle: {kind} {side if kind in ('expanded', 'length') else ''}", zip_bytes(wrong), "pth", True, True
+    }  # fmt: skip
+    kind = pick(rng, made)
+    return f"{ending} {kind}", made[kind], ending, kind != "header", kind != "header"
 
 
 def raw_pickle(rng, arrays, metadata):
@@ -242,8 +183,7 @@ def raw_pickle(rng, arrays, metadata):
 
 
 KINDS = (
-    header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, hostile_pickle,
-    raw_pickle,
+    header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, raw_pickle,
 )  # fmt: skip
 
 
@@ -253,7 +193,7 @@ def make(rng, folder: Path, things) -> Case:
     own = rng.random() < 0.5
     arrays, metadata = read_safetensors(things.weights if own else things.release)
     kind = pick(rng, KINDS)
-    if kind in (other_arrays, hostile_pickle, bytes_damaged, not_finite) and not own:
+    if kind in (other_arrays, bytes_damaged, not_finite) and not own:
         (folder / "config.json").write_text(json.dumps({"model": {"touch": {"heads": 2}, "decoder": {"heads": 2}}}))
     name, data, ending, always, used = kind(rng, arrays, metadata)
     file = folder / f"w.{ending}"
@@ -271,51 +211,31 @@ def command(rng, name, file, folder, things, always, used):
 def shards(rng, folder: Path, things) -> Case:
     """Weights in two files, with an index that does not fit them."""
     arrays, metadata = read_safetensors(things.release)
-    names = sorted(arrays)
-    parts = {
-        "a-00001-of-00002.safetensors": names[: len(names) // 2],
-        "a-00002-of-00002.safetensors": names[len(names) // 2 :],
-    }
-    where = {name: file for file, inside in parts.items() for name in inside}
-    for file, inside in parts.items():
-        (folder / file).write_bytes(safetensors({name: arrays[name] for name in inside}, metadata))
+    names, files = sorted(arrays), [f"a-0000{i}-of-00002.safetensors" for i in (1, 2)]
+    where = {name: files[i >= len(names) // 2] for i, name in enumerate(names)}
+    for file in files:
+        inside = {name: arrays[name] for name in names if where[name] == file}
+        (folder / file).write_bytes(safetensors(inside, metadata))
     (folder / "config.json").write_text(json.dumps({"model": {"touch": {"heads": 2}, "decoder": {"heads": 2}}}))
-    kind = pick(
-        rng,
-        "whole, lost, outside, absolute, type, empty, swapped, html, cut, missing name, folder, device",
-    )
-    index: Any = {"metadata": {"total_size": 1}, "weight_map": where}
-    first = next(iter(where))
+    first = names[0]
+    maps: dict[str, Any] = {
+        "outside": {first: "../" + things.release.name}, "absolute": {first: str(things.release)},
+        "folder": {first: "."}, "device": {first: "/dev/zero"}, "swapped": {first: files[1]},
+        "missing name": {"nothing.weight": files[0]}, "number": {first: 3}, "record": {first: {}},
+    }  # fmt: skip
+    kind = pick(rng, (*maps, "whole", "lost", "html", "cut", "empty", "type"))
+    content = {"html": b"<html>", "cut": safetensors(arrays, metadata)[:-9]}.get(kind)
     if kind == "lost":
-        (folder / "a-00002-of-00002.safetensors").unlink()
-    elif kind in ("outside", "absolute", "folder", "device"):
-        places = {
-            "outside": "../" + things.release.name,
-            "absolute": str(things.release),
-            "folder": ".",
-            "device": "/dev/zero",
-        }
-        where[first] = places[kind]
-    elif kind == "type":
-        index = pick(
-            rng,
-            ([], {"weight_map": []}, {"weight_map": {first: 3}}, {"weight_map": None}, 3, {"weight_map": {first: {}}}),
-        )
-    elif kind == "empty":
-        index["weight_map"] = {}
-    elif kind == "swapped":
-        where[first] = where[names[-1]]
-    elif kind == "missing name":
-        where["nothing.weight"] = where[first]
-    elif kind in ("html", "cut"):
-        (folder / "a-00001-of-00002.safetensors").write_bytes(
-            b"<html>" if kind == "html" else safetensors(arrays, metadata)[:-9]
-        )
+        (folder / files[1]).unlink()
+    elif content is not None:
+        (folder / files[0]).write_bytes(content)
+    index: Any = {"metadata": {"total_size": 1}, "weight_map": {} if kind == "empty" else where | maps.get(kind, {})}
+    if kind == "type":
+        index = pick(rng, ([], {"weight_map": []}, {"weight_map": None}, 3))
     file = folder / "a.safetensors.index.json"
     file.write_text(json.dumps(index))
-    place = file if rng.random() < 0.7 else folder / "a-00001-of-00002.safetensors"
-    wrong = kind != "whole"
-    return Case(*command(rng, f"shards: {kind}", place, folder, things, wrong, wrong))
+    place = file if rng.random() < 0.7 else folder / files[0]
+    return Case(*command(rng, f"shards: {kind}", place, folder, things, kind != "whole", kind != "whole"))
 
 
 @pytest.mark.parametrize("count", [25, pytest.param(0.14, marks=pytest.mark.slow)])

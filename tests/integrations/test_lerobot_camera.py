@@ -6,9 +6,9 @@ import importlib
 import sys
 import tomllib
 
-import cv2
 import numpy as np
 import pytest
+from films import write_film
 from measuring import gel, measuring_weights
 from places import ROOT
 
@@ -87,12 +87,10 @@ def test_features_are_those_of_the_encoder(plugin, film, tmp_path):
 def test_a_film_never_ends_and_its_depth_is_a_grey_picture(plugin, tmp_path):
     """LeRobot's own camera reads a film as fast as it can, and then its thread is over."""
     path, weights = tmp_path / "film.avi", measuring_weights(tmp_path / "weights.safetensors")
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 100, (64, 48))
-    for number in range(4):
-        picture = gel()
+    frames = [gel() for _ in range(4)]
+    for number, picture in enumerate(frames):
         picture[10:30, 10 : 20 + 8 * number] += 60
-        writer.write(picture[..., ::-1])
-    writer.release()
+    write_film(path, (picture[..., ::-1] for picture in frames), 100)
     settings = {"index_or_path": path, "encoder": str(weights), "sensor": "tacto", "width_mm": 12.0}
     camera = plugin.AnyTouchCamera(plugin.AnyTouchCameraConfig(**settings, depth=True, white_mm=0.1, rotate=90))
     with camera_open(camera):

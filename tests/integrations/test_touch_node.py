@@ -9,6 +9,7 @@ from types import ModuleType, SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from measuring import measuring_weights
 from places import ROOT
 
@@ -102,10 +103,7 @@ def test_what_every_frame_publishes_until_ros_ends(monkeypatch, tmp_path, tiny_r
     press = gel.copy()
     press[10:30, 10:30] += 90
     cv2.imwrite("gel.png", gel)
-    writer = cv2.VideoWriter("7.avi", cv2.VideoWriter_fourcc(*"MJPG"), 30, (48, 48))
-    for picture in (gel, gel, press, press):
-        writer.write(picture)
-    writer.release()
+    write_film("7.avi", (gel, gel, press, press), 30)
     (tmp_path / "7.avi").rename("7")  # a number, as camera:=0 is for ROS
     model = measuring_weights(tmp_path / "weights.safetensors") if measures else tiny_run
     given = {

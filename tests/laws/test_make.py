@@ -53,7 +53,7 @@ def test_a_target_can_be_planned(target: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_variables_reach_the_options_of_training() -> None:
+def test_variables_reach_the_options() -> None:
     words = ["DATA=a.parquet b.csv", "RUN=r", "PRESET=large", "STEPS=4", "STOP_AFTER=2", "SAVE=1", "BATCH=3"]
     options, config = parsed(planned("train-stage1", *words, "ARGS=--data.flip 0")[-1])
     assert (options.stage, options.data, options.run) == (1, (Path("a.parquet"), Path("b.csv")), Path("r"))
@@ -61,13 +61,9 @@ def test_variables_reach_the_options_of_training() -> None:
     assert config.data.batch_size == 3 and config.data.flip == 0
     spaces = parsed(planned("train-stage1", "DATA='my folder/a.parquet' b.csv", "RUN='my runs/one'")[-1]).options
     assert spaces.data == (Path("my folder/a.parquet"), Path("b.csv")) and spaces.run == Path("my runs/one")
-    for init in ("runs/stage1", "w.pth"):
-        given = [] if init == "runs/stage1" else [f"INIT={init}"]
+    for init, given in (("runs/stage1", []), ("w.pth", ["INIT=w.pth"])):
         options = parsed(planned("train-stage2", "DATA=a.csv", *given)[-1]).options
         assert (options.stage, options.init, options.run) == (2, Path(init), Path("runs/stage2"))
-
-
-def test_variables_reach_the_options_of_probes() -> None:
     options = parsed(planned("probe", "DATA=a.csv", "RUN=r", "LABEL=slip")[-1])
     assert (options.model, options.data, options.label) == ((Path("r"),), (Path("a.csv"),), "slip")
 
@@ -85,20 +81,17 @@ def test_plain_make_lists_every_target() -> None:
     assert """DATA="'my folder/a.parquet' b.csv\"\n""" in done.stdout  # as the test above has it
 
 
-@pytest.mark.parametrize("target", ["train-stage1", "train-stage2"])
-def test_without_data_training_simulates_touches(target: str) -> None:
-    assert parsed(planned(target)[-1]).options.data == (Path("simulated"),)
-    assert parsed(planned(target, "DATA=a.csv")[-1]).options.data == (Path("a.csv"),)
-
-
-def test_without_data_the_simulated_scenes_are_made_first(tmp_path: Path) -> None:
-    target, scenes = "probe", tmp_path / "scenes"
-    simulate, use = planned(target, f"SCENES={scenes}")
+def test_without_data_touches_are_simulated(tmp_path: Path) -> None:
+    for target in ("train-stage1", "train-stage2"):
+        assert parsed(planned(target)[-1]).options.data == (Path("simulated"),)
+        assert parsed(planned(target, "DATA=a.csv")[-1]).options.data == (Path("a.csv"),)
+    scenes = tmp_path / "scenes"
+    simulate, use = planned("probe", f"SCENES={scenes}")
     assert simulate[:2] == ["data", "simulate"] and parsed(simulate).out == scenes
     assert f"{scenes}/manifest.parquet" in use
     scenes.mkdir()
     (scenes / "manifest.parquet").write_bytes(b"")
-    assert len(planned(target, f"SCENES={scenes}")) == len(planned(target, "DATA=a.csv")) == 1
+    assert len(planned("probe", f"SCENES={scenes}")) == len(planned("probe", "DATA=a.csv")) == 1
 
 
 def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
@@ -130,12 +123,10 @@ def test_a_longer_demo_continues_from_the_scenes_and_stage_1_of_the_plain_one() 
 def test_an_old_python_is_one_sentence(tmp_path: Path) -> None:
     for name in ("Makefile", "requirements.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path / name)
-    old = tmp_path / "python-old"
-    old.write_text("#!/bin/sh\nexit 1\n")  # what `sys.exit(version < 3.11)` answers there
-    old.chmod(0o755)
-    done = make("setup", f"PYTHON={old}", folder=tmp_path)
-    assert done.returncode != 0
-    assert done.stderr.startswith("This project needs Python 3.11 or newer")
+    (tmp_path / "python-old").write_text("#!/bin/sh\nexit 1\n")  # what `sys.exit(version < 3.11)` answers there
+    (tmp_path / "python-old").chmod(0o755)
+    done = make("setup", f"PYTHON={tmp_path}/python-old", folder=tmp_path)
+    assert done.returncode != 0 and done.stderr.startswith("This project needs Python 3.11 or newer")
     assert not (tmp_path / ".venv").exists()
 
 

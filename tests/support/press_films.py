@@ -27,7 +27,8 @@ def gel_frame(look: str, depth: float, shape: str = "ball", shift: float = 0.0, 
             for column in range(10, SHAPE[1], 16):
                 near = np.exp(-((row - 60) ** 2 + (column - 80 - shift) ** 2) / 40**2)
                 middle = column + 5 * depth * near  # shear moves the dots
-                picture[(y - row) ** 2 + (x - middle) ** 2 < 2.5**2] = 20
+                part = np.s_[row - 3 : row + 4, max(int(middle) - 3, 0) : int(middle) + 5]
+                picture[part][(y[part] - row) ** 2 + (x[part] - middle) ** 2 < 2.5**2] = 20
     picture *= 1 + 0.02 * np.sin(seed)  # exposure drifts
     return np.clip(picture + rng.normal(0, 1.2, picture.shape), 0, 255).astype(np.uint8)
 

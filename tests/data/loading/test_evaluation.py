@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from anytouch_jax.data.loading.samples import SampleError, evaluation
-from anytouch_jax.data.manifest.manifest import ManifestError
 from anytouch_jax.errors import UserError
 
 
@@ -45,13 +44,3 @@ def test_bad_rows_are_named_or_left_out(make, settings, read_back):
     got = list(evaluation(manifest, np.arange(12), settings(on_bad_sample="skip")))
     assert [ids.tolist() for ids, _ in got] == [[1, 3], [4, 5, 6, 7]]  # a batch of nothing but bad rows is not given
     assert read_back(got[0][1].clip)[:, 0].tolist() == [1, 3, 3, 3]
-
-
-def test_unknown_and_field_sensors(make, settings):
-    manifest = make([{"sensor": "newfinger"}, {"sensor": "tac3d"}, {}])
-    with pytest.raises(ManifestError, match=r"row 0 of .*unknown sensor 'newfinger'"):
-        evaluation(manifest, np.array([0, 2]), settings())
-    ((_, batch),) = evaluation(manifest, np.array([0, 2]), settings(), unknown="universal")
-    assert batch.sensor[:2].tolist() == [9, 1]
-    with pytest.raises(UserError, match=r"row 1 of .*'tac3d' measures a force field"):
-        evaluation(manifest, np.array([1]), settings())

@@ -16,23 +16,6 @@ def _draws(matches, anchor, count=200):
     return {positive for positive, _ in drawn}, {negative for _, negative in drawn}
 
 
-def test_another_sensor_is_preferred_to_another_unit():
-    keys = _keys(touch=[0, 0, 0, 1, 1, 2], sensor=[0, 0, 1, 2, 2, 3], unit=[0, 1, 2, 3, 4, 5])
-    matches = Matches(np.arange(6), keys)
-    assert matches.anchors.tolist() == [0, 1, 2, 3, 4]  # 5 is alone
-    assert _draws(matches, 0)[0] == {2}
-    assert _draws(matches, 2)[0] == {0, 1}
-    assert _draws(matches, 3)[0] == {4}  # one sensor, two units
-    assert _draws(matches, 0)[1] == {3, 4, 5}
-
-
-def test_an_unknown_unit_is_not_another_unit():
-    keys = _keys(touch=[0, 0, 1, 1, 1, 2], sensor=[0] * 6, unit=[3, -1, 3, 4, -1, 3])
-    matches = Matches(np.arange(6), keys)
-    assert matches.anchors.tolist() == [2, 3]
-    assert _draws(matches, 2)[0] == {3}
-
-
 def test_negatives_are_elsewhere_and_by_option_of_another_object():
     keys = _keys(
         touch=[0, 0, 1, 2, 2, -1, -1, -1, -1],
@@ -66,12 +49,6 @@ def test_a_rare_negative_is_found():
     assert _draws(Matches(np.arange(3003), keys, other_object=True), 0, 20)[1] == {3002}
 
 
-def test_one_object_only_gives_its_other_places():
-    matches = Matches(np.arange(4), _keys(touch=[0, 0, 1, 1], sensor=[0, 1, 0, 1], object=[3] * 4))
-    assert matches.one_object
-    assert _draws(matches, 0)[1] == {2, 3}
-
-
 def test_no_anchor_where_there_is_no_pair_or_no_negative():
     assert not Matches(np.arange(0), _keys(touch=[], sensor=[])).anchors.size
     assert not Matches(np.arange(3), _keys(touch=[-1] * 3, sensor=[0, 1, 2])).anchors.size
@@ -85,12 +62,17 @@ def test_no_anchor_where_there_is_no_pair_or_no_negative():
     assert Matches(np.array([3, 2, 1, 0]), mixed).anchors.tolist() == [2, 3]
 
 
+def _random(seed, rows, highs):
+    rng = np.random.default_rng(seed)
+    columns = {name: rng.integers(-1, high, rows) for name, high in zip(MatchKeys._fields, highs, strict=True)}
+    return _keys(**columns | {"sensor": np.abs(columns["sensor"])}), rng
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_laws_hold_on_random_tables(seed):
-    rng = np.random.default_rng(seed)
-    columns = {name: rng.integers(-1, high, 60) for name, high in zip(MatchKeys._fields, (8, 3, 4, 4, 2), strict=True)}
-    columns["sensor"] = np.abs(columns["sensor"])
-    keys, pool = _keys(**columns), rng.permutation(60)[:40]
+    """Another sensor is preferred to another unit, and an unknown unit is not another one."""
+    keys, rng = _random(seed, 60, (8, 3, 4, 4, 2))
+    pool = rng.permutation(60)[:40]
     matches, elsewhere = Matches(pool, keys), Matches(pool, keys, other_object=True)
     brute = []
     for a, row in enumerate(pool):
@@ -101,9 +83,11 @@ def test_laws_hold_on_random_tables(seed):
     assert matches.anchors.tolist() == brute and len(brute) > 5
     for anchor in matches.anchors:
         a = pool[anchor]
+        others = {keys.sensor[r] for r in pool if keys.touch[r] == keys.touch[a]} - {keys.sensor[a]}
         for key in range(20):
             p, n = pool[list(matches.draw(int(anchor), np.random.default_rng(key)))]
             assert keys.touch[p] == keys.touch[a] and p != a
+            assert keys.sensor[p] != keys.sensor[a] or (not others and -1 not in (keys.unit[p], keys.unit[a]))
             assert keys.sensor[p] != keys.sensor[a] or keys.unit[p] != keys.unit[a]
             assert keys.touch[n] != keys.touch[a]
             p, n = pool[list(elsewhere.draw(int(anchor), np.random.default_rng(key)))]
@@ -113,10 +97,8 @@ def test_laws_hold_on_random_tables(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_negative_of_the_same_sensor_on_random_tables(seed):
-    rng = np.random.default_rng(seed)
-    columns = {name: rng.integers(-1, high, 50) for name, high in zip(MatchKeys._fields, (9, 4, 4, 4, 2), strict=True)}
-    columns["sensor"] = np.abs(columns["sensor"])
-    keys = _keys(**columns)
+    """A sensor that felt one place only is no partner."""
+    keys, _ = _random(seed, 50, (9, 4, 4, 4, 2))
     matches = Matches(np.arange(50), keys, same_sensor=True)
     places = {s: set(keys.touch[keys.sensor == s].tolist()) - {-1} for s in range(4)}
     brute = []
@@ -132,13 +114,3 @@ def test_a_negative_of_the_same_sensor_on_random_tables(seed):
         for key in range(20):
             p, n = matches.draw(anchor, np.random.default_rng(key))
             assert keys.sensor[n] == keys.sensor[p] and keys.touch[n] != keys.touch[anchor] == keys.touch[p]
-
-
-def test_a_sensor_with_one_place_only_is_no_partner():
-    keys = _keys(touch=[0, 0, 0, 1, 2], sensor=[0, 1, 2, 0, 1])
-    assert Matches(np.arange(5), keys).anchors.tolist() == [0, 1, 2]
-    matches = Matches(np.arange(5), keys, same_sensor=True)
-    assert matches.anchors.tolist() == [0, 1, 2]
-    assert {matches.draw(0, np.random.default_rng(k)) for k in range(50)} == {(1, 4)}  # never 2: sensor 2 felt 0 only
-    lock = _keys(touch=[0, 0, 1], sensor=[0, 1, 2])
-    assert Matches(np.arange(3), lock).anchors.size and not Matches(np.arange(3), lock, same_sensor=True).anchors.size

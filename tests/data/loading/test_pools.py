@@ -136,11 +136,6 @@ def test_what_counts_as_set(make, values, set_):
     assert pools.withheld_text(manifest).tolist() == [bool(one) for one in set_]
 
 
-def test_all_text_withheld_means_no_text_slots(make, settings):
-    loader = Loader(make([{"text": "x", "downstream_test": "a", "image_path": "v.png"}] * 4), settings(2))
-    assert len(loader.batch(0).align.text) == 0 and loader.tokenizer is None
-
-
 SIZE = 4
 
 
@@ -165,26 +160,23 @@ def changed(config, name):
     return presets.apply_baseline(name, config)
 
 
-def test_tlv_link_draws_only_samples_with_all_three(make, settings, read_back):
-    loader = Loader(make(world()), changed(settings(2), "tlv_link"))
-    collected = set()
+@pytest.mark.parametrize(
+    ("name", "recordings", "images", "texts", "matches"),
+    [
+        ("tlv_link", {2, 4, 5, 7}, 4, 4, False), ("unitouch", {0, 2, 4, 5, 7}, 4, 0, False),
+        ("no_text", set(range(8)), None, 0, True), ("no_vision", set(range(8)), 0, None, True),
+    ],
+)  # fmt: skip
+def test_a_baseline_draws_what_it_needs(make, settings, read_back, name, recordings, images, texts, matches):
+    loader, collected = Loader(make(world()), changed(settings(2), name)), set()
     for batch in batches(loader):
         align = batch.align
-        assert align.clip.shape[1] == 1 and batch.match is None
-        assert sorted(align.image_row.tolist()) == sorted(align.text_row.tolist()) == list(range(SIZE))
+        for rows, count in ((align.image_row, images), (align.text_row, texts)):
+            assert (sorted(rows.tolist()) == list(range(count))) if count is not None else len(rows)
+        assert (batch.match is not None) == matches
         collected |= set((read_back(align.clip)[:, -1] // 6).tolist())
-    assert collected == {2, 4, 5, 7}
-    assert any("24 of 48 rows have image and text" in note for note in loader.notes)
-
-
-def test_unitouch_draws_photographs_and_no_text(make, settings, read_back):
-    loader = Loader(make(world()), changed(settings(2), "unitouch"))
-    collected = set()
-    for batch in batches(loader):
-        assert batch.align.text.shape[0] == 0 and batch.match is None
-        assert sorted(batch.align.image_row.tolist()) == list(range(SIZE))
-        collected |= set((read_back(batch.align.clip)[:, -1] // 6).tolist())
-    assert collected == {0, 2, 4, 5, 7} and loader.tokenizer is None
+    assert collected == recordings and (loader.tokenizer is None) == (texts == 0)
+    assert any("24 of 48 rows have image and text" in note for note in loader.notes) == (name == "tlv_link")
 
 
 def test_clips_end_at_rows_with_the_required_modalities(make, settings, read_back):
@@ -202,10 +194,21 @@ def test_clips_end_at_rows_with_the_required_modalities(make, settings, read_bac
             assert set((read_back(clip)[:, -1] % 6).tolist()) == {4}
 
 
-def test_no_row_with_the_required_modalities_is_an_error(make, settings):
-    rows = [{**row, "image_path": None} for row in world()]
-    with pytest.raises(UserError, match=r"data\.require: no row of split 'train' has image and text"):
-        Loader(make(rows), settings(2, require=("image", "text")))
+@pytest.mark.parametrize(
+    ("change", "data", "message"),
+    [
+        (
+            {"image_path": None},
+            {"require": ("image", "text")},
+            r"data\.require: no row of split 'train' has image and text",
+        ),
+        ({}, {"contact_only": True}, r"--data\.contact-only needs the column 'label\.contact'"),
+        ({"label.contact": "0"}, {"contact_only": True}, r"data\.contact_only: no row of split 'train' has contact"),
+    ],
+)
+def test_no_row_that_may_be_drawn_is_an_error(make, settings, change, data, message):
+    with pytest.raises(UserError, match=message):
+        Loader(make([row | change for row in world()]), settings(2, **data))
 
 
 def test_only_frames_in_contact_are_drawn_in_alignment_and_in_matching(make, settings, read_back):
@@ -220,14 +223,6 @@ def test_only_frames_in_contact_are_drawn_in_alignment_and_in_matching(make, set
     assert any("40 of 48 rows have contact; only they are drawn (data.contact_only)" in note for note in loader.notes)
     both = Loader(make(rows), settings(2, contact_only=True, require=("text",)))
     assert any("25 of 48 rows have text and contact" in note for note in both.notes)
-
-
-def test_contact_only_needs_the_contact_column(make, settings):
-    with pytest.raises(UserError, match=r"--data\.contact-only needs the column 'label\.contact'"):
-        Loader(make(world()), settings(1, contact_only=True))
-    free = [row | {"label.contact": "0"} for row in world()]
-    with pytest.raises(UserError, match=r"data\.contact_only: no row of split 'train' has contact"):
-        Loader(make(free), settings(1, contact_only=True))
 
 
 def captions_drawn(loader, steps=24):
@@ -265,18 +260,10 @@ def test_a_touch_is_aligned_by_another_sensor_or_another_unit(make):
     assert not pools.withheld_text(manifest).any()
 
 
-@pytest.mark.parametrize(("name", "images", "texts"), [("no_text", True, False), ("no_vision", False, True)])
-def test_a_modality_left_out_never_reaches_a_batch(make, settings, name, images, texts):
-    for batch in batches(Loader(make(world()), changed(settings(2), name)), 6):
-        assert bool(len(batch.align.image)) == images and bool(len(batch.align.text)) == texts
-        assert batch.match is not None
-
-
 def test_without_matching_no_triple_is_drawn(make, settings):
-    loader = Loader(make(world()), changed(settings(2), "no_matching"))
-    assert all(batch.match is None for batch in batches(loader, 6))
-    release = Loader(make(world()), changed(settings(2, "release"), "no_matching"))
-    assert all(batch.match is None and batch.align is not None for batch in batches(release, 6))
+    for recipe in ("paper", "release"):
+        loader = Loader(make(world()), changed(settings(2, recipe), "no_matching"))
+        assert all(batch.match is None and batch.align is not None for batch in batches(loader, 6))
 
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])
@@ -295,11 +282,8 @@ def test_a_static_model_never_sees_a_clip(make, settings, name, stage, recipe):
 
 def test_the_trained_sensors_are_those_drawn_from(make, settings):
     rows = [*world(), {"sensor": "duragel", "split": "val"}, {"sensor": "gelsight", "image_path": "w.png"}]
-    assert Loader(make(rows), settings(1)).trained_sensors == ["gelsight", "digit", "gelslim"]
-    assert Loader(make(rows), settings(2, require=("text",))).trained_sensors == ["digit", "gelslim"]
-
-
-def test_a_sensor_without_a_clip_is_not_trained_where_only_clips_are_drawn(make, settings):
-    rows = [*world(), {"sensor": "duragel"}]
-    assert "duragel" in Loader(make(rows), settings(1)).trained_sensors
-    assert "duragel" not in Loader(make(rows), settings(1, clip_share=1.0)).trained_sensors
+    for stage, data, sensors in (
+        (1, {}, ["gelsight", "digit", "gelslim"]), (1, {"clip_share": 1.0}, ["digit", "gelslim"]),
+        (2, {"require": ("text",)}, ["digit", "gelslim"]),
+    ):  # fmt: skip
+        assert Loader(make(rows), settings(stage, **data)).trained_sensors == sensors

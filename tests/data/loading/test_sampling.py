@@ -1,13 +1,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from anytouch_jax.data.loading import sampling as s
-from anytouch_jax.data.loading.sampling import EpochSampler, Shard
+from anytouch_jax.data.loading.sampling import EpochSampler
 
 
 def test_uniform_is_a_function_of_seed_tag_and_step():
@@ -95,20 +94,6 @@ def test_a_rare_stratum_is_visited_at_even_distances():
     assert np.diff([-1, *visits, 3000]).max() <= 21
 
 
-def test_shares_that_are_whole_numbers_are_met_exactly():
-    strata = s.StratumQuota((2, 2, 2, 2), 8)
-    assert (strata.images, strata.texts) == (4, 4)
-    assert all(strata.at(k)[1].tolist() == [2, 2, 2, 2] for k in range(20))
-    long = s.StratumQuota((1, 0, 0, 3), 2)  # one image slot; half a row of it is natural, the slot is filled
-    assert long.images == 1 and all(long.at(k)[1].tolist() == [1, 0, 0, 1] for k in range(20))
-
-
-def test_filling_moves_at_most_half_of_a_stratum():
-    shares = [Fraction(0), Fraction(1, 2), Fraction(1, 2), Fraction(1)]
-    assert sum(s._fill(shares, 1, 2)) == 2
-    assert s._fill(shares, 2, 2)[s.TEXT] >= Fraction(1, 4)
-
-
 @pytest.mark.parametrize("weights", [[2, 2, 2, 1, 1], [3, 0.5, 0.5, 0.5, 0.5], [1, 2.5, 2.5, 1, 1], [0.2] * 5])
 def test_an_epoch_draws_each_thing_by_its_weight(weights):
     weights = np.array(weights, float)
@@ -128,14 +113,3 @@ def test_an_epoch_draws_each_thing_by_its_weight(weights):
     assert len(set(drawn)) == len(drawn)  # each time with another augmentation
     assert EpochSampler(5, 0, 9, weights).take(377, 20) == drawn[377:397]  # no need to walk there
     assert stream.take(0, stream.size) != stream.take(stream.size, stream.size)
-
-
-def test_weights_of_one_change_nothing():
-    assert EpochSampler(7, 3, 9, np.ones(7)).take(5, 40) == EpochSampler(7, 3, 9).take(5, 40)
-
-
-def test_slots_fall_into_the_parts_in_order():
-    places = [Shard(i, 3).place(slot, 9) for slot in range(9) for i in range(3)]
-    assert [place for place in places if place is not None] == [0, 1, 2] * 3
-    assert [i for slot in range(9) for i in range(3) if Shard(i, 3).place(slot, 9) is not None] == sorted([0, 1, 2] * 3)
-    assert Shard(1, 3).place(None, 9) is None and Shard(1, 3).cut(np.arange(9)).tolist() == [3, 4, 5]

@@ -82,19 +82,16 @@ def test_the_first_error_of_a_step_reaches_the_caller(threads):
     assert drawn == [0, 1] and not _ours()
 
 
-def test_an_error_in_the_caller_ends_the_threads():
-    with pytest.raises(RuntimeError, match="mine"):
-        for _ in prefetch_batches(_plan, range(9), 2, 2):
-            raise RuntimeError("mine")
-    assert not _ours()
-
-
-def test_an_error_in_the_plan_ends_the_threads():
+def test_an_error_in_the_caller_or_in_the_plan_ends_the_threads():
     def plan(step):
         if step == 3:
             raise ValueError("no plan")
         return _plan(step)
 
+    with pytest.raises(RuntimeError, match="mine"):
+        for _ in prefetch_batches(_plan, range(9), 2, 2):
+            raise RuntimeError("mine")
+    assert not _ours()
     with pytest.raises(ValueError, match="no plan"):
         list(prefetch_batches(plan, range(9), 2, 2))
     assert not _ours()

@@ -4,6 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from checked_world import plain_rows
 
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import content, schema
@@ -127,9 +128,6 @@ def test_types_in_memory_are_enforced(tmp_path):
     good = {"path": ["a"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
     gaps = m.from_columns({**good, "stride": [3.0], "sensor": pa.array(["digit"]).dictionary_encode()}, tmp_path / "x")
     assert gaps.table["stride"].type == pa.int64() and gaps.value(0, "sensor") == "digit"
-    for bad in ({"sequence": [3]}, {"frame_index": [0.5]}, {"frame_index": [[1]]}, {"commercial": [2]}, {"text": [1]}):
-        with pytest.raises(m.ManifestError, match=f"column {next(iter(bad))!r}"):
-            m.from_columns({**good, **bad}, tmp_path / "x.csv")
     for odd in ({"split": ["train", "val"]}, {"frame_index": [10**20]}):
         with pytest.raises(m.ManifestError, match="make no table"):
             m.from_columns({**good, **odd}, tmp_path / "x.csv")
@@ -219,36 +217,15 @@ def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
         got.clips(2)
 
 
-def test_clips_of_many_rows():
-    from anytouch_jax.data.manifest.content import clip_windows
-
-    n = 400_000
-    sequence, frame = np.repeat(np.arange(n // 100), 100), np.tile(np.arange(100), n // 100)
-    result = clip_windows(sequence, frame, np.ones(n, np.int64), 4)
-    assert result.shape == (n // 100 * 97, 4)
-    assert (np.diff(result, axis=1) == 1).all()
-
-
 def test_joined_manifests_written_as_one_keep_their_keys_apart(tmp_path):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        rows = "".join(f"{i}.png,digit,s,{i},train,t{i},g\n" for i in range(3))
-        _file(tmp_path / name, f"{HEAD},touch,grasp_group\n{rows}")
-    both = m.read([tmp_path / "a/manifest.csv", tmp_path / "b/manifest.csv"])
-    m.write(both, tmp_path / "both.parquet")
-    one = m.read(tmp_path / "both.parquet")
-    assert len(one.clips(2)) == len(both.clips(2)) == 4
-    assert len(np.unique(one.codes("touch"))) == 6 and len(np.unique(one.codes("grasp_group"))) == 2
-
-
-def test_keys_may_be_numbers_in_joined_manifests(tmp_path):
     head = {"sensor": ["digit"] * 2, "sequence": ["s"] * 2, "frame_index": [0, 1], "split": ["train"] * 2}
     for name in "ab":
         (tmp_path / name).mkdir()
-        columns = {"path": ["0.png", "1.png"], **head, "grasp_group": [7, 8]}
+        columns = {"path": ["0.png", "1.png"], **head, "touch": ["t0", "t1"], "grasp_group": [7, 8]}
         m.write(m.from_columns(columns, tmp_path / name / "m.parquet"), tmp_path / name / "m.parquet")
     m.write(m.read([tmp_path / "a/m.parquet", tmp_path / "b/m.parquet"]), tmp_path / "both.parquet")
-    assert len(np.unique(m.read(tmp_path / "both.parquet").codes("grasp_group"))) == 4
+    one = m.read(tmp_path / "both.parquet")
+    assert len(one.clips(2)) == 2 and [len(np.unique(one.codes(name))) for name in ("touch", "grasp_group")] == [4, 4]
 
 
 def test_columns_of_any_kind_are_carried_along(tmp_path):
@@ -338,12 +315,8 @@ def test_labels_of_a_csv_keep_what_they_say(tmp_path):
     assert both.column("label.stable").to_pylist() == [True, False, None] * 2
 
 
-def _clean(count=6, **extra):
-    return [{"sequence": f"s{i // 3}", "frame_index": i % 3, "dataset": "d", **extra} for i in range(count)]
-
-
 def test_captions_are_attached_by_a_table(make, tmp_path):
-    loose = make(_clean(text=None))
+    loose = make(plain_rows(text=None))
     csv = '\ufeffsequence,text\ns0,"soft, ""very""\nand round"\nq,unused\ns1,  \n'
     (tmp_path / "t.csv").write_text(csv, encoding="utf-8")
     got, notes = attach_text(loose, tmp_path / "t.csv")
@@ -381,9 +354,9 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
 def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(UserError, match=words):
-        attach_text(make(_clean()), tmp_path / "t.csv", **options)
+        attach_text(make(plain_rows()), tmp_path / "t.csv", **options)
     with pytest.raises(UserError, match="No such file"):
-        attach_text(make(_clean()), tmp_path / "none.csv")
+        attach_text(make(plain_rows()), tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(

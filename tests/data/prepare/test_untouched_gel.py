@@ -16,10 +16,10 @@ def estimate(frames):
     return estimate_untouched_gel([scale_picture(frame) for frame in frames])
 
 
-@pytest.mark.parametrize(("number", "share"), list(enumerate([0.1, 0.5, 0.75, 0.95])))
-@pytest.mark.parametrize("look", LOOKS)
-def test_films_that_are_pressed_for_any_share_of_the_time_are_decided_and_not_inverted(look, number, share):
-    frames, contact = press_film(look, share, SHAPES[(number + LOOKS.index(look)) % len(SHAPES)])
+@pytest.mark.parametrize("share", [0.1, 0.95])
+@pytest.mark.parametrize(("look", "shape"), list(zip(LOOKS, SHAPES, strict=True)))
+def test_films_that_are_pressed_for_any_share_of_the_time_are_decided_and_not_inverted(look, shape, share):
+    frames, contact = press_film(look, share, shape)
     gel, _ = estimate(frames)
     assert gel is not None and gel.has_dots == (look == "dotted")
     predicted = np.array([gel.score(frame) for frame in frames]) > THRESHOLDS[SENSORS[look]]
@@ -33,8 +33,7 @@ def test_a_film_that_is_always_free_or_always_pressed_is_undecided(look, depth):
     assert gel is None and "always" in reason
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize(("look", "shape"), list(zip(LOOKS, SHAPES, strict=True)))
 def test_a_press_that_moves_and_gets_deeper_and_never_ends_is_undecided(look, shape):
     frames, _ = press_film(look, 1.0, shape, 20)  # its lightest frames look like the untouched gel of the others
     assert estimate(frames)[0] is None

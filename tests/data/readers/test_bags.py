@@ -21,28 +21,22 @@ START = 5_000_000_000
 
 def ros_messages(store, *, ros1: bool):
     """(topic, type, time, message): four pictures with a padded row, and a force that is late for the last."""
-    kinds = store.types
-    Image, Header, Time = (
-        kinds[n] for n in ("sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
-    )
-    Wrench, Vector, Stamped = (
-        kinds[f"geometry_msgs/msg/{name}"] for name in ("Wrench", "Vector3", "WrenchStamped")
-    )  # fmt: skip
+    names = "sensor_msgs/Image std_msgs/Header builtin_interfaces/Time geometry_msgs/Wrench geometry_msgs/Vector3"
+    types = [store.types[name.replace("/", "/msg/")] for name in [*names.split(), "geometry_msgs/WrenchStamped"]]
+    Image, Header, Time, Wrench, Vector, Stamped = types
 
     def header(time):
         stamp = Time(sec=time // 10**9, nanosec=time % 10**9)
-        return Header(seq=0, stamp=stamp, frame_id="") if ros1 else Header(stamp=stamp, frame_id="")
+        return Header(stamp=stamp, frame_id="", **{"seq": 0} if ros1 else {})
 
     for i in range(4):
-        time = START + i * 50_000_000
+        time, late = START + i * 50_000_000, 200_000_000 * (i == 3)
         pixels = np.zeros((8, 26), np.uint8)
         pixels[:, :24] = np.tile([10 * i, 0, 200], 8)  # blue, green, red and two bytes of padding
-        message = Image(
-            header=header(time), height=8, width=8, encoding="bgr8", is_bigendian=0, step=26, data=pixels.ravel()
-        )
+        about = {"height": 8, "width": 8, "encoding": "bgr8", "is_bigendian": 0, "step": 26}
+        message = Image(header=header(time), data=pixels.ravel(), **about)
         yield "/gel/left", "sensor_msgs/msg/Image", time + 1_000_000, message
         force = Vector(x=0.0, y=0.0, z=float(i))
-        late = 0 if i < 3 else 200_000_000
         stamped = Stamped(header=header(time + late + 10_000_000), wrench=Wrench(force=force, torque=force))
         yield "/ft", "geometry_msgs/msg/WrenchStamped", time + late + 20_000_000, stamped
 

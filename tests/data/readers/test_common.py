@@ -68,17 +68,6 @@ def test_hash_splits_are_stable_disjoint_and_of_the_wanted_share():
     assert {hash_split("x", f"o{k}", IndexOptions(0, 1)) for k in range(50)} == {"test"}
 
 
-def test_columns_have_a_value_for_every_row_and_a_list_for_every_path(tmp_path):
-    rows = DatasetIndex("x", tmp_path)
-    with pytest.raises(ValueError, match="'frame_index' has 1 values for 2 rows"):
-        DatasetIndex("x", tmp_path).add(["a", "b"], frame_index=[1])
-    rows.add(["a", "b"], sensor="digit", frame_index=[0, 1], unit=None)
-    rows.add(["c"], sensor="digit", object="mug")
-    columns = rows.columns()
-    assert columns["object"] == [None, None, "mug"] and columns["frame_index"] == [0, 1, None]
-    assert "unit" not in columns and columns["split"] == [None] * 3  # a required column stays, to be an error later
-
-
 def test_numbers_order_frames_and_folders_naturally(tmp_path):
     fill(tmp_path, ["f10/x.png", "f9/x.png", "2.png", "10.png", "1.png", "٣.png"])
     rows = DatasetIndex("x", tmp_path)

@@ -7,6 +7,7 @@ import os
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from reader_world import fill
 
 from anytouch_jax.data.images import decode
@@ -14,12 +15,7 @@ from anytouch_jax.data.readers.common import EXPORT_RECORD
 
 
 def film(path, grey, count=5):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    code = cv2.VideoWriter_fourcc(*("MJPG" if path.suffix == ".avi" else "mp4v"))
-    writer = cv2.VideoWriter(str(path), code, 10, (32, 32))
-    for _ in range(count):
-        writer.write(np.full((32, 32, 3), grey, np.uint8))
-    writer.release()
+    write_film(path, (np.full((32, 32, 3), grey, np.uint8) for _ in range(count)))
 
 
 def greys(table, root):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import pickle
 
-import cv2
 import numpy as np
 import pytest
+from films import write_film
 from reader_world import fill
 
 from anytouch_jax.data.images import decode
@@ -96,14 +96,9 @@ def test_forces_of_touchd(read, tmp_path):
 
 
 def test_films_of_freetacman(read, tmp_path):
-    (tmp_path / "Cast").mkdir()
     for camera in ("front", "tactile_left"):
-        film = cv2.VideoWriter(
-            str(tmp_path / f"Cast/Cast_1_{camera}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, (32, 32)
-        )
-        for i in range(5):
-            film.write(np.full((32, 32, 3), 40 * i, np.uint8))
-        film.release()
+        frames = [np.full((32, 32, 3), 40 * i, np.uint8) for i in range(5)]
+        write_film(tmp_path / f"Cast/Cast_1_{camera}.mp4", frames, 30)
     times = tmp_path / "Cast" / "Cast_1_tactile_left_timestamps.txt"
     times.write_text("".join(f"{100 + i / 30}\n" for i in range(5)))
     poses = "".join(f"{i},{0.1 * i},{40 - i},up\n" for i in range(5))

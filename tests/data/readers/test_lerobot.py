@@ -7,11 +7,11 @@ import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from films import write_film
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.images import decode, frames_from_video
@@ -35,57 +35,35 @@ def make(root):
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
     }  # fmt: skip
-    (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
+    for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
+        (root / folder).mkdir(parents=True)
     (root / "meta" / "info.json").write_text(json.dumps(info))
-    pa.parquet.write_table(
-        pa.table({"task_index": [0, 1], "__index_level_0__": ["press", "slide"]}), root / "meta" / "tasks.parquet"
-    )
-    rows, films, episodes = {0: [], 1: []}, {0: [], 1: []}, []
+    tasks = pa.table({"task_index": [0, 1], "__index_level_0__": ["press", "slide"]})
+    pa.parquet.write_table(tasks, root / "meta" / "tasks.parquet")
+    rows, episodes = {0: [], 1: []}, []
     for episode, length in enumerate(LENGTHS):
-        home = 0 if episode < 2 else 1  # file of data and of film
-        first = len(films[home])
-        episodes.append(
-            {
-                "episode_index": episode,
-                "length": length,
-                "data/chunk_index": 0,
-                "data/file_index": home,
-                **{
-                    f"videos/{key}/{end}": value
-                    for key in (FILM, SCENE)
-                    for end, value in (
-                        ("chunk_index", 0),
-                        ("file_index", home),
-                        ("from_timestamp", first / FPS),
-                        ("to_timestamp", (first + length) / FPS),
-                    )
-                },
-                "stats/x": [0.5],
-            }
-        )
+        home = episode // 2  # file of data and of film
+        first = len(rows[home])
+        place = {"chunk_index": 0, "file_index": home}
+        film = place | {"from_timestamp": first / FPS, "to_timestamp": (first + length) / FPS}
+        about = {"episode_index": episode, "length": length, "stats/x": [0.5]}
+        about |= {f"data/{end}": value for end, value in place.items()}
+        about |= {f"videos/{key}/{end}": value for key in (FILM, SCENE) for end, value in film.items()}
+        episodes.append(about)
         for frame in range(length):
             number = sum(LENGTHS[:episode]) + frame
-            films[home].append(20 * number)
-            picture = {"bytes": png(10 * number), "path": None}
             rows[home].append({
-                GEL: picture, "observation.force": [float(number), -1.0], "timestamp": frame / FPS,
-                "frame_index": frame, "episode_index": episode, "index": number, "task_index": episode % 2,
+                GEL: {"bytes": png(10 * number), "path": None}, "observation.force": [float(number), -1.0],
+                "timestamp": frame / FPS, "frame_index": frame, "episode_index": episode, "index": number,
+                "task_index": episode % 2,
             })  # fmt: skip
-    pa.parquet.write_table(
-        pa.Table.from_pylist(episodes), root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
-    )
-    for home in (0, 1):
+    pa.parquet.write_table(pa.Table.from_pylist(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
+    for home, own in rows.items():
+        frames = [np.full((32, 32, 3), 20 * row["index"], np.uint8) for row in own]
         for key in (FILM, SCENE):
-            target = root / "videos" / key / "chunk-000" / f"file-{home:03d}.mp4"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            film = cv2.VideoWriter(str(target), cv2.VideoWriter_fourcc(*"mp4v"), FPS, (32, 32))
-            for value in films[home]:
-                film.write(np.full((32, 32, 3), value, np.uint8))
-            film.release()
-        target = root / "data" / "chunk-000" / f"file-{home:03d}.parquet"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        table = pa.Table.from_pylist(rows[home]).replace_schema_metadata({b"huggingface": b"{}"})
-        pa.parquet.write_table(table, target)
+            write_film(root / "videos" / key / "chunk-000" / f"file-{home:03d}.mp4", frames, FPS)
+        table = pa.Table.from_pylist(own).replace_schema_metadata({b"huggingface": b"{}"})
+        pa.parquet.write_table(table, root / "data" / "chunk-000" / f"file-{home:03d}.parquet")
     return root
 
 
@@ -201,15 +179,8 @@ def test_columns_of_two_cameras_are_written_with_their_statistics_or_not_at_all(
     assert stats.pop("observation.force") == {"mean": [0.5]} and stats.keys() == columns.keys()
     tables = [pa.parquet.read_table(path) for path in sorted((root / "data").rglob("*.parquet"))]
     for name, (x, _) in columns.items():
-        wanted = {
-            "min": x.min(0),
-            "max": x.max(0),
-            "mean": x.mean(0),
-            "std": x.std(0),
-            "q50": np.median(x, 0),
-            "count": 9,
-        }
-        for key, value in wanted.items():
+        wanted = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0), "q50": np.median(x, 0)}
+        for key, value in (wanted | {"count": 9}).items():
             np.testing.assert_allclose(stats[name][key], np.atleast_1d(value), atol=1e-6)
         assert {"q01", "q10", "q90", "q99"} < stats[name].keys()
         written = np.concatenate([np.stack(table[name].to_pylist()) for table in tables])
@@ -291,10 +262,7 @@ def test_films_recorded_again_replace_their_pictures(root):
     _, before = rows_of(root, export=True, keys=(FILM,))
     grey = {row["path"]: int(decode(root / row["path"])[0, 0, 0]) for row in before}
     film = root / "videos" / FILM / "chunk-000" / "file-000.mp4"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"mp4v"), FPS, (32, 32))
-    for _ in range(9):
-        writer.write(np.full((32, 32, 3), 250, np.uint8))
-    writer.release()
+    write_film(film, (np.full((32, 32, 3), 250, np.uint8) for _ in range(9)), FPS)
     _, after = rows_of(root, export=True, keys=(FILM,))
     for row in after:
         shown = int(decode(root / row["path"])[0, 0, 0])

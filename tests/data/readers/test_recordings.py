@@ -7,11 +7,10 @@ import os
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from reader_world import fill
 
 from anytouch_jax.data.images import decode
-from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.manifest import replace_column
 from anytouch_jax.data.readers import IndexOptions, index
 from anytouch_jax.data.readers.recordings import ranked_split
 from anytouch_jax.errors import UserError
@@ -62,15 +61,6 @@ def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
     assert "too few objects or recordings for split test" in " ".join(
         read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0.001).report.notes
     )
-
-
-def test_an_object_is_never_on_two_sides(tmp_path, read):
-    fill(tmp_path, [f"thing {n}/take {k}/0.png" for n in range(30) for k in range(3)])
-    table = read("recordings", sensor="digit", val=0.3, test=0.3)
-    sides = {}
-    for row in table.rows.values():
-        sides.setdefault(row["object"], set()).add(row["split"])
-    assert all(len(one) == 1 for one in sides.values()) and set.union(*sides.values()) == {"train", "val", "test"}
 
 
 def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, read):
@@ -195,11 +185,7 @@ def test_the_side_may_stand_anywhere_in_the_name(tmp_path, read, form, sides):
 
 
 def _film(path, frames=5):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 32))
-    for number in range(frames):
-        writer.write(np.full((32, 32, 3), (200, 20 * number, 10), np.uint8))  # blue first
-    writer.release()
+    write_film(path, (np.full((32, 32, 3), (200, 20 * number, 10), np.uint8) for number in range(frames)))
 
 
 def test_videos_become_folders_of_pictures_whole_or_not_at_all(tmp_path, read, monkeypatch):
@@ -350,19 +336,3 @@ def test_what_is_no_recording(tmp_path, read):
     assert [path for path in table.rows if "mug" in path] == ["mug/1700000000.1234567.png", "mug/1700000000.5.png"]
     assert table.reasons == {"folder called background or photo, where one picture is expected": 1}
     assert set(table["sequence"]) == {".", "mug", tmp_path.name}
-
-
-@pytest.fixture
-def edited(tmp_path, read):
-    """edited(ending): the manifest of two objects, to which somebody added label.material and changed a split."""
-
-    def make(ending):
-        fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
-        out = tmp_path / f"hand{ending}"
-        table = read("recordings", out=out, sensor="digit", val=0, test=0).manifest
-        split = ["test" if path.startswith("mug") else "train" for path in table.column("path").to_pylist()]
-        material = [None, *["clay"] * 5]
-        manifests.write(replace_column(replace_column(table, "split", split), "label.material", material), out)
-        return out
-
-    return make

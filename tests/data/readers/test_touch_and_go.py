@@ -54,13 +54,15 @@ def test_label_txt_adds_contact_frames_without_a_label(tmp_path, read):
     assert _at(table, 20)["sequence"] != _at(table, 14)["sequence"]  # not a frame of a listed touch
 
 
-def test_minus_one_is_no_label(tmp_path, read):
+def test_minus_one_is_no_label_and_background_lists_and_windows_line_ends_are_read(tmp_path, read):
     _tree(tmp_path)
-    _list(tmp_path, "train.txt", [(14, -1), (15, 0)])
-    _list(tmp_path, "test.txt", [(20, 1)])
+    lines = [f"{VIDEO}/{14:010d}.jpg,-1", f"{VIDEO}/{15:010d}.jpg,0", ""]
+    (tmp_path / "train.txt").write_bytes(b"\xef\xbb\xbf" + "\r\n".join(lines).encode())
+    (tmp_path / "test_bg.txt").write_text(f"{VIDEO}/{20:010d}.jpg,5,{16:010d}.jpg\n")
     table = read("touch_and_go")
+    assert table.report.splits == {"train": 2, "test": 1} and _at(table, 15)["label.material"] == 0
     assert (_at(table, 14)["label.material"], _at(table, 14)["label.hardness"]) == (None, None)
-    assert _at(table, 15)["label.material"] == 0
+    assert _at(table, 20)["background_path"].endswith(f"{16:010d}.jpg")
 
 
 def test_the_task_decides_the_split_and_the_other_test_is_marked(tmp_path, read):
@@ -74,15 +76,6 @@ def test_the_task_decides_the_split_and_the_other_test_is_marked(tmp_path, read)
     assert _at(rough, 24)["downstream_test"] == "material"
     clips = rough.clips(3)
     assert all(len({rough.rows[path]["split"] for path in clip}) == 1 for clip in clips)
-
-
-def test_background_lists_and_windows_line_ends_are_read(tmp_path, read):
-    _tree(tmp_path)
-    (tmp_path / "train.txt").write_bytes(b"\xef\xbb\xbf" + f"{VIDEO}/{14:010d}.jpg,3\r\n\r\n".encode())
-    (tmp_path / "test_bg.txt").write_text(f"{VIDEO}/{20:010d}.jpg,5,{16:010d}.jpg\n")
-    table = read("touch_and_go")
-    assert table.report.splits == {"train": 1, "test": 1}
-    assert _at(table, 20)["background_path"].endswith(f"{16:010d}.jpg")
 
 
 def test_what_is_missing_is_counted(tmp_path, read):
@@ -111,6 +104,8 @@ def test_lists_may_be_elsewhere(tmp_path, read):
     assert len(read("touch_and_go", root, lists=lists).rows) == 2
     with pytest.raises(UserError, match=r"expected the list train.txt in .*fredfyyang/Touch-and-Go"):
         read("touch_and_go", root)
+    with pytest.raises(UserError, match=r"expected dataset/.*is ROOT the folder that holds 'dataset'"):
+        read("touch_and_go", root / "dataset")
 
 
 @pytest.mark.parametrize(
@@ -127,12 +122,6 @@ def test_broken_lists_name_the_line(tmp_path, read, name, line, says):
         file.write(line + "\n")
     with pytest.raises(UserError, match=says):
         read("touch_and_go")
-
-
-def test_another_folder_is_refused(tmp_path, read):
-    _both(tmp_path)
-    with pytest.raises(UserError, match=r"expected dataset/.*is ROOT the folder that holds 'dataset'"):
-        read("touch_and_go", tmp_path / "dataset")
 
 
 def test_frames_of_a_touch_that_is_tested_are_not_trained_on(tmp_path, read):

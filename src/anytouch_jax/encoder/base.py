@@ -225,6 +225,8 @@ class Encoder:
 
     def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Exported | None:
         """Return the export on its engine for touches of `frames` frames, None if XLA computes them."""
+        if self.engine == "xla":
+            return None
         refuse_forked()
         key = ("exported", frames, pooling, fields)
         if key not in self._compiled:

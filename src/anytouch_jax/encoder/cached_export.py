@@ -37,7 +37,7 @@ def cached_export(encoder: Encoder, frames: int, pooling: Pooling, *, fields: bo
     raises UserError if it is not installed, for bfloat16, and CheckError if the export differs.
     """
     engine, model, is_auto = encoder.engine, encoder.config.model, encoder.engine == "auto"
-    if engine == "xla" or frames not in (1, model.frames):
+    if frames not in (1, model.frames):
         return None
     if is_auto and (jax.default_backend() != "cpu" or model.dtype != "float32" or _count(encoder) > LARGEST):
         return None

@@ -314,7 +314,7 @@ def _worst(
         else:
             live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
             exported = np.asarray(run(clips, rows))
-        if exported.shape != live.shape or not np.isfinite(exported).all():
+        if exported.shape != live.shape or not (np.isfinite(exported).all() and np.isfinite(live).all()):
             raise CheckError(f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite")
         worst = max(worst, float(np.abs(exported - live).max() / np.abs(live).max()))
         width = live.shape[1]

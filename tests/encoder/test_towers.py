@@ -98,7 +98,7 @@ def test_the_matching_head_of_a_run(encoder, stored):
 
 
 def test_towers_go_to_the_device_only_when_they_are_called(stored):
-    encoder = load_encoder(stored.run)
+    encoder = load_encoder(stored.run, engine="xla")
     encoder.encode_touch(STILLS, "digit")
     assert set(encoder._compiled) == {("class", "mean")} and set(encoder.params) == {"touch"}
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(encoder.others["text"]))

@@ -31,10 +31,10 @@ FOLDER = ".engines"  # next to the weights
 def cached_export(encoder: Encoder, frames: int, pooling: Pooling, *, fields: bool = False) -> Exported | None:
     """Return the export of touches of `frames` frames on the encoder's engine, None where XLA computes.
 
-    "auto" is onnxruntime, if it is installed, jax runs on a CPU, the encoder computes in float32 and has at most
-    LARGEST parameters, and the export differs from the live model by at most 1e-5. Clips of more than one segment are
-    computed by XLA. An export that is not whole, or of other weights, is made again. For an engine that was named,
-    raises UserError if it is not installed, for bfloat16, and CheckError if the export differs.
+    "auto" is onnxruntime if it is installed and jax runs on a CPU. The encoder must compute in float32 and have at most
+    LARGEST parameters, and its export must differ from the live model by at most 1e-5. XLA computes clips of more than
+    one segment. An export that is not whole, or of other weights, is made again. For an engine that was named, raises
+    UserError if it is not installed and for bfloat16, and CheckError if the export differs.
     """
     engine, model, is_auto = encoder.engine, encoder.config.model, encoder.engine == "auto"
     if frames not in (1, model.frames):

@@ -131,8 +131,8 @@ bench-torch: $(TORCH)/.made
 bench-torch: $(STAMP) ## next to PyTorch, in a separate venv: [PRESET= BATCH= OUT= WHAT=]
 	$(PY) -m experiments.benchmarks.pytorch.run $(WHAT) --torch $(TORCH)/bin/python --preset $(PRESET)$(if $(BATCH), --batch $(BATCH))$(if $(OUT), --out $(OUT))
 
-bench-gpu: ## ViT-L on an accelerator: PYTHON= with jax, flax, optax, numpy; nothing is installed [BATCH= OUT= WHAT=]
-	$(PYTHON) -m experiments.benchmarks.run $(if $(WHAT),$(WHAT),stage1 stage2 embed) --preset large --batch $(if $(BATCH),$(BATCH),64)$(if $(OUT), --out $(OUT))
+bench-gpu: ## simulation, tiny and ViT-L on an accelerator in four minutes: PYTHON= with jax, flax, optax, numpy [OUT=]
+	$(PYTHON) -m experiments.benchmarks.gpu$(if $(OUT), --out $(OUT))
 
 compare: $(STAMP) ## encoders of all families: what they cost, and what your files know: [ENCODERS="a=FILE b=FILE" DATA=manifest LABEL= OUT=runs/compare/compare.jsonl]
 	$(PY) -m experiments.compare.run$(if $(ENCODERS), --encoders $(ENCODERS) --data $(DATA) --label $(LABEL))$(if $(OUT), --out $(OUT))

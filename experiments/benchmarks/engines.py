@@ -109,7 +109,7 @@ def main() -> None:
     options = parser.parse_args()
     table, about = manifests.read(options.corpus), dataclasses.asdict(machine.describe())
     for name in options.encoders:
-        source = load_encoder(name).computed_in("float32")
+        source = load_encoder(name, engine="xla").computed_in("float32")
         shown = name if options.frames == 1 else f"{name}, clips"
         with TemporaryDirectory() as folder:
             several = encoders_on(source, table, options.frames, Path(folder))

@@ -10,6 +10,7 @@ import math
 import os
 import shutil
 import threading
+import time
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -165,6 +166,20 @@ def check_array(name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str
         raise ValueError(f"its {name} is {array.dtype} {array.shape}, not of shape {shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"its {name} has values that are not finite")
+
+
+def cache_folder() -> Path:
+    """Return the user's folder of what can be made again: anytouch_jax under $XDG_CACHE_HOME or ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "anytouch_jax"
+
+
+def remove_old(folder: Path, pattern: str, days: float = 60) -> None:
+    """Remove the files of a folder that match a pattern and were not written or touched for so many days."""
+    old = time.time() - days * 86400
+    for file in folder.glob(pattern):
+        with contextlib.suppress(OSError):  # another process may remove it, or own it
+            if file.stat().st_mtime < old:
+                file.unlink()
 
 
 def part_path(path: Path) -> Path:

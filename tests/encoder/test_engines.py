@@ -11,7 +11,7 @@ from tiny_models import touch_model
 
 from anytouch_jax.config import Config
 from anytouch_jax.encoder import engines
-from anytouch_jax.encoder.encoder import EngineEncoder, load_encoder, on_engine, random_encoder
+from anytouch_jax.encoder.encoder import EngineEncoder, load_encoder, random_encoder
 from anytouch_jax.encoder.export import describes, export, load, read_checked
 from anytouch_jax.errors import CheckError, UserError
 
@@ -120,7 +120,7 @@ def test_what_cannot_be_run_is_one_sentence(exported, encoder, calibration, tmp_
     clips = CLIPS[:, :3]
     for call, word in (
         (lambda: load(exported[0], "xla"), "runs on onnxruntime or openvino, not on xla"),
-        (lambda: on_engine(own, "xla", 3), "runs on onnxruntime or openvino, not on xla"),
+        (lambda: load_encoder(exported[0], engine="xla"), "runs on onnxruntime or openvino, not on xla"),
         (lambda: own.encode_touch(clips, pooling="mean"), "has pooling class, not mean"),
         (lambda: own.encode_touch(CLIPS), r"\(B, 3, 28, 28, 3\)"),
         (lambda: own.computed_in("bfloat16"), "float32 or int8"),
@@ -159,7 +159,8 @@ def test_fields_on_an_engine_are_those_of_the_live_model(tmp_path, frames, pooli
         np.testing.assert_allclose(getattr(two, name), getattr(one, name), rtol=1e-3, atol=1e-4)
     features = [each.encode_touch(CLIPS[:2, :frames], "digit", pooling=pooling) for each in (live, engine)]
     np.testing.assert_allclose(*features, atol=1e-4)
-    plain = on_engine(live, "onnxruntime", frames)
+    export(live, tmp_path / "plain.onnx", frames=frames, form="onnx")
+    plain = load_encoder(tmp_path / "plain.onnx")
     for wrong in (lambda: plain.measure(clips), lambda: export(live, tmp_path / "m.bin", fields=True)):
         with pytest.raises(UserError, match=r"--model\.fields 32|--to onnx"):
             wrong()

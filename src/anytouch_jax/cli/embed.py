@@ -50,6 +50,9 @@ class FrameOptions(SensorOptions):
     join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a long clip are joined.
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """Arithmetic: that of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
+    engine: Literal["auto", "xla", "onnxruntime", "openvino"] = "auto"
+    """What computes the features: onnxruntime if it is installed (extra engines) and exact on this machine, else xla.
+    An export is made for it once."""
     head: Path | None = None
     """Also predict the class with this head of `anytouch probe label --save`: its label, probability p, conformal set
     and whether the touch is novel."""
@@ -118,7 +121,7 @@ def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean"
     head = None if options.head is None else load_head(options.head)
     pooling = options.pooling or ("class" if head is None else head.pooling)
     enable_compilation_cache()
-    encoder = load_encoder(options.model).computed_in(options.dtype)
+    encoder = load_encoder(options.model, engine=options.engine).computed_in(options.dtype)
     if options.sensor is not None:
         check_spelling(options.sensor, encoder.config.model.sensors)
     if str(options.model) == DEFAULT:

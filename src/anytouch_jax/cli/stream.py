@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
@@ -51,9 +51,6 @@ class StreamOptions(CameraOptions, embed.FrameOptions):
     """Camera or video file. A camera is a number such as 0, a part of its name, its serial, /dev/video0, or an address
     http:// or rtsp://. `anytouch info cameras` lists them."""
     out: Path  # The .npz to write, or - for one JSON line per frame on standard output.
-    engine: Literal["xla", "onnxruntime", "openvino"] | None = None
-    """What runs the encoder: xla, or for an .onnx file of `anytouch export` onnxruntime. The others need the extra
-    engines, and export the encoder first."""
     stride: Count[int] = 1  # Frames from one frame of a clip to the next, as in the training data.
     reuse: NotNegative[float] = 0.0
     """Reuse features while no place changes by more than so many times the camera's noise (0: while frames are
@@ -77,7 +74,6 @@ def run(options: StreamOptions) -> int:
     from anytouch_jax.data.images import decode
     from anytouch_jax.encoder import stream
     from anytouch_jax.encoder.embed import Features
-    from anytouch_jax.encoder.encoder import on_engine
 
     source, live = stream.open_source(options.data, settings, log)  # first: it fails within a second
     if not live:
@@ -88,7 +84,6 @@ def run(options: StreamOptions) -> int:
         gel = None if options.background is None else decode(options.background)
         turned: dict[str, Any] = {"rotate": options.rotate, "flip": options.flip}
         measure = encoder.measure_of(options.sensor or UNIVERSAL, gel, options.width_mm, log, **turned)
-    encoder = on_engine(encoder, options.engine, options.frames, pooling, fields=options.fields)
     known = encoder.gels if head is None else head.gels
     row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
     embedded = stream.stream(

@@ -5,11 +5,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable
 from itertools import islice
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from anytouch_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from anytouch_jax.config import ModelConfig
 
 Pooling = Literal["class", "mean", "both"]
 Join = Literal["mean", "sum", "concat"]
@@ -65,6 +68,12 @@ def as_array(values: Any, name: str) -> np.ndarray:
         raise UserError(
             f"{name} must be one array; its parts differ in size, so bring them to one size first"
         ) from None
+
+
+def check_frames(model: ModelConfig, frames: int) -> None:
+    """Raise UserError unless a touch may have `frames` frames: 1 (a still), or at least those of the model's clips."""
+    if frames != 1 and frames < model.frames:
+        raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
 
 
 def filled(batch: np.ndarray) -> np.ndarray:

@@ -29,11 +29,15 @@ from anytouch_jax.encoder.arrays import (
     Pooling,
     as_array,
     check_features,
+    check_frames,
     filled,
     rows_of_sensors,
     run_in_batches,
     warn,
 )
+from anytouch_jax.encoder.cached_export import cached_export
+from anytouch_jax.encoder.engines import EngineChoice
+from anytouch_jax.encoder.export import Exported
 from anytouch_jax.encoder.fields import Fields, Measure, missing, output_of, scale_of
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.nn.attention import usable
@@ -55,6 +59,7 @@ class Encoder:
     is None if the weights do not store them. If training never drew the universal tokens (`universal_drawn`), the mean
     of the trained sensors' tokens is used instead. `others` are the parameters of towers, decoder and heads of the
     `whole` model: they stay on the host until they are used. `tokenizer_file` is None without a tokenizer.json.
+    `engine` computes touch, by `cached_export`; all else is computed by XLA.
     """
 
     config: Config = field(repr=False)
@@ -66,6 +71,7 @@ class Encoder:
     others: Params = field(default_factory=dict, repr=False)
     tokenizer_file: Path | None = field(default=None, repr=False)
     metadata: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    engine: EngineChoice = field(default="xla", repr=False)
 
     def __repr__(self) -> str:
         return described(f"{type(self).__name__} {self.source}", **self.about())
@@ -212,7 +218,20 @@ class Encoder:
                 f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
             )
         check_frames(self.config.model, frames.shape[1])
+        check_choices(pooling, join)
+        if len(frames) and (run := self.exported(frames.shape[1], pooling)) is not None:
+            return run(frames, rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors)))
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
+
+    def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Exported | None:
+        """Return the export on its engine for touches of `frames` frames, None if XLA computes them."""
+        if self.engine == "xla":
+            return None
+        refuse_forked()
+        key = ("exported", frames, pooling, fields)
+        if key not in self._compiled:
+            self._compiled[key] = cached_export(self, frames, pooling, fields=fields)
+        return self._compiled[key]
 
     def _encode(self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any) -> np.ndarray:
         """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled for a few B and `key`s."""
@@ -228,7 +247,7 @@ class Encoder:
         return jax.device_put(self.params)
 
     @cached_property
-    def _compiled(self) -> dict[Any, Callable[..., jax.Array]]:
+    def _compiled(self) -> dict[Any, Any]:
         """What was called: touch by pooling and join, other parts by their method."""
         return {}
 
@@ -327,6 +346,8 @@ class Encoder:
 
         `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over width.
         """
+        if self.measures and (run := self.exported(clips.shape[1], pooling, fields=True)) is not None:
+            return run.measure(clips, rows, aspect)
         if (key := ("fields", pooling)) not in self._compiled:
             net = build(usable(self.whole or self.config.model))
             self._compiled[key] = jax.jit(partial(features_and_fields, net=net, pooling=pooling))
@@ -488,12 +509,6 @@ def precision(config: Config) -> AbstractContextManager[Any]:
     """
     refuse_forked()
     return jax.enable_x64(config.model.dtype == "float64")
-
-
-def check_frames(model: ModelConfig, frames: int) -> None:
-    """Raise UserError unless a touch may have `frames` frames: 1 (a still), or at least those of the model's clips."""
-    if frames != 1 and frames < model.frames:
-        raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
 
 
 def as_clips(frames: Any) -> np.ndarray:

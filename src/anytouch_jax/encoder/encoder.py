@@ -10,10 +10,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,9 +20,9 @@ import numpy as np
 from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import export
-from anytouch_jax.encoder.arrays import METADATA, Join, Pooling, rows_of_sensors
-from anytouch_jax.encoder.base import Encoder, as_clips, check_frames, random_encoder, touch_features, touch_only
-from anytouch_jax.encoder.engines import Engine
+from anytouch_jax.encoder.arrays import METADATA, Join, Pooling, check_frames, rows_of_sensors
+from anytouch_jax.encoder.base import Encoder, as_clips, random_encoder, touch_features, touch_only
+from anytouch_jax.encoder.engines import Engine, EngineChoice
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.encoder.fields import missing
 from anytouch_jax.errors import UserError, refuse_forked
@@ -35,16 +34,19 @@ from anytouch_jax.weights.families import Size, load_family
 
 __all__ = [
     "Encoder", "EngineEncoder", "ExampleTouch", "check_frames", "example_touches", "find_tokenizer", "load_encoder",
-    "load_engine", "on_engine", "random_encoder", "touch_features",
+    "load_engine", "random_encoder", "touch_features",
 ]  # fmt: skip
 FOLDER = Path(__file__).parent / "examples"  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg of the untouched gel
 
 
 def load_encoder(
-    path: str | Path, *, step: int | None = None, heads: int | None = None, image_size: int | Size | None = None
-) -> Encoder:
+    path: str | Path, *, step: int | None = None, heads: int | None = None, image_size: int | Size | None = None,
+    engine: EngineChoice = "auto",
+) -> Encoder:  # fmt: skip
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
+    `engine` computes the features of touch. "auto" is the fastest that is installed and exact, see `cached_export`:
+    onnxruntime on a CPU, else XLA. Gradients, towers and clips of several segments are always computed by XLA.
     An .onnx file of `anytouch export` runs on onnxruntime, see `load_engine`.
     Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, DINOv3, SigLIP, ViT-MAE, ViT, DeiT).
     `heads` is their number of attention heads, where neither the file nor a config.json next to it has it. `image_size`
@@ -63,9 +65,13 @@ def load_encoder(
     if {"features", "rows"} <= names:
         raise UserError(f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`")
     if path.suffix == ".onnx":
-        return load_engine(path)
+        return load_engine(path, None if engine == "auto" else engine)
+    if engine not in (known := ("auto", "xla", "onnxruntime", "openvino")):
+        raise UserError(f"engine is one of {', '.join(known)}, not {engine!r}")
     model, weights = load_family(path, heads=heads, image_size=image_size)
     if model is not None:
+        if engine not in ("auto", "xla"):
+            raise UserError(f"{name} is an encoder of another family, which XLA computes; leave out {engine}")
         return family_encoder(model, name, path)
     if heads is not None or image_size is not None:
         raise UserError(f"{name} stores its heads and image size; leave out heads and image_size")
@@ -73,10 +79,11 @@ def load_encoder(
     if "touch" not in loaded.params:
         raise UserError(f"{name} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
     others = {name: part for name, part in loaded.params.items() if name != "touch"}
-    return Encoder(
+    encoder = Encoder(
         touch_only(loaded.config), {"touch": loaded.params["touch"]}, name, loaded.trained_sensors,
-        loaded.universal_drawn, loaded.config.model, others, find_tokenizer(path), loaded.metadata,
+        loaded.universal_drawn, loaded.config.model, others, find_tokenizer(path), loaded.metadata, engine,
     )  # fmt: skip
+    return encoder if engine in ("auto", "xla") else encoder.computed_in("float32")
 
 
 @dataclass(frozen=True, repr=False)
@@ -136,23 +143,6 @@ def load_engine(path: str | Path, engine: Engine | None = None) -> EngineEncoder
     sensors = trained and tuple(map(str, trained))
     metadata = {METADATA: run.about.get("fields", {}).get("calibration", {})}
     return EngineEncoder(config, {}, str(path), sensors, run.about["universal_drawn"], metadata=metadata, run=run)
-
-
-def on_engine(
-    encoder: Encoder, engine: Engine | None, frames: int, pooling: Pooling = "class", *, fields: bool = False
-) -> Encoder:
-    """Return the same encoder on an engine, exported for touches of `frames` frames; None leaves it where it is.
-
-    With `fields` it measures too.
-    """
-    if isinstance(encoder, EngineEncoder):
-        return encoder if engine is None else load_engine(encoder.source, engine)
-    if engine in (None, "xla"):
-        return encoder
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "encoder.onnx"
-        export.export(encoder, path, frames=frames, pooling=pooling, form="onnx", fields=fields)
-        return replace(load_engine(path, engine), source=encoder.source)
 
 
 def find_tokenizer(path: Path) -> Path | None:

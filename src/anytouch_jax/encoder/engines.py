@@ -6,6 +6,7 @@ of `nn.touch`.
 
 from __future__ import annotations
 
+import importlib
 import operator
 import os
 import sys
@@ -25,6 +26,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.ops.fields import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE, FieldOutput
 
 Engine = Literal["xla", "onnxruntime", "openvino"]
+EngineChoice = Engine | Literal["auto"]
 CALIBRATION = 200  # touches that the ranges of int8 are measured on
 OPSET = 20  # the first with Gelu
 _BLOCK = "block"  # start of the names of nodes in blocks
@@ -263,6 +265,15 @@ def quantised(data: bytes, touches: np.ndarray, rows: np.ndarray) -> bytes:
         return out.read_bytes()
 
 
+def imported(engine: Engine) -> Any:
+    """Return the package of an engine. Raises UserError if it is not installed."""
+    if engine == "openvino":
+        silenced: dict[str, Any] = {"openvino_telemetry": None}  # it forks, to report what is run
+        sys.modules.update(silenced)
+    with _needed("openvino" if engine == "openvino" else "anytouch_jax[engines]"):
+        return importlib.import_module(engine)
+
+
 def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[..., Any]:
     """Return the function of an ONNX model on an engine: touches u8, sensor rows i32 (B,) to features f32 (B, E).
 
@@ -270,21 +281,16 @@ def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[..., Any]:
     core that the process may use, in float32. Raises UserError for an engine that is not installed.
     """
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    package = imported(engine)
     if engine == "openvino":
-        silenced: dict[str, Any] = {"openvino_telemetry": None}  # it forks, to report what is run
-        sys.modules.update(silenced)
-        with _needed("openvino"):
-            import openvino
-        core = openvino.Core()
+        core = package.Core()
         settings = {"INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": "f32"}
         model = core.compile_model(core.read_model(data), "CPU", settings)
         names = [output.get_any_name() for output in model.outputs]
         return _call(names, lambda given: [np.asarray(value) for value in model(given).values()])
-    with _needed("anytouch_jax[engines]"):
-        import onnxruntime
-    options = onnxruntime.SessionOptions()
+    options = package.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = threads, 3
-    running = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    running = package.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     names = [output.name for output in running.get_outputs()]
     return _call(names, lambda given: running.run(names, given))
 

@@ -29,6 +29,7 @@ from anytouch_jax.encoder.arrays import (
     Join,
     Pooling,
     as_array,
+    check_frames,
     filled,
     rows_of_sensors,
     run_in_batches,
@@ -179,18 +180,17 @@ def export(
     encoder: Encoder, path: str | Path, *, frames: int = 1, platforms: Sequence[str] = ("cpu", "cuda"),
     pooling: Pooling = "class", join: Join = "mean", form: Literal["jax", "onnx"] = "jax",
     calibration: tuple[np.ndarray, np.ndarray] | None = None, gels: Mapping[str, np.ndarray] | None = None,
-    fields: bool = False,
+    fields: bool = False, engine: Engine = "onnxruntime",
 ) -> dict[str, Any]:  # fmt: skip
     """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
 
-    The artefact is first called with 1 and 5 touches and compared with the live model. ONNX is float32, for CPUs. With
-    `calibration`, touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), its linear layers become int8 after the
-    comparison. `gels` are pictures of the untouched gel of their units, for the description. With `fields`, ONNX has
-    the outputs of `nn.fields` too. Raises CheckError if they differ, UserError for what ONNX is not written for and if
-    it cannot be compared on this machine, OSError for a full disk.
+    The artefact is first called with 1 and 5 touches and compared with the live model by XLA. ONNX is float32, for
+    CPUs, and compared on `engine`. With `calibration`, touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), its
+    linear layers become int8 after the comparison. `gels` are pictures of the untouched gel of their units, for the
+    description. With `fields`, ONNX has the outputs of `nn.fields` too. Raises CheckError if they differ, UserError for
+    what ONNX is not written for and if it cannot be compared on this machine, OSError for a full disk.
     """
-    from anytouch_jax.encoder.base import check_frames
-
+    encoder = replace(encoder, engine="xla")
     if form == "onnx":
         encoder, platforms = encoder.computed_in("float32"), (_here(),)
         if encoder.blank.dtype != np.uint8:
@@ -213,7 +213,7 @@ def export(
     with jax.enable_x64(model.dtype == "float64"):
         if form == "onnx":
             data = engines.touch_graph(params, model, frames, pooling)
-            run: Any = engines.session(data)
+            run: Any = engines.session(data, engine)
         else:
             data = _artefact(plain, frames, platforms, pooling, join)
             run = jax.jit(jax_export.deserialize(bytearray(data)).call)
@@ -314,7 +314,7 @@ def _worst(
         else:
             live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
             exported = np.asarray(run(clips, rows))
-        if exported.shape != live.shape or not np.isfinite(exported).all():
+        if exported.shape != live.shape or not (np.isfinite(exported).all() and np.isfinite(live).all()):
             raise CheckError(f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite")
         worst = max(worst, float(np.abs(exported - live).max() / np.abs(live).max()))
         width = live.shape[1]

@@ -256,7 +256,7 @@ def compile_for_one(
     if measures:
         encoder.encode_and_measure(touch, row, np.zeros(1, np.float32), pooling)
         return lambda clip, aspect: encoder.encode_and_measure(clip, row, aspect, pooling)
-    if isinstance(encoder, EngineEncoder):
+    if isinstance(encoder, EngineEncoder) or encoder.exported(frames, pooling) is not None:
         call = partial(encoder.encode_touch, sensor=np.full(1, sensor), pooling=pooling, join=join)
         call(touch)
         return call

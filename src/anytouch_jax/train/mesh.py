@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +12,11 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from anytouch_jax.errors import ConfigError
+from anytouch_jax.files import cache_folder, remove_old
 from anytouch_jax.train.optim import SMALL
 
 Tree = Any
 BATCH_AXES = ("data", "fsdp")
-CACHE_DAYS = 60  # age at which a compiled program is removed
 
 
 def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None) -> Mesh:
@@ -115,20 +112,14 @@ def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
 def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
     """Keep compiled programs on disk for the next start. Return the folder, or None if it cannot be made.
 
-    The default is anytouch_jax under $XDG_CACHE_HOME or ~/.cache. Programs older than CACHE_DAYS are removed.
+    The default is `cache_folder`. Programs older than 60 days are removed.
     """
-    if folder is None:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "anytouch_jax"
-    folder = Path(folder)
+    folder = cache_folder() if folder is None else Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return None
-    old = time.time() - CACHE_DAYS * 86400
-    for file in folder.glob("*-cache"):
-        with contextlib.suppress(OSError):  # another process may remove it, or own it
-            if file.stat().st_mtime < old:
-                file.unlink()
+    remove_old(folder, "*-cache")
     jax.config.update("jax_compilation_cache_dir", str(folder))
     compilation_cache.reset_cache()  # a program compiled before would have switched the cache off
     return folder

@@ -26,7 +26,7 @@ function showLive(source, about) {
   const canvas = el("canvas", { role: "img", ariaLabel: "live picture" }), curves = el("section", { className: "time" });
   const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
-  const pictures = about.table === null ? null : framesOf(about.table, "frame", true);
+  const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
   const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
   let stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
   let recorded = new Pictures(`${source}/recorded`, "frame", true);
@@ -123,7 +123,7 @@ function showLive(source, about) {
   const show = async (one, jpeg) => {
     if (one.error) { say(one.error, true); return; }
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
-    paint(canvas, bitmap);
+    showLayer(canvas, bitmap, one.layer === "surface");
     bitmap.close();
     const age = performance.timeOrigin + performance.now() - one.grabbed;
     ages.push(age);
@@ -136,6 +136,7 @@ function showLive(source, about) {
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
     draws.forEach((draw) => draw());
     feel(one);
+    force.show(one.fields, one.layer === "surface");
     hidden.hidden = one.layer === state.layer;
     record.textContent = recording ? `Recording ${one.recording.name}: ${one.recording.written} frames` : "Hold to record";
     record.classList.toggle("on", recording);
@@ -194,7 +195,7 @@ function showLive(source, about) {
     background, el("button", { onclick: () => send({ do: "no background" }) }, "Estimate it again")), facts));
   main.replaceChildren(el("div", { className: "split live" },
     el("div", { className: "column" }, el("div", { className: "bar" }, el("h2", {}, state.sources[source].name), el("div", { className: "push" }, layers.node)),
-      el("div", { className: "stage" }, canvas), hidden, curves, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
+      stage(canvas), hidden, force.node, curves, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
     panel), more);
   keys([["r", "hold to record", () => { if (!state.repeated) begin(); }], ["l", "next layer", layers.next], ["b", "capture the untouched gel", () => background.click()]]);
   document.addEventListener("keyup", lifted);

@@ -6,7 +6,7 @@ const COLOURS = ["#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377
   "#4b7d2c", "#888888"];
 const RATE = 10, AHEAD = 6, KEPT = 900; // frames a second of recordings, frames read ahead, pictures in memory
 const DASHES = [[], [7, 3], [2, 3], [9, 3, 2, 3]]; // lines differ by more than their colour
-const LAYERS = { frame: "Picture", difference: "Difference", contact: "Contact", depth: "Depth" };
+const LAYERS = { frame: "Picture", difference: "Difference", contact: "Contact", depth: "Depth", surface: "Surface" };
 const main = document.getElementById("main"), tabs = document.getElementById("tabs");
 const state = { sources: [], stop: () => {}, keys: {}, layer: "frame", token: new URLSearchParams(location.hash.slice(1)).get("token") };
 
@@ -104,6 +104,8 @@ class Pictures {
     const response = await api(`${this.path}/${row}?layer=${layer}`), score = response.headers.get("X-Score");
     one.bitmap = await createImageBitmap(await response.blob());
     one.score = score ? Number(score) : null;
+    one.fields = JSON.parse(response.headers.get("X-Fields"));
+    one.isSurface = layer === "surface" && one.fields !== null;
     one.ready = true;
   }
   image(row, ariaLabel) {
@@ -224,9 +226,9 @@ function describe(clip, title) {
 
 function clipCard(source, clip, pictures, title) {
   const canvas = el("canvas", { role: "img", ariaLabel: `touch by ${clip.sensor ?? "this sensor"}` });
-  const contact = el("span", { className: "soft" }), scores = clip.rows.map(() => null);
-  const node = el("section", { className: "clip" }, el("div", { className: "stage" }, canvas),
-    el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), describe(clip, title));
+  const contact = el("span", { className: "soft" }), scores = clip.rows.map(() => null), force = forceBar(), measured = {};
+  const node = el("section", { className: "clip" }, stage(canvas),
+    el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), force.node, describe(clip, title));
   if (clip.photo) {
     guard(async () => {
       const image = await picture(`${source}/photo/${clip.rows[0]}`, "photograph of the object");
@@ -237,15 +239,17 @@ function clipCard(source, clip, pictures, title) {
     const at = Math.min(t, clip.rows.length - 1), one = pictures.get(clip.rows[at]);
     if (!one.ready) await one.wait;
     if (one.score !== undefined) scores[at] = one.score;
+    for (const [name, value] of Object.entries(one.fields?.curves ?? {})) (measured[name] ??= clip.rows.map(() => null))[at] = value;
     return one;
   };
   const show = async (t) => {
     for (let next = t + 1; next <= Math.min(t + AHEAD, clip.rows.length - 1); next++) pictures.get(clip.rows[next]);
     const one = await load(t), score = one.score ?? null;
-    if (one.bitmap) paint(canvas, one.bitmap);
+    if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface);
+    force.show(one.fields, one.isSurface);
     contact.textContent = one.error ?? (score === null ? (clip.rows.length > 1 ? "\u00a0" : "") : score > clip.threshold ? "● contact" : "○ no contact");
   };
-  return { node, clip, scores, load, show };
+  return { node, clip, scores, measured, load, show };
 }
 
 // One time axis: the slider, and a curve below it for everything that was measured.
@@ -253,7 +257,7 @@ function timeline(cards, length, seek) {
   const slider = el("input", { type: "range", min: 0, max: length - 1, value: 0, ariaLabel: "frame", oninput: () => seek(Number(slider.value)) });
   const playing = el("button", {}, "Play"), clock = el("span", { className: "soft" }), curves = el("div", { className: "time" });
   const node = el("section", {}, el("div", { className: "time scrub" }, playing, slider, clock), curves);
-  const names = new Set(cards.flatMap((one) => Object.keys(one.clip.curves))), rows = [];
+  const names = new Set(cards.flatMap((one) => Object.keys(one.clip.curves))), rows = [], added = new Set();
   const value = (number) => (number === null || number === undefined ? "" : Number(number.toPrecision(3)).toString());
   const addRow = (name, of, level) => {
     const canvas = el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), now = el("span");
@@ -276,6 +280,10 @@ function timeline(cards, length, seek) {
   const draw = (t) => {
     slider.value = t;
     clock.textContent = `${t + 1} / ${length}`;
+    for (const name of cards.flatMap((one) => Object.keys(one.measured)).filter((one) => !added.has(one))) {
+      addRow(`measured ${name}`, (one) => one.measured[name] ?? [null], null);
+      added.add(name);
+    }
     if (length > 1) rows.forEach((row) => row(t));
   };
   return { node, playing, draw };
@@ -351,7 +359,13 @@ function showTable(source, about, start = 0) {
   const same = (name) => String(about.filters[name]) === String(about.filters[name.replace("label.", "")]);
   Object.keys(about.filters).filter((name) => !name.startsWith("label.") || !same(name)).forEach((name) => addFilter(name, about.filters[name]));
   const step = (by) => () => { if (count) go((place + by + count) % count); };
-  const layers = layerBar(about.layers, () => move(t));
+  const layers = layerBar(about.layers, guard(async () => {
+    const slow = setTimeout(() => say("Opening the encoder. This takes some seconds."), 500);
+    await move(t);
+    clearTimeout(slow);
+    say("");
+    if (length > 1) await measure(asked);
+  }));
   const turning = el("div", { className: "bar push", hidden: true }, el("button", { onclick: step(-1), ariaLabel: "previous touch" }, "←"), number, total,
     el("button", { onclick: step(1), ariaLabel: "next touch" }, "→"));
   filterBox.hidden = !filterBar.children.length;

@@ -325,11 +325,12 @@ def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) 
     height, width = frame.shape[:2]
     one = measured[row].at(height, width)
     level, _ = depth_levels(one.depth[0], one.width_mm)
-    colours = cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1]
-    share = (0.7 * np.clip(level / 64, 0, 1))[..., None]
-    view = np.ascontiguousarray((frame * (1 - share) + colours * share).astype(np.uint8))
+    colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    share = np.minimum(level, 64) * np.float32(0.7 / 64)
+    view = cv2.blendLinear(np.ascontiguousarray(frame), colours, 1 - share, share)
     inside = (one.contact[0] > 0.5).astype(np.uint8)
-    cv2.drawContours(view, cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0], -1, (255, 255, 255))
+    rims = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    cv2.drawContours(view, rims, -1, (255, 255, 255), 1, cv2.LINE_AA)
     step, long = max(min(height, width) // 14, 1), 4 * width / (one.width_mm or 1.0)  # arrows four times their length
     for y in range(step // 2, height, step):
         for x in range(step // 2, width, step):

@@ -2,6 +2,7 @@
 // What was measured: the surface of the gel, which can be turned, and force and depth as a bar and in words.
 
 const VIEW = [640, 440], LIFT = 0.25; // pixels of the view; height of the deepest place, in widths of the picture
+const REACH = { "force, N": [0, 1], "depth, mm": [0, 0.2], "depth, widths": [0, 0.01], slip: [0, 1] }; // of their curves at least
 const turned = { about: -0.5, tilt: 0.95 }; // radians, for all surfaces
 
 // Heights from a grey picture. They are smoothed, as its 256 steps are no edges.
@@ -29,9 +30,9 @@ function drawSurface(canvas) {
   for (let i = 0; i < count; i++) {
     const column = i % width, row = (i - column) / width, at = (r, c) => heights[Math.min(Math.max(r, 0), height - 1) * width + Math.min(Math.max(c, 0), width - 1)];
     const [right, down, nearer] = turn((column + 0.5) / width - 0.5, (row + 0.5 - height / 2) / width, LIFT * heights[i]);
-    const scale = (0.66 * wide * 2.4) / (2.4 - nearer) * Math.min(1, width / height);
+    const scale = (0.53 * wide * 2.4) / (2.4 - nearer) * Math.min(1, width / height);
     x[i] = wide / 2 + scale * right;
-    y[i] = 0.55 * tall + scale * down;
+    y[i] = 0.53 * tall + scale * down;
     z[i] = nearer;
     const a = -LIFT * width * (at(row, column + 1) - at(row, column - 1)) / 2, b = -LIFT * width * (at(row + 1, column) - at(row - 1, column)) / 2;
     const [na, nb, nc] = turn(a, b, 1);
@@ -92,7 +93,7 @@ function forceBar() {
   const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), fault = el("p", { className: "soft small" });
   const bars = el("div", { className: "bars small" }, el("span", {}, "force"), el("span", { className: "track" }, bar), value);
   const node = el("div", { className: "force" }, bars, words, fault);
-  let most = 5; // N of a whole bar
+  let most = 10; // N of a whole bar
   const show = (one, isSurface = false) => {
     node.hidden = !one;
     if (!one) return;
@@ -106,7 +107,7 @@ function forceBar() {
       const arrow = sideways > one.sideways_std ? ` ${"→↘↓↙←↖↑↗"[Math.round((4 * Math.atan2(down, right)) / Math.PI + 8) % 8]}` : "";
       part.push(`sideways${arrow} ${off(sideways, one.sideways_std, 1)} N`);
     }
-    part.push(`depth ${off(one.depth, one.depth_std, 2)} ${one.unit}`);
+    part.push(`depth ${off(one.depth, one.depth_std, one.unit === "mm" ? 2 : 4)} ${one.unit}`);
     if (one.unit === "mm") part.push(`contact ${one.area.toFixed(0)} mm²`);
     if (isSurface) part.push(`heights are drawn ${(LIFT / one.high).toPrecision(2)} times as high`);
     words.textContent = part.join(", ");

@@ -100,7 +100,7 @@ function showLive(source, about) {
     if (scores[name].length > KEPT_LIVE) scores[name].shift();
     return () => {
       const at = 3 * Object.keys(scores).indexOf(name);
-      chart(curves.children[at + 1], [{ values: scores[name], ...looks(at / 3) }], { level, length: KEPT_LIVE });
+      chart(curves.children[at + 1], [{ values: scores[name], colour: accent() }], { level, reach: REACH[name], length: KEPT_LIVE });
       curves.children[at + 2].textContent = String(value);
     };
   };

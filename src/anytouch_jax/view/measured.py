@@ -17,6 +17,7 @@ from anytouch_jax.encoder.fields import Fields, depth_levels, overlay
 
 Array = npt.NDArray[Any]
 _ENCODER = "anytouch-tiny"  # measures recordings, by which no encoder is named
+_SHARP = 480  # pixels of the long side of a picture with arrows, at least
 _SIDE = 72  # cells of a surface along the long side of the picture
 _ONE_BY_ONE = Lock()
 
@@ -46,7 +47,8 @@ def last_clip(frames: Sequence[Array], length: int) -> Array:
 def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
     """Return what was measured of a frame as a picture u8 (h, w, 3): "depth" on the frame, or a "surface" in grey."""
     if name == "depth":
-        return overlay(frame, measured, text=False)
+        larger = max(1.0, _SHARP / max(frame.shape[:2]))  # lines on few pixels would be thick
+        return overlay(cv2.resize(frame, None, fx=larger, fy=larger), measured, text=False)
     scale = _SIDE / max(1.0, measured.shape)
     small = cv2.resize(measured.depth[0], (round(scale), round(scale * measured.shape)))
     return cv2.cvtColor(depth_levels(small, measured.width_mm)[0], cv2.COLOR_GRAY2RGB)
@@ -62,7 +64,7 @@ def numbers(measured: Fields) -> dict[str, Any]:
     curves["slip"] = about["slip"] if measured.area[0] > 0 else 0.0
     _, high = depth_levels(measured.depth[0], measured.width_mm)
     return {
-        "curves": {name: round(value, 4) for name, value in curves.items() if value is not None},
+        "curves": {name: round(value, 3) for name, value in curves.items() if value is not None},
         "force": None if measured.force is None else [about[f"force_{axis}"] for axis in "xyz"],
         "force_std": about["force_z_std"], "sideways_std": about["force_x_std"], "depth": about["depth"],
         "depth_std": about["depth_std"], "area": about["area"], "unit": unit, "faults": measured.faults,

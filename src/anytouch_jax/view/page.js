@@ -139,9 +139,10 @@ async function picture(path, alt) {
 
 // ---- charts ------------------------------------------------------------------------------------------------------
 
-// lines: [{values: [y or null], x: [x] or nothing, colour, dash}]; mark: x of a vertical line; level: y of a limit.
+// lines: [{values: [y or null], x: [x] or nothing, colour, dash}]; mark: x of a vertical line; level: y of a limit;
+// reach: values that the axis shows at least.
 // With a `length` in frames the chart has the time axis of a slider, and its numbers lie inside.
-function chart(canvas, lines, { mark = null, level = null, log = false, length = 0 } = {}) {
+function chart(canvas, lines, { mark = null, level = null, reach = [], log = false, length = 0 } = {}) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   if (!width) return;
   canvas.width = width * ratio;
@@ -150,8 +151,8 @@ function chart(canvas, lines, { mark = null, level = null, log = false, length =
   g.scale(ratio, ratio);
   const y = (value) => (log ? Math.log10(Math.max(value, 1e-9)) : value);
   const every = lines.flatMap((line) => line.values.filter((value) => value !== null).map(y));
-  if (level !== null) every.push(y(level));
   if (!every.length) return;
+  every.push(...(level === null ? reach : [...reach, level]).map(y));
   let low = every.reduce((a, b) => Math.min(a, b)), high = every.reduce((a, b) => Math.max(a, b));
   if (high - low < 1e-9) { low -= 0.5; high += 0.5; }
   const at = (line, i) => (line.x ? line.x[i] : i);
@@ -186,8 +187,12 @@ function chart(canvas, lines, { mark = null, level = null, log = false, length =
   g.font = "12px system-ui, sans-serif";
   g.fillStyle = style.getPropertyValue("--soft");
   g.textAlign = length ? "left" : "right";
-  g.fillText(text(high), length ? 12 : 40, 16);
-  g.fillText(text(low), length ? 12 : 40, height - (length ? 9 : 15));
+  g.strokeStyle = style.backgroundColor;
+  g.lineWidth = 4;
+  for (const draw of ["strokeText", "fillText"]) { // numbers can be read on top of a line
+    g[draw](text(high), length ? 12 : 40, 16);
+    g[draw](text(low), length ? 12 : 40, height - (length ? 9 : 15));
+  }
   if (!length) g.fillText(String(right), width - 8, height - 2);
 }
 
@@ -255,11 +260,12 @@ function clipCard(source, clip, pictures, title) {
 // One time axis: the slider, and a curve below it for everything that was measured.
 function timeline(cards, length, seek) {
   const slider = el("input", { type: "range", min: 0, max: length - 1, value: 0, ariaLabel: "frame", oninput: () => seek(Number(slider.value)) });
-  const playing = el("button", {}, "Play"), clock = el("span", { className: "soft" }), curves = el("div", { className: "time" });
-  const node = el("section", {}, el("div", { className: "time scrub" }, playing, slider, clock), curves);
+  const playing = el("button", {}, "Play"), clock = el("span", { className: "soft" });
+  const seen = el("div", { className: "time" }), labels = el("div", { className: "time" });
+  const node = el("section", {}, el("div", { className: "time scrub" }, playing, slider, clock), seen, labels);
   const names = new Set(cards.flatMap((one) => Object.keys(one.clip.curves))), rows = [], added = new Set();
-  const value = (number) => (number === null || number === undefined ? "" : Number(number.toPrecision(3)).toString());
-  const addRow = (name, of, level) => {
+  const value = (number) => (number === null || number === undefined ? "" : number && Math.abs(number) < 0.01 ? number.toExponential(1) : Number(number.toPrecision(3)).toString());
+  const addRow = (curves, name, of, level, reach) => {
     const canvas = el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), now = el("span");
     const point = (event) => { if (event.buttons) seek(Math.round(((event.offsetX - 8) / (canvas.clientWidth - 16)) * (length - 1))); };
     canvas.addEventListener("pointerdown", point);
@@ -270,18 +276,19 @@ function timeline(cards, length, seek) {
       const lines = cards.map((one, i) => ({ values: of(one), ...looks(i) }));
       parts.forEach((part) => { part.hidden = lines.every((line) => line.values.every((each) => each === null)); });
       if (parts[0].hidden) return;
-      chart(canvas, lines, { mark: t, level, length });
+      chart(canvas, lines, { mark: t, level, reach, length });
       now.textContent = lines.map((line) => value(line.values[Math.min(t, line.values.length - 1)])).join("\n");
     });
   };
-  addRow("contact", (one) => one.scores, cards[0]?.clip.threshold ?? null);
-  for (const name of names) addRow(name.replace("label.", ""), (one) => one.clip.curves[name] ?? [null], null);
+  addRow(seen, "contact", (one) => one.scores, cards[0]?.clip.threshold ?? null);
+  for (const name of names) addRow(labels, name.replace("label.", ""), (one) => one.clip.curves[name] ?? [null], null);
   node.hidden = length < 2;
   const draw = (t) => {
     slider.value = t;
     clock.textContent = `${t + 1} / ${length}`;
-    for (const name of cards.flatMap((one) => Object.keys(one.measured)).filter((one) => !added.has(one))) {
-      addRow(`measured ${name}`, (one) => one.measured[name] ?? [null], null);
+    for (const name of new Set(cards.flatMap((one) => Object.keys(one.measured)))) {
+      if (added.has(name)) continue;
+      addRow(seen, `measured ${name}`, (one) => one.measured[name] ?? [null], null, REACH[name]);
       added.add(name);
     }
     if (length > 1) rows.forEach((row) => row(t));
@@ -384,7 +391,7 @@ function showTable(source, about, start = 0) {
 
 function showStart(source, about) {
   const examples = state.sources.findIndex((one) => one.kind === "table"), thumbs = el("div", { className: "thumbs" });
-  thumbs.style.setProperty("--thumb", "150px");
+  thumbs.style.setProperty("--thumb", "min(48%, 172px)"); // six in a row, or three, or two
   const open = guard(async (camera) => {
     say("Opening the camera and its encoder. This takes some seconds.");
     const { source: place } = await (await order(source, { camera })).json();

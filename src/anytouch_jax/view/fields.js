@@ -108,7 +108,7 @@ function forceBar() {
       part.push(`sideways${arrow} ${off(sideways, one.sideways_std, 1)} N`);
     }
     part.push(`depth ${off(one.depth, one.depth_std, one.unit === "mm" ? 2 : 4)} ${one.unit}`);
-    if (one.unit === "mm") part.push(`contact ${one.area.toFixed(0)} mm²`);
+    part.push(one.unit === "mm" ? `contact ${one.area.toFixed(0)} mm²` : "no mm and N, since the sensor is not known");
     if (isSurface) part.push(`heights are drawn ${(LIFT / one.high).toPrecision(2)} times as high`);
     words.textContent = part.join(", ");
     fault.textContent = one.faults.length ? `Do not trust these values: ${one.faults.join(" ")}` : "";

@@ -15,8 +15,9 @@ function verdict(result) {
     return [el("span", {}, name), el("span", { className: "track" }, inner), el("span", {}, percent(share) + note)];
   };
   const better = result.right > result.pixels;
+  const useless = result.right > result.chance ? "" : " That is no better than the commonest name alone: record each name again.";
   return [el("p", {}, `Right on ${percent(result.right)} of frames of recordings that were left out. ${better
-    ? `Raw pixels reach ${percent(result.pixels)}.` : `Raw pixels reach ${percent(result.pixels)}, so the encoder adds nothing here.`}`),
+    ? `Raw pixels reach ${percent(result.pixels)}.` : `Raw pixels reach ${percent(result.pixels)}, so the encoder adds nothing here.`}${useless}`),
   el("div", { className: "bars small" }, ...bar("this head", result.right, true, range("right")),
     ...bar("raw pixels", result.pixels, false, range("pixels")), ...bar("commonest name", result.chance, false, "")),
   ...(result.once ? [el("p", { className: "soft small" }, `${result.once} names were recorded once only. They do not count here: record them again.`)] : [])];
@@ -101,7 +102,7 @@ function showLive(source, about) {
     return () => {
       const at = 3 * Object.keys(scores).indexOf(name);
       chart(curves.children[at + 1], [{ values: scores[name], colour: accent() }], { level, reach: REACH[name], length: KEPT_LIVE });
-      curves.children[at + 2].textContent = String(value);
+      curves.children[at + 2].textContent = shortened(value);
     };
   };
   const feel = (one) => {

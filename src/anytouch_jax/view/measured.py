@@ -64,7 +64,7 @@ def numbers(measured: Fields) -> dict[str, Any]:
     curves["slip"] = about["slip"] if measured.area[0] > 0 else 0.0
     _, high = depth_levels(measured.depth[0], measured.width_mm)
     return {
-        "curves": {name: round(value, 3) for name, value in curves.items() if value is not None},
+        "curves": {name: round(value, 4) for name, value in curves.items() if value is not None},
         "force": None if measured.force is None else [about[f"force_{axis}"] for axis in "xyz"],
         "force_std": about["force_z_std"], "sideways_std": about["force_x_std"], "depth": about["depth"],
         "depth_std": about["depth_std"], "area": about["area"], "unit": unit, "faults": measured.faults,

@@ -257,6 +257,9 @@ function clipCard(source, clip, pictures, title) {
   return { node, clip, scores, measured, load, show };
 }
 
+const shortened = (number) => (number === null || number === undefined ? ""
+  : number && Math.abs(number) < 0.01 ? number.toExponential(1) : Number(number.toPrecision(3)).toString());
+
 // One time axis: the slider, and a curve below it for everything that was measured.
 function timeline(cards, length, seek) {
   const slider = el("input", { type: "range", min: 0, max: length - 1, value: 0, ariaLabel: "frame", oninput: () => seek(Number(slider.value)) });
@@ -264,7 +267,6 @@ function timeline(cards, length, seek) {
   const seen = el("div", { className: "time" }), labels = el("div", { className: "time" });
   const node = el("section", {}, el("div", { className: "time scrub" }, playing, slider, clock), seen, labels);
   const names = new Set(cards.flatMap((one) => Object.keys(one.clip.curves))), rows = [], added = new Set();
-  const value = (number) => (number === null || number === undefined ? "" : number && Math.abs(number) < 0.01 ? number.toExponential(1) : Number(number.toPrecision(3)).toString());
   const addRow = (curves, name, of, level, reach) => {
     const canvas = el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), now = el("span");
     const point = (event) => { if (event.buttons) seek(Math.round(((event.offsetX - 8) / (canvas.clientWidth - 16)) * (length - 1))); };
@@ -277,7 +279,7 @@ function timeline(cards, length, seek) {
       parts.forEach((part) => { part.hidden = lines.every((line) => line.values.every((each) => each === null)); });
       if (parts[0].hidden) return;
       chart(canvas, lines, { mark: t, level, reach, length });
-      now.textContent = lines.map((line) => value(line.values[Math.min(t, line.values.length - 1)])).join("\n");
+      now.textContent = lines.map((line) => shortened(line.values[Math.min(t, line.values.length - 1)])).join("\n");
     });
   };
   addRow(seen, "contact", (one) => one.scores, cards[0]?.clip.threshold ?? null);
@@ -377,10 +379,10 @@ function showTable(source, about, start = 0) {
     el("button", { onclick: step(1), ariaLabel: "next touch" }, "→"));
   filterBox.hidden = !filterBar.children.length;
   main.replaceChildren(el("div", { className: "bar" }, el("div", {}, title, subtitle), turning), filterBox, layers.node, clips, below);
-  keys([["ArrowLeft", "previous touch", step(-1)], ["ArrowRight", "next touch", step(1)],
+  keys([...(about.touches > 1 ? [["ArrowLeft", "previous touch", step(-1)], ["ArrowRight", "next touch", step(1)]] : []),
     [" ", "play or pause", () => axis.playing.click()], [",", "frame back", () => { pause(); move(t - 1); }],
     [".", "frame on", () => { pause(); move(t + 1); }], ["l", "next layer", layers.next],
-    ["f", "filters", () => { filterBox.open = true; filterBar.querySelector("select, input")?.focus(); }]]);
+    ...(filterBox.hidden ? [] : [["f", "filters", () => { filterBox.open = true; filterBar.querySelector("select, input")?.focus(); }]])]);
   const resized = () => axis.draw(t);
   window.addEventListener("resize", resized);
   state.stop = () => { pause(); asked++; window.removeEventListener("resize", resized); };

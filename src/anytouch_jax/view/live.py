@@ -32,7 +32,7 @@ from anytouch_jax.encoder.fields import Fields
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.stream import Embedded, stream
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.measured import last_clip, measured_layer, numbers
+from anytouch_jax.view.measured import field_numbers, last_clip, measured_layer
 from anytouch_jax.view.space import FeatureMap
 from anytouch_jax.view.tables import LAYERS, MEASURED, scale_down, touch_layer
 from anytouch_jax.view.teach import LiveRecorder, Teacher
@@ -234,7 +234,7 @@ class Live:
         threshold = THRESHOLDS.get(self._sensor or UNIVERSAL, DEFAULT_THRESHOLD)
         score = touch_layer(picture, gel, threshold, "frame")[1]
         fields = self._fields(picture, [prepared for *_, prepared in kept]) if score == score else None
-        measured = {} if fields is None else numbers(fields)
+        measured = {} if fields is None else field_numbers(fields)
         self.recorder.add(picture, score, frame.values)
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T

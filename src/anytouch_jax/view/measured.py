@@ -54,7 +54,7 @@ def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
     return cv2.cvtColor(depth_levels(small, measured.width_mm)[0], cv2.COLOR_GRAY2RGB)
 
 
-def numbers(measured: Fields) -> dict[str, Any]:
+def field_numbers(measured: Fields) -> dict[str, Any]:
     """Return what the page writes of a frame: values with deviations, points of curves, and reasons not to trust them.
 
     `high` is the depth of a white place of the surface, in widths of the picture.

@@ -152,9 +152,9 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
         view, score, fields = table.layer(request.path_params["row"], _layer(request))
         headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
         if fields is not None:
-            from anytouch_jax.view.measured import numbers
+            from anytouch_jax.view.measured import field_numbers
 
-            headers["X-Fields"] = json.dumps(numbers(fields))
+            headers["X-Fields"] = json.dumps(field_numbers(fields))
         return _picture(view, headers)
 
     def recorded(request: Request, live: Live) -> Response:

@@ -12,19 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import UNIVERSAL
-from anytouch_jax.encoder.encoder import Encoder, load_encoder
+from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.encoder.fields import Fields, depth_levels, overlay
 
 Array = npt.NDArray[Any]
 _ENCODER = "anytouch-tiny"  # measures recordings, by which no encoder is named
 _SHARP = 480  # pixels of the long side of a picture with arrows, at least
 _SIDE = 72  # cells of a surface along the long side of the picture
-_ONE_BY_ONE = Lock()
-
-
-@cache
-def _encoder() -> Encoder:
-    return load_encoder(_ENCODER)
+_ONE_BY_ONE, _load = Lock(), cache(load_encoder)
 
 
 def measure_recorded(frames: Sequence[Array], gel: Array | None, sensor: str | None) -> Fields:
@@ -33,9 +28,9 @@ def measure_recorded(frames: Sequence[Array], gel: Array | None, sensor: str | N
     Raises UserError for a gel of other proportions.
     """
     with _ONE_BY_ONE:
-        encoder = _encoder()
-        clip = last_clip(frames, encoder.config.model.frames)
-        return encoder.measure(clip[None], gel, sensor or UNIVERSAL, log=lambda _: None)
+        encoder = _load(_ENCODER)
+        clip = last_clip(frames, encoder.config.model.frames)[None]
+        return encoder.measure(clip, gel, sensor or UNIVERSAL, log=lambda _: None)
 
 
 def last_clip(frames: Sequence[Array], length: int) -> Array:

@@ -101,8 +101,8 @@ class Table:
 
         Fields are for the layers MEASURED.
         """
-        gel = self._untouched(row)
-        view, score = touch_layer(self.frame(row), gel, self.threshold(row), name)
+        frame, gel = self.frame(row), self._untouched(row)
+        view, score = touch_layer(frame, gel, self.threshold(row), name)
         if name not in MEASURED or gel is None or score != score:
             return view, score, None
         from anytouch_jax.view.measured import measured_layer

@@ -128,6 +128,27 @@ def test_touches_are_filtered_and_played(browse):
 
 
 @pytest.mark.slow
+def test_a_surface_is_turned(browse):
+    page = browse(0)
+    page.get_by_role("button", name="Surface").click()
+    page.wait_for_selector("text=times as high")
+    canvas, seen = page.locator(".stage canvas").first, set()
+    seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
+    for key in ("ArrowLeft", "ArrowDown"):
+        canvas.press(key)
+        seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
+    canvas.hover()
+    page.mouse.down()
+    page.mouse.move(500, 400, steps=3)
+    page.mouse.up()
+    seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
+    assert len(seen) == 4 and page.locator("input[type=number]").input_value() == "1"  # still the first touch
+    page.wait_for_selector("text=measured force, N")  # its curve
+    page.get_by_role("button", name="Picture").click()
+    assert drawn(page) not in seen
+
+
+@pytest.mark.slow
 def test_keyboard_alone(browse):
     page = browse(0)
     page.wait_for_selector("text=of 2 touches")
@@ -282,6 +303,9 @@ def test_everybody_can_use_it(browse, theme):
     for tab, sign in enumerate(("of 2 touches", "Click a point", "Teach it a touch", "What do you want")):
         page = browse(tab, theme=theme, bypass_csp=True)
         page.wait_for_selector(f"text={sign}")
+        if tab == 0:
+            page.get_by_role("button", name="Surface").click()
+            page.wait_for_selector("text=times as high")
         page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         page.wait_for_timeout(1000)
         page.evaluate(AXE.read_text())

@@ -89,6 +89,38 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
     assert sorted(path.name[0] for path in (tmp_path / "recorded").iterdir()) == ["2", "2", "m"]  # nothing hidden
 
 
+def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
+    camera = PressCamera()
+    monkeypatch.setattr(live_module, "open_source", lambda *_: (camera, True))
+    assert not {"depth", "surface"} & set(Live("0", encoder, sensor=None, out=tmp_path).about()["layers"])
+    live = Live("0", load_encoder("anytouch-tiny"), sensor="gelsight_mini", out=tmp_path, log=lambda _: None)
+    assert live.about()["layers"][-2:] == ["depth", "surface"]
+    live.start()
+    runner, packets = asyncio.Runner(), {layer: live.packets(layer) for layer in ("depth", "surface")}
+
+    def until(layer: str, wanted) -> tuple[dict, np.ndarray]:
+        for _ in range(500):
+            about, jpeg = opened(runner.run(anext(packets[layer])))
+            if about["layer"] == layer and wanted(about):
+                return about, cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        raise AssertionError(layer)
+
+    try:
+        free, _ = until("depth", lambda about: about["frame"] > 3)
+        live.capture_background()
+        camera.shape = "ball"
+        for layer, shape in (("depth", (360, 480, 3)), ("surface", (54, 72, 3))):
+            pressed, picture = until(layer, lambda about: about["fields"]["area"] > 0)
+            assert picture.shape == shape and pressed["fields"]["force"][2] > 0.1 > free["fields"]["force"][2]
+            assert {"contact", "force, N", "depth, mm", "slip"} == set(pressed["curves"])
+        live.orient(90, "none")  # another shape than the sensor's: it is said
+        turned, _ = until("depth", lambda about: about["fields"]["faults"])
+        assert "height" in turned["fields"]["faults"][0]
+    finally:
+        live.stop()
+        runner.close()
+
+
 def test_a_stopped_camera_does_not_stop_the_page(encoder, film, tmp_path):
     live, open_streams = Live(str(film), encoder, sensor="digit", out=tmp_path), set()
     plain = live.packets

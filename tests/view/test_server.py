@@ -88,6 +88,24 @@ def test_a_frame_shows_its_difference_and_contact(page):
         assert page.get(f"/api/0/{path}").status_code == 400
 
 
+def test_depth_is_measured_where_the_untouched_gel_is_known(page, tmp_path):
+    free, pressed = (page.get(f"/api/0/frame/{row}?layer=depth") for row in (0, 2))
+    nothing, values = (json.loads(answer.headers["x-fields"]) for answer in (free, pressed))
+    assert picture(pressed).shape == (480, 480, 3) and values["unit"] == "mm"
+    assert (
+        nothing["force"][2] < 0.05 < 0.3 < values["force"][2] == pytest.approx(values["curves"]["force, N"], abs=1e-3)
+    )
+    assert nothing["area"] == 0 < values["area"] and values["depth_std"] > 0 and nothing["curves"]["slip"] == 0
+    surface = picture(page.get("/api/0/frame/2?layer=surface")).astype(int)
+    assert np.ptp(surface.max(2) - surface.min(2)) <= 2 and surface.max() > 60  # grey
+    assert "x-fields" not in page.get("/api/0/frame/2?layer=contact").headers
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((32, 48, 3), 90, np.uint8))
+    columns = {"path": ["0.png"], "sensor": ["mine"], "sequence": ["s"], "frame_index": [0], "split": ["test"]}
+    manifests.write(manifests.from_columns(columns, tmp_path / "m.csv"), tmp_path / "m.csv")
+    unknown = client(tmp_path / "m.csv").get("/api/0/frame/0?layer=depth")  # one frame shows no untouched gel
+    assert picture(unknown).shape == (32, 48, 3) and "x-fields" not in unknown.headers
+
+
 def test_a_film_by_its_name_with_its_own_untouched_gel(film, tmp_path):
     shutil.copy(film, tmp_path / "film.avi")
     page = client(tmp_path / "film.avi")

@@ -314,29 +314,37 @@ def _unlike(frame: Array, background: Array) -> str:
     return nearest if 1.05 * differs(others[nearest]) + 0.5 < differs(small) else ""
 
 
-def overlay(frame: Array, measured: Fields, row: int = 0) -> Array:
-    """Return a picture u8 (h, w, 3) of a frame with its depth in colour, the rim of contact, shear and force."""
+def depth_levels(depth: Array, width_mm: float | None) -> tuple[Array, float]:
+    """Return a map of depth as u8, and the depth of 255: the deepest place, but no less than a usual touch."""
+    deepest = max(float(depth.max()), LENGTH * (width_mm or 1.0))
+    return np.clip(255 * depth / deepest, 0, 255).astype(np.uint8), deepest
+
+
+def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) -> Array:
+    """Return a picture u8 (h, w, 3) of a frame: its depth in colour, the rim of contact, shear, and force as `text`."""
     height, width = frame.shape[:2]
     one = measured[row].at(height, width)
-    deepest = max(float(one.depth.max()), LENGTH * (one.width_mm or 1.0))
-    level = np.clip(255 * one.depth[0] / deepest, 0, 255).astype(np.uint8)
-    colours = cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1]
-    share = (0.7 * np.clip(level / 64, 0, 1))[..., None]
-    view = np.ascontiguousarray((frame * (1 - share) + colours * share).astype(np.uint8))
+    level, _ = depth_levels(one.depth[0], one.width_mm)
+    colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    share = np.minimum(level, 64) * np.float32(0.7 / 64)
+    view = cv2.blendLinear(np.ascontiguousarray(frame), colours, 1 - share, share)
     inside = (one.contact[0] > 0.5).astype(np.uint8)
-    cv2.drawContours(view, cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0], -1, (255, 255, 255))
+    rims = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    cv2.drawContours(view, rims, -1, (255, 255, 255), 1, cv2.LINE_AA)
     step, long = max(min(height, width) // 14, 1), 4 * width / (one.width_mm or 1.0)  # arrows four times their length
     for y in range(step // 2, height, step):
         for x in range(step // 2, width, step):
             if inside[y, x]:
                 tip = np.rint((x, y) + long * one.shear[0, y, x]).astype(int)
                 cv2.arrowedLine(view, (x, y), tuple(tip.tolist()), (120, 255, 120), 1, cv2.LINE_AA, tipLength=0.3)
+    if not text:
+        return view
     about = one.summary()
     unit, force = "" if one.width_mm is None else " mm", about["force_z"]
-    text = f"{about['depth']:.2f}+-{about['depth_std']:.2f}{unit}"
-    text += "" if force is None else f"  {force:.2f}+-{about['force_z_std']:.2f} N"
+    line = f"{about['depth']:.2f}+-{about['depth_std']:.2f}{unit}"
+    line += "" if force is None else f"  {force:.2f}+-{about['force_z_std']:.2f} N"
     cv2.putText(
-        view, text, (6, height - 8), cv2.FONT_HERSHEY_SIMPLEX, width / 800 + 0.1, (255, 255, 255), 1, cv2.LINE_AA
+        view, line, (6, height - 8), cv2.FONT_HERSHEY_SIMPLEX, width / 800 + 0.1, (255, 255, 255), 1, cv2.LINE_AA
     )
     return view
 

@@ -15,8 +15,9 @@ function verdict(result) {
     return [el("span", {}, name), el("span", { className: "track" }, inner), el("span", {}, percent(share) + note)];
   };
   const better = result.right > result.pixels;
+  const useless = result.right > result.chance ? "" : " That is no better than the commonest name alone: record each name again.";
   return [el("p", {}, `Right on ${percent(result.right)} of frames of recordings that were left out. ${better
-    ? `Raw pixels reach ${percent(result.pixels)}.` : `Raw pixels reach ${percent(result.pixels)}, so the encoder adds nothing here.`}`),
+    ? `Raw pixels reach ${percent(result.pixels)}.` : `Raw pixels reach ${percent(result.pixels)}, so the encoder adds nothing here.`}${useless}`),
   el("div", { className: "bars small" }, ...bar("this head", result.right, true, range("right")),
     ...bar("raw pixels", result.pixels, false, range("pixels")), ...bar("commonest name", result.chance, false, "")),
   ...(result.once ? [el("p", { className: "soft small" }, `${result.once} names were recorded once only. They do not count here: record them again.`)] : [])];
@@ -26,7 +27,7 @@ function showLive(source, about) {
   const canvas = el("canvas", { role: "img", ariaLabel: "live picture" }), curves = el("section", { className: "time" });
   const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
-  const pictures = about.table === null ? null : framesOf(about.table, "frame", true);
+  const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
   const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
   let stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
   let recorded = new Pictures(`${source}/recorded`, "frame", true);
@@ -100,8 +101,8 @@ function showLive(source, about) {
     if (scores[name].length > KEPT_LIVE) scores[name].shift();
     return () => {
       const at = 3 * Object.keys(scores).indexOf(name);
-      chart(curves.children[at + 1], [{ values: scores[name], ...looks(at / 3) }], { level, length: KEPT_LIVE });
-      curves.children[at + 2].textContent = String(value);
+      chart(curves.children[at + 1], [{ values: scores[name], colour: accent() }], { level, reach: REACH[name], length: KEPT_LIVE });
+      curves.children[at + 2].textContent = shortened(value);
     };
   };
   const feel = (one) => {
@@ -123,7 +124,7 @@ function showLive(source, about) {
   const show = async (one, jpeg) => {
     if (one.error) { say(one.error, true); return; }
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
-    paint(canvas, bitmap);
+    showLayer(canvas, bitmap, one.layer === "surface");
     bitmap.close();
     const age = performance.timeOrigin + performance.now() - one.grabbed;
     ages.push(age);
@@ -136,6 +137,7 @@ function showLive(source, about) {
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
     draws.forEach((draw) => draw());
     feel(one);
+    force.show(one.fields, one.layer === "surface");
     hidden.hidden = one.layer === state.layer;
     record.textContent = recording ? `Recording ${one.recording.name}: ${one.recording.written} frames` : "Hold to record";
     record.classList.toggle("on", recording);
@@ -194,7 +196,7 @@ function showLive(source, about) {
     background, el("button", { onclick: () => send({ do: "no background" }) }, "Estimate it again")), facts));
   main.replaceChildren(el("div", { className: "split live" },
     el("div", { className: "column" }, el("div", { className: "bar" }, el("h2", {}, state.sources[source].name), el("div", { className: "push" }, layers.node)),
-      el("div", { className: "stage" }, canvas), hidden, curves, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
+      stage(canvas), hidden, force.node, curves, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
     panel), more);
   keys([["r", "hold to record", () => { if (!state.repeated) begin(); }], ["l", "next layer", layers.next], ["b", "capture the untouched gel", () => background.click()]]);
   document.addEventListener("keyup", lifted);

@@ -28,11 +28,13 @@ from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.encoder import Encoder
+from anytouch_jax.encoder.fields import Fields
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.stream import Embedded, stream
 from anytouch_jax.errors import UserError
+from anytouch_jax.view.measured import field_numbers, last_clip, measured_layer
 from anytouch_jax.view.space import FeatureMap
-from anytouch_jax.view.tables import LAYERS, scale_down, touch_layer
+from anytouch_jax.view.tables import LAYERS, MEASURED, scale_down, touch_layer
 from anytouch_jax.view.teach import LiveRecorder, Teacher
 
 Array = npt.NDArray[Any]
@@ -70,12 +72,13 @@ class LoopedFilm:
 
 
 class _Shown(NamedTuple):
-    """What the page shows of a frame: its picture, turned, the untouched gel, and what is known."""
+    """What the page shows of a frame: its picture, turned, the untouched gel, what is known, and what was measured."""
 
     number: int = 0
     about: Mapping[str, Any] = {}
     picture: Array | None = None
     gel: tuple[Array, UntouchedGel] | None = None
+    fields: Fields | None = None
 
 
 class Live:
@@ -100,13 +103,11 @@ class Live:
         self._row = encoder.sensor_row(sensor or UNIVERSAL, log)
         self._rotate = 0
         self._flip: Flip = "none"
-        self.gel: Array | None = None  # the picture of the untouched gel, RGB u8 (h, w, 3), turned as frames are
-        self._gel: tuple[Array, UntouchedGel] | None = None
         self._running: RunningGel | None = RunningGel()  # None with a picture of it
         self._looker = ThreadPoolExecutor(1)
         self._looking: Future[None] | None = None
-        self._preprocess = Preprocess(encoder)
-        self._raw: deque[tuple[int, Array]] = deque(maxlen=8)  # the last pictures by the number of their frame
+        self._use_gel(None)
+        self._raw: deque[tuple[int, Array, Array]] = deque(maxlen=8)  # last frames: number, picture, prepared
         self._count = 0
         self._near: tuple[dict[str, Any], float] = ({}, 0.0)
         self._times: deque[tuple[float, float]] = deque(maxlen=_KEPT)
@@ -120,7 +121,8 @@ class Live:
         """Return what the page can offer."""
         return {
             "encoder": self._encoder.source, "sensor": self._sensor, "head": self._head and self._head.label,
-            "source": self.source, "table": self._space and self._space.table, "layers": LAYERS,
+            "source": self.source, "table": self._space and self._space.table,
+            "layers": [name for name in LAYERS if self._encoder.measures or name not in MEASURED],
         }  # fmt: skip
 
     def start(self) -> None:
@@ -170,9 +172,11 @@ class Live:
 
     def _use_gel(self, picture: Array | None) -> None:
         # Frames are turned before, so the encoder's preprocessing does not.
-        self.gel = picture
+        self.gel = picture  # of the untouched gel, RGB u8 (h, w, 3), turned as frames are
         self._gel = None if picture is None else (scale_down(picture), UntouchedGel(picture))
         self._preprocess = Preprocess(self._encoder, picture)
+        known = self._sensor or UNIVERSAL, picture
+        self._measure = self._encoder.measure_of(*known, log=lambda _: None) if self._encoder.measures else None
 
     def _find_gel(self, picture: Array) -> None:
         """Look for the untouched gel by the rule of `data.gels`: that of the head's unit, or a running estimate."""
@@ -199,12 +203,16 @@ class Live:
         """Keep the picture of a frame and return it for the encoder: frames come here one by one, from 0."""
         turned = self._oriented(picture)
         self._find_gel(turned)
-        self._raw.append((self._count, picture))
+        prepared = self._preprocess(turned)
+        self._raw.append((self._count, picture, prepared))
         self._count += 1
-        return self._preprocess(turned)
+        return prepared
 
     def _run(self, source: Any) -> None:
         try:
+            if self._measure is not None:  # compiled before the first frame
+                self._fields(self._encoder.blank, [self._encoder.blank])
+                self._use_gel(self.gel)
             prepare: Any = self._prepare
             frames = stream(
                 self._encoder, source, prepare, live=True, sensor=self._row, log=self._log,
@@ -219,12 +227,14 @@ class Live:
             self._newest = _Shown(self._newest.number + 1, {"error": str(error)})
 
     def _show(self, frame: Embedded) -> None:
-        pictures = [picture for number, picture in tuple(self._raw) if number == frame.number]
-        if not pictures:
+        kept = [one for one in tuple(self._raw) if one[0] <= frame.number]
+        if not kept or kept[-1][0] != frame.number:
             return
-        picture, gel = self._oriented(pictures[0]), self._gel
+        picture, gel = self._oriented(kept[-1][1]), self._gel
         threshold = THRESHOLDS.get(self._sensor or UNIVERSAL, DEFAULT_THRESHOLD)
         score = touch_layer(picture, gel, threshold, "frame")[1]
+        fields = self._fields(picture, [prepared for *_, prepared in kept]) if score == score else None
+        measured = {} if fields is None else field_numbers(fields)
         self.recorder.add(picture, score, frame.values)
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
@@ -232,12 +242,21 @@ class Live:
             "frame": frame.number, "grabbed": 1e3 * (frame.started + frame.at), "picture": frame.picture,
             "contact": None if score != score else bool(score > threshold), "threshold": threshold,
             "gel": "captured" if self._running is None else "estimated",
-            "curves": {} if score != score else {"contact": round(score, 2)},
+            "curves": {} if score != score else {"contact": round(score, 2)} | measured.get("curves", {}),
+            "fields": measured or None,
             "encoder": encoder.round(2).tolist(), "age": age.round(2).tolist(), "missed": frame.missed,
             "recording": self.recorder.state(), "taught": self.teacher.version,
         }  # fmt: skip
         about |= self._classify(frame.values) | self._nearest(frame.values)
-        self._newest = _Shown(self._newest.number + 1, about, picture, gel)
+        self._newest = _Shown(self._newest.number + 1, about, picture, gel, fields)
+
+    def _fields(self, picture: Array, prepared: list[Array]) -> Fields | None:
+        """Measure a picture, the last of some prepared frames, if the encoder can."""
+        if (measure := self._measure) is None:
+            return None
+        clip = last_clip(prepared, self._encoder.config.model.frames)
+        row, aspect = np.array([self._row], np.int32), np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
+        return measure(self._encoder.encode_and_measure(clip[None], row, aspect)[1], picture)
 
     def _classify(self, values: Array) -> dict[str, Any]:
         if (head := self.teacher.head or self._head) is None:
@@ -269,7 +288,9 @@ def _packet(shown: _Shown, layer: str) -> bytes:
     if shown.picture is not None:
         gel = shown.gel if layer != LAYERS[0] else None  # its score is known already
         view, score = touch_layer(shown.picture, gel, about["threshold"], layer)
-        about["layer"] = "frame" if score != score else layer
+        about["layer"] = "frame" if score != score or (layer in MEASURED and shown.fields is None) else layer
+        if shown.fields is not None and about["layer"] in MEASURED:
+            view = measured_layer(view, shown.fields, layer)
         jpeg = encode(view, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 85)
     text = json.dumps(about).encode()
     return struct.pack("<I", len(text)) + text + struct.pack("<I", len(jpeg)) + jpeg

@@ -6,7 +6,7 @@ const COLOURS = ["#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377
   "#4b7d2c", "#888888"];
 const RATE = 10, AHEAD = 6, KEPT = 900; // frames a second of recordings, frames read ahead, pictures in memory
 const DASHES = [[], [7, 3], [2, 3], [9, 3, 2, 3]]; // lines differ by more than their colour
-const LAYERS = { frame: "Picture", difference: "Difference", contact: "Contact", depth: "Depth" };
+const LAYERS = { frame: "Picture", difference: "Difference", contact: "Contact", depth: "Depth", surface: "Surface" };
 const main = document.getElementById("main"), tabs = document.getElementById("tabs");
 const state = { sources: [], stop: () => {}, keys: {}, layer: "frame", token: new URLSearchParams(location.hash.slice(1)).get("token") };
 
@@ -104,6 +104,8 @@ class Pictures {
     const response = await api(`${this.path}/${row}?layer=${layer}`), score = response.headers.get("X-Score");
     one.bitmap = await createImageBitmap(await response.blob());
     one.score = score ? Number(score) : null;
+    one.fields = JSON.parse(response.headers.get("X-Fields"));
+    one.isSurface = layer === "surface" && one.fields !== null;
     one.ready = true;
   }
   image(row, ariaLabel) {
@@ -137,9 +139,10 @@ async function picture(path, alt) {
 
 // ---- charts ------------------------------------------------------------------------------------------------------
 
-// lines: [{values: [y or null], x: [x] or nothing, colour, dash}]; mark: x of a vertical line; level: y of a limit.
+// lines: [{values: [y or null], x: [x] or nothing, colour, dash}]; mark: x of a vertical line; level: y of a limit;
+// reach: values that the axis shows at least.
 // With a `length` in frames the chart has the time axis of a slider, and its numbers lie inside.
-function chart(canvas, lines, { mark = null, level = null, log = false, length = 0 } = {}) {
+function chart(canvas, lines, { mark = null, level = null, reach = [], log = false, length = 0 } = {}) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   if (!width) return;
   canvas.width = width * ratio;
@@ -148,8 +151,8 @@ function chart(canvas, lines, { mark = null, level = null, log = false, length =
   g.scale(ratio, ratio);
   const y = (value) => (log ? Math.log10(Math.max(value, 1e-9)) : value);
   const every = lines.flatMap((line) => line.values.filter((value) => value !== null).map(y));
-  if (level !== null) every.push(y(level));
   if (!every.length) return;
+  every.push(...(level === null ? reach : [...reach, level]).map(y));
   let low = every.reduce((a, b) => Math.min(a, b)), high = every.reduce((a, b) => Math.max(a, b));
   if (high - low < 1e-9) { low -= 0.5; high += 0.5; }
   const at = (line, i) => (line.x ? line.x[i] : i);
@@ -184,8 +187,12 @@ function chart(canvas, lines, { mark = null, level = null, log = false, length =
   g.font = "12px system-ui, sans-serif";
   g.fillStyle = style.getPropertyValue("--soft");
   g.textAlign = length ? "left" : "right";
-  g.fillText(text(high), length ? 12 : 40, 16);
-  g.fillText(text(low), length ? 12 : 40, height - (length ? 9 : 15));
+  g.strokeStyle = style.backgroundColor;
+  g.lineWidth = 4;
+  for (const draw of ["strokeText", "fillText"]) { // numbers can be read on top of a line
+    g[draw](text(high), length ? 12 : 40, 16);
+    g[draw](text(low), length ? 12 : 40, height - (length ? 9 : 15));
+  }
   if (!length) g.fillText(String(right), width - 8, height - 2);
 }
 
@@ -224,9 +231,9 @@ function describe(clip, title) {
 
 function clipCard(source, clip, pictures, title) {
   const canvas = el("canvas", { role: "img", ariaLabel: `touch by ${clip.sensor ?? "this sensor"}` });
-  const contact = el("span", { className: "soft" }), scores = clip.rows.map(() => null);
-  const node = el("section", { className: "clip" }, el("div", { className: "stage" }, canvas),
-    el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), describe(clip, title));
+  const contact = el("span", { className: "soft" }), scores = clip.rows.map(() => null), force = forceBar(), measured = {};
+  const node = el("section", { className: "clip" }, stage(canvas),
+    el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), force.node, describe(clip, title));
   if (clip.photo) {
     guard(async () => {
       const image = await picture(`${source}/photo/${clip.rows[0]}`, "photograph of the object");
@@ -237,25 +244,30 @@ function clipCard(source, clip, pictures, title) {
     const at = Math.min(t, clip.rows.length - 1), one = pictures.get(clip.rows[at]);
     if (!one.ready) await one.wait;
     if (one.score !== undefined) scores[at] = one.score;
+    for (const [name, value] of Object.entries(one.fields?.curves ?? {})) (measured[name] ??= clip.rows.map(() => null))[at] = value;
     return one;
   };
   const show = async (t) => {
     for (let next = t + 1; next <= Math.min(t + AHEAD, clip.rows.length - 1); next++) pictures.get(clip.rows[next]);
     const one = await load(t), score = one.score ?? null;
-    if (one.bitmap) paint(canvas, one.bitmap);
+    if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface);
+    force.show(one.fields, one.isSurface);
     contact.textContent = one.error ?? (score === null ? (clip.rows.length > 1 ? "\u00a0" : "") : score > clip.threshold ? "● contact" : "○ no contact");
   };
-  return { node, clip, scores, load, show };
+  return { node, clip, scores, measured, load, show };
 }
+
+const shortened = (number) => (number === null || number === undefined ? ""
+  : number && Math.abs(number) < 0.01 ? number.toExponential(1) : Number(number.toPrecision(3)).toString());
 
 // One time axis: the slider, and a curve below it for everything that was measured.
 function timeline(cards, length, seek) {
   const slider = el("input", { type: "range", min: 0, max: length - 1, value: 0, ariaLabel: "frame", oninput: () => seek(Number(slider.value)) });
-  const playing = el("button", {}, "Play"), clock = el("span", { className: "soft" }), curves = el("div", { className: "time" });
-  const node = el("section", {}, el("div", { className: "time scrub" }, playing, slider, clock), curves);
-  const names = new Set(cards.flatMap((one) => Object.keys(one.clip.curves))), rows = [];
-  const value = (number) => (number === null || number === undefined ? "" : Number(number.toPrecision(3)).toString());
-  const addRow = (name, of, level) => {
+  const playing = el("button", {}, "Play"), clock = el("span", { className: "soft" });
+  const seen = el("div", { className: "time" }), labels = el("div", { className: "time" });
+  const node = el("section", {}, el("div", { className: "time scrub" }, playing, slider, clock), seen, labels);
+  const names = new Set(cards.flatMap((one) => Object.keys(one.clip.curves))), rows = [], added = new Set();
+  const addRow = (curves, name, of, level, reach) => {
     const canvas = el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), now = el("span");
     const point = (event) => { if (event.buttons) seek(Math.round(((event.offsetX - 8) / (canvas.clientWidth - 16)) * (length - 1))); };
     canvas.addEventListener("pointerdown", point);
@@ -266,16 +278,21 @@ function timeline(cards, length, seek) {
       const lines = cards.map((one, i) => ({ values: of(one), ...looks(i) }));
       parts.forEach((part) => { part.hidden = lines.every((line) => line.values.every((each) => each === null)); });
       if (parts[0].hidden) return;
-      chart(canvas, lines, { mark: t, level, length });
-      now.textContent = lines.map((line) => value(line.values[Math.min(t, line.values.length - 1)])).join("\n");
+      chart(canvas, lines, { mark: t, level, reach, length });
+      now.textContent = lines.map((line) => shortened(line.values[Math.min(t, line.values.length - 1)])).join("\n");
     });
   };
-  addRow("contact", (one) => one.scores, cards[0]?.clip.threshold ?? null);
-  for (const name of names) addRow(name.replace("label.", ""), (one) => one.clip.curves[name] ?? [null], null);
+  addRow(seen, "contact", (one) => one.scores, cards[0]?.clip.threshold ?? null);
+  for (const name of names) addRow(labels, name.replace("label.", ""), (one) => one.clip.curves[name] ?? [null], null);
   node.hidden = length < 2;
   const draw = (t) => {
     slider.value = t;
     clock.textContent = `${t + 1} / ${length}`;
+    for (const name of new Set(cards.flatMap((one) => Object.keys(one.measured)))) {
+      if (added.has(name)) continue;
+      addRow(seen, `measured ${name}`, (one) => one.measured[name] ?? [null], null, REACH[name]);
+      added.add(name);
+    }
     if (length > 1) rows.forEach((row) => row(t));
   };
   return { node, playing, draw };
@@ -351,15 +368,21 @@ function showTable(source, about, start = 0) {
   const same = (name) => String(about.filters[name]) === String(about.filters[name.replace("label.", "")]);
   Object.keys(about.filters).filter((name) => !name.startsWith("label.") || !same(name)).forEach((name) => addFilter(name, about.filters[name]));
   const step = (by) => () => { if (count) go((place + by + count) % count); };
-  const layers = layerBar(about.layers, () => move(t));
+  const layers = layerBar(about.layers, guard(async () => {
+    const slow = setTimeout(() => say("Opening the encoder. This takes some seconds."), 500);
+    await move(t);
+    clearTimeout(slow);
+    say("");
+    if (length > 1) await measure(asked);
+  }));
   const turning = el("div", { className: "bar push", hidden: true }, el("button", { onclick: step(-1), ariaLabel: "previous touch" }, "←"), number, total,
     el("button", { onclick: step(1), ariaLabel: "next touch" }, "→"));
   filterBox.hidden = !filterBar.children.length;
   main.replaceChildren(el("div", { className: "bar" }, el("div", {}, title, subtitle), turning), filterBox, layers.node, clips, below);
-  keys([["ArrowLeft", "previous touch", step(-1)], ["ArrowRight", "next touch", step(1)],
+  keys([...(about.touches > 1 ? [["ArrowLeft", "previous touch", step(-1)], ["ArrowRight", "next touch", step(1)]] : []),
     [" ", "play or pause", () => axis.playing.click()], [",", "frame back", () => { pause(); move(t - 1); }],
     [".", "frame on", () => { pause(); move(t + 1); }], ["l", "next layer", layers.next],
-    ["f", "filters", () => { filterBox.open = true; filterBar.querySelector("select, input")?.focus(); }]]);
+    ...(filterBox.hidden ? [] : [["f", "filters", () => { filterBox.open = true; filterBar.querySelector("select, input")?.focus(); }]])]);
   const resized = () => axis.draw(t);
   window.addEventListener("resize", resized);
   state.stop = () => { pause(); asked++; window.removeEventListener("resize", resized); };
@@ -370,7 +393,7 @@ function showTable(source, about, start = 0) {
 
 function showStart(source, about) {
   const examples = state.sources.findIndex((one) => one.kind === "table"), thumbs = el("div", { className: "thumbs" });
-  thumbs.style.setProperty("--thumb", "150px");
+  thumbs.style.setProperty("--thumb", "min(48%, 172px)"); // six in a row, or three, or two
   const open = guard(async (camera) => {
     say("Opening the camera and its encoder. This takes some seconds.");
     const { source: place } = await (await order(source, { camera })).json();

@@ -8,6 +8,7 @@ headers, and every change needs a header that another site cannot send.
 from __future__ import annotations
 
 import hmac
+import json
 import secrets
 import socket
 from collections.abc import Callable, Sequence
@@ -43,7 +44,7 @@ if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest need
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 HEADER = "x-anytouch"  # of every request that changes something: another site would need CORS to send it
-_SCRIPTS = ("page.js", "space.js", "live.js")
+_SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
 _ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
 _POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob: data:"
 _SAFE = {
@@ -148,8 +149,13 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
         return _json(table.touch(place, filters))
 
     def frame(request: Request, table: Table) -> Response:
-        view, score = table.layer(request.path_params["row"], _layer(request))
-        return _picture(view, {"X-Score": "" if np.isnan(score) else f"{score:.2f}"})
+        view, score, fields = table.layer(request.path_params["row"], _layer(request))
+        headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
+        if fields is not None:
+            from anytouch_jax.view.measured import field_numbers
+
+            headers["X-Fields"] = json.dumps(field_numbers(fields))
+        return _picture(view, headers)
 
     def recorded(request: Request, live: Live) -> Response:
         if live.teacher.table is None:

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -29,12 +29,17 @@ from anytouch_jax.data.prepare.untouched_gel import UntouchedGel, contact_score,
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.errors import UserError
 
+if TYPE_CHECKING:
+    from anytouch_jax.encoder.fields import Fields
+
 Array = npt.NDArray[Any]
 UNKNOWN, UNUSED = "unknown", "unused"  # the sensor and the split of a folder or a film, which the page leaves out
 EXAMPLES = Path(encoder.__file__).with_name("examples")  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg
-LAYERS = ("frame", "difference", "contact")  # of a touch, by which the page shows it
+LAYERS = ("frame", "difference", "contact", "depth", "surface")  # of a touch, by which the page shows it
+MEASURED = LAYERS[3:]  # those that an encoder measures
 SIDE = 640  # pixels of the long side of a picture on the page
 _MOST_ROWS, _MOST_CLIPS, _MOST_CHOICES = 5000, 12, 500  # frames of a clip, clips of a touch, values of a filter
+_CLIP = 3  # frames on which a touch is measured
 _LINES = 2_000  # points of a loss curve on the page
 _BLOCK = 1 << 22  # bytes of metrics.jsonl that are read at once
 _FILTERS = ("sensor", "object", "split", "dataset", "unit")
@@ -49,7 +54,7 @@ class Table:
     def __init__(self, manifest: Manifest, name: str, film: Path | None = None) -> None:
         self.manifest, self.name = manifest, name
         self._film = None if film is None else _Film(film)
-        self._chosen = lru_cache(8)(self._choose)
+        self._chosen, self._measured = lru_cache(8)(self._choose), lru_cache(256)(self._measure)
 
     def about(self) -> dict[str, Any]:
         """Return the number of rows and touches, and the columns that filter them with their values."""
@@ -91,9 +96,29 @@ class Table:
         self._check(row)
         return decode(self.manifest.file(row, "image_path"))
 
-    def layer(self, row: int, name: str) -> tuple[Array, float]:
-        """Return a layer of a row (see `touch_layer`) and its contact score, NaN without an untouched gel."""
-        return touch_layer(self.frame(row), self._untouched(row), self.threshold(row), name)
+    def layer(self, row: int, name: str) -> tuple[Array, float, Fields | None]:
+        """Return a layer of a row (see `touch_layer`), its contact score, NaN without an untouched gel, and its fields.
+
+        Fields are for the layers MEASURED.
+        """
+        frame, gel = self.frame(row), self._untouched(row)
+        view, score = touch_layer(frame, gel, self.threshold(row), name)
+        if name not in MEASURED or gel is None or score != score:
+            return view, score, None
+        from anytouch_jax.view.measured import measured_layer
+
+        fields = self._measured(row)
+        return measured_layer(view, fields, name), score, fields
+
+    def _measure(self, row: int) -> Fields:
+        from anytouch_jax.view.measured import measure_recorded
+
+        order, starts = self._order
+        end = self._position(row) + 1
+        rows = order[max(starts[starts < end][-1], end - _CLIP) : end].tolist()
+        gel, sensor = self._untouched(row), self.manifest.value(row, "sensor")
+        frames = [self.frame(one) for one in rows]
+        return measure_recorded(frames, gel and gel[0], None if sensor == UNKNOWN else sensor)
 
     def threshold(self, row: int) -> float:
         """Return the contact score above which a frame of the row's sensor shows contact."""
@@ -228,9 +253,9 @@ def touch_layer(
 ) -> tuple[Array, float]:
     """Return one of LAYERS as a picture RGB u8 (h, w, 3), and the contact score.
 
-    They are the frame, its difference from the untouched gel as an encoder reads it, and its contact. Without a `gel`
-    (scaled down) of the same proportions, the frame is returned, and the score is NaN. Raises UserError for another
-    name.
+    They are the frame, its difference from the untouched gel as an encoder reads it, and its contact. For MEASURED, it
+    is the frame, which is not measured here. Without a `gel` (scaled down) of the same proportions, the frame is
+    returned, and the score is NaN. Raises UserError for another name.
     """
     if name not in LAYERS:
         raise UserError(f"A touch has the layers {', '.join(LAYERS)}, not {name[:20]}.")

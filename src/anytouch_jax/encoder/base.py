@@ -35,9 +35,7 @@ from anytouch_jax.encoder.arrays import (
     run_in_batches,
     warn,
 )
-from anytouch_jax.encoder.cached_export import cached_export
 from anytouch_jax.encoder.engines import EngineChoice
-from anytouch_jax.encoder.export import Exported
 from anytouch_jax.encoder.fields import Fields, Measure, missing, output_of, scale_of
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.nn.attention import usable
@@ -59,7 +57,7 @@ class Encoder:
     is None if the weights do not store them. If training never drew the universal tokens (`universal_drawn`), the mean
     of the trained sensors' tokens is used instead. `others` are the parameters of towers, decoder and heads of the
     `whole` model: they stay on the host until they are used. `tokenizer_file` is None without a tokenizer.json.
-    `engine` computes touch, by `cached_export`; all else is computed by XLA.
+    `engine` computes touch by what `exporter` returns (`cached_export`); XLA computes all else.
     """
 
     config: Config = field(repr=False)
@@ -72,6 +70,7 @@ class Encoder:
     tokenizer_file: Path | None = field(default=None, repr=False)
     metadata: Mapping[str, Any] = field(default_factory=dict, repr=False)
     engine: EngineChoice = field(default="xla", repr=False)
+    exporter: Callable[..., Any] | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         return described(f"{type(self).__name__} {self.source}", **self.about())
@@ -223,14 +222,14 @@ class Encoder:
             return run(frames, rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors)))
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
 
-    def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Exported | None:
+    def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Any:
         """Return the export on its engine for touches of `frames` frames, None if XLA computes them."""
-        if self.engine == "xla":
+        if self.engine == "xla" or self.exporter is None:
             return None
         refuse_forked()
         key = ("exported", frames, pooling, fields)
         if key not in self._compiled:
-            self._compiled[key] = cached_export(self, frames, pooling, fields=fields)
+            self._compiled[key] = self.exporter(self, frames, pooling, fields=fields)
         return self._compiled[key]
 
     def _encode(self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any) -> np.ndarray:

@@ -72,7 +72,7 @@ def _made(
             export(encoder, path, frames=frames, pooling=pooling, form="onnx", fields=fields, engine=engine)
             return load(path, engine)
         except CheckError as error:
-            describes(path).write_text(json.dumps({"refused": str(error)}))
+            atomic_write(describes(path), json.dumps({"refused": str(error)}))
             raise
         finally:
             files = {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir())}  # the description last

@@ -22,6 +22,7 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import export
 from anytouch_jax.encoder.arrays import METADATA, Join, Pooling, check_frames, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips, random_encoder, touch_features, touch_only
+from anytouch_jax.encoder.cached_export import cached_export
 from anytouch_jax.encoder.engines import Engine, EngineChoice
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.encoder.fields import missing
@@ -82,6 +83,7 @@ def load_encoder(
     encoder = Encoder(
         touch_only(loaded.config), {"touch": loaded.params["touch"]}, name, loaded.trained_sensors,
         loaded.universal_drawn, loaded.config.model, others, find_tokenizer(path), loaded.metadata, engine,
+        cached_export,
     )  # fmt: skip
     return encoder if engine in ("auto", "xla") else encoder.computed_in("float32")
 

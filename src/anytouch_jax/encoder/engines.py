@@ -6,7 +6,6 @@ of `nn.touch`.
 
 from __future__ import annotations
 
-import importlib
 import operator
 import os
 import sys
@@ -270,8 +269,14 @@ def imported(engine: Engine) -> Any:
     if engine == "openvino":
         silenced: dict[str, Any] = {"openvino_telemetry": None}  # it forks, to report what is run
         sys.modules.update(silenced)
-    with _needed("openvino" if engine == "openvino" else "anytouch_jax[engines]"):
-        return importlib.import_module(engine)
+        with _needed("openvino"):
+            import openvino
+
+            return openvino
+    with _needed("anytouch_jax[engines]"):
+        import onnxruntime
+
+        return onnxruntime
 
 
 def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[..., Any]:

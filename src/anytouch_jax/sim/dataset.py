@@ -35,7 +35,7 @@ from anytouch_jax.sim.world import captions, objects
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches in a part
-VERSION = 5  # a change of the simulator that changes the data of a seed raises it
+VERSION = 6  # a change of the simulator that changes the data of a seed raises it
 Row = dict[str, Any]
 
 

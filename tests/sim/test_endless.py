@@ -66,9 +66,7 @@ SAMPLING = endless.Sampling(frames=1, takes=2, size=32, vision=0.5, fields=("dis
 
 @pytest.fixture(scope="module")
 def drawn(world):
-    return jax.device_get(
-        jax.jit(endless.draw_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12)
-    )
+    return jax.device_get(jax.jit(endless.draw_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12))
 
 
 @pytest.fixture(scope="module")

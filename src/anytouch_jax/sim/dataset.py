@@ -65,11 +65,6 @@ def simulate(
         ) from None
 
 
-def version(sensors: Sequence[str]) -> int:
-    """Return the version of the data that a seed gives for these sensors."""
-    return VERSION
-
-
 def _simulate(
     scenes: Scenes, things: Any, splits: Sequence[str], out: Path, threads: int, progress: Callable[[int, int], None]
 ) -> Path:
@@ -102,7 +97,7 @@ def _simulate(
 
 def _claim(scenes: Scenes, out: Path) -> None:
     """Write the settings into the folder, or check that they equal those of the folder."""
-    settings = {"version": version(scenes.sensors)} | dataclasses.asdict(scenes)
+    settings = {"version": VERSION} | dataclasses.asdict(scenes)
     for name, default in (("units", "each"), ("first", 0)):  # data sets from before these settings continue
         if settings[name] == default:
             del settings[name]

@@ -168,7 +168,9 @@ def make_world(things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, pl
     rng = np.random.default_rng([seed, _PLACES])
     spots = np.stack([[draw_place(rng)[0] for _ in range(places)] for _ in things]).astype(np.float32)
     kinds = [SENSORS[name] for name in sensors]
-    return World(relief, material, stack_trees([family(one) for one in kinds]), np.stack([*map(untouched, kinds)]), spots)
+    return World(
+        relief, material, stack_trees([family(one) for one in kinds]), np.stack([*map(untouched, kinds)]), spots
+    )
 
 
 def over_cores(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
@@ -256,8 +258,8 @@ def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -
 
     number = jnp.arange(sampling.takes)
     keys = jax.vmap(lambda n: jax.random.fold_in(jax.random.fold_in(key, 0), n))(number)
-    sensor, *inputs = jax.vmap(take)(keys, number)
-    return DrawnTouches(sensor, thing, photo, *inputs)
+    sensor, clip, numbers, pitch = jax.vmap(take)(keys, number)
+    return DrawnTouches(sensor, thing, photo, clip, numbers, pitch)
 
 
 def _cropped(rng: Draws) -> Array:

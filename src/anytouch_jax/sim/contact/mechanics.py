@@ -205,9 +205,7 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
     return Solution(factor * end.x, excess, complementarity(factor * end.x, excess), end.iterations)
 
 
-def sideways(
-    pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False
-) -> Array:
+def sideways(pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False) -> Array:
     """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W) kPa alone.
 
     A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more under a wide block.

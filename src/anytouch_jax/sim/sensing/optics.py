@@ -109,10 +109,11 @@ def render(
     """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
 
     The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
-    mm (x, y) moves the markers. It may be on a coarser grid. None is an untouched gel. `key` draws the noise, and None omits it. `resolution` is (height, width), by default
-    square pixels with a short side of 224. `photometry` replaces that of the sensor. `sensor` and `resolution` are
-    static under jit. `behind` is the `backdrop` of the same unit and resolution. `drift` (3, 3) changes the light
-    (`sensors.draw_drift`). `stretched` is as in `picture_view`. Raises UserError for a sensor without a camera.
+    mm (x, y), on that grid or a coarser one, moves the markers. None is an untouched gel. `key` draws the noise, and
+    None omits it. `resolution` is (height, width), by default square pixels with a short side of 224. `photometry`
+    replaces that of the sensor. `sensor` and `resolution` are static under jit. `behind` is the `backdrop` of the same
+    unit and resolution. `drift` (3, 3) changes the light (`sensors.draw_drift`). `stretched` is as in `picture_view`.
+    Raises UserError for a sensor without a camera.
     """
     resolution = resolution or picture_size(sensor)
     place = picture_view(sensor, unit, resolution, stretched=stretched)

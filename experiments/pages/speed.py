@@ -34,7 +34,7 @@ def speed(folder: Path) -> Page:
     tried, families, variants = (read_records(folder / f"{name}.jsonl") for name in names)
     spent = [(one["question"], one["answer"], one["figure"]) for one in tried.values() if one.get("speed")]
     gpu = any(one["machine"]["device"] != "cpu" for one in variants.values())
-    words = {"gpu": "" if gpu else "No figure of a GPU is recorded. `make bench-gpu` measures yours."}
+    words = {"gpu": "" if gpu else "No step is measured on a GPU. `make bench-gpu` measures yours."}
     own = [Table(f"On {kind}", HEAD, rows) for kind, rows in by_kind.items()]
     tables = [*own, simulated_table(folder), spent, families_table(families)]
     return Page(

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.pages.page import Measure
+import numpy as np
+
+from experiments.pages.page import Measure, Table
 from experiments.records import Record, read_records
 from experiments.values import Value
 
 WORKS = ("one touch", "stage1 clips", "stage2 align", "embed clips")  # in the order of their rows
 HEAD = ("work", "way", Measure("ms"), Measure("time / ours in float32", ".2f"), Measure("error", ".0e"))
+SIMULATED = (
+    "device",
+    "touches",
+    Measure("frames/s", ",.0f"),
+    Measure("processor ms a frame", ".2f"),
+    Measure("roofline, %", ".0f"),
+    Measure("mm", ".4f"),
+    Measure("kPa", ".2f"),
+    Measure("grey levels", ".2f"),
+)
 Rows = list[tuple[Any, ...]]
 
 
@@ -47,3 +59,22 @@ def rows_by_kind(folder: Path) -> dict[str, Rows]:
     for rows in result.values():
         rows.sort(key=lambda row: (WORKS.index(row[0].partition(",")[0]), row[0]))
     return result
+
+
+def simulated_table(folder: Path) -> Table:
+    """Return the speed of the simulator and the error of "fast" against "exact": means of sensors, then sensors."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for one in read_records(folder / "simulator.jsonl").values():
+        device = one["machine"]["device"].replace("cpu", one["machine"].get("vectors", ""))
+        kind = f"{one['size']} pixels, {'stills' if one['frames'] == 1 else 'clips'}, {one['fidelity']}"
+        groups.setdefault((device, kind), []).append(one)
+        if one["sensor"] != "all" and (one["size"], one["frames"], one["fidelity"]) == (112, 1, "fast"):
+            groups.setdefault((device, f"{kind}, {one['sensor']}"), []).append(one)
+    names = ("frames_s", "processor_ms", "roofline", "mm", "kpa", "levels")
+    rows = [(*key, *(_mean(found, name) for name in names)) for key, found in sorted(groups.items())]
+    return Table("Simulated touches", SIMULATED, rows)
+
+
+def _mean(found: Sequence[Record], name: str) -> float | None:
+    values = [one[name] for one in found if name in one]
+    return float(np.mean(values)) * (100 if name == "roofline" else 1) if values else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.benchmarks.table import HEAD, Rows, rows_by_kind
+from experiments.benchmarks.table import HEAD, Rows, rows_by_kind, simulated_table
 from experiments.compare.table import families_table
 from experiments.pages.page import Page, Table
 from experiments.records import read_records
@@ -34,9 +34,9 @@ def speed(folder: Path) -> Page:
     tried, families, variants = (read_records(folder / f"{name}.jsonl") for name in names)
     spent = [(one["question"], one["answer"], one["figure"]) for one in tried.values() if one.get("speed")]
     gpu = any(one["machine"]["device"] != "cpu" for one in variants.values())
-    words = {"gpu": "" if gpu else "No figure of a GPU is recorded. `make bench-gpu` measures yours."}
+    words = {"gpu": "" if gpu else "No step is measured on a GPU. `make bench-gpu` measures yours."}
     own = [Table(f"On {kind}", HEAD, rows) for kind, rows in by_kind.items()]
-    tables = [*own, spent, families_table(families)]
+    tables = [*own, simulated_table(folder), spent, families_table(families)]
     return Page(
         "speed", tables, [f"{one} {figure[0].upper()}{figure[1:]}" for one, figure in choices], choices[0], words=words
     )

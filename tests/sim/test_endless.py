@@ -65,27 +65,32 @@ SAMPLING = endless.Sampling(frames=1, takes=2, size=32, vision=0.5, fields=("dis
 
 
 @pytest.fixture(scope="module")
+def drawn(world):
+    return jax.device_get(jax.jit(endless.draw_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12))
+
+
+@pytest.fixture(scope="module")
 def touches(world):
     return jax.device_get(
         jax.jit(endless.sample_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12)
     )
 
 
-def test_touches_have_their_shapes_and_a_key_decides_them(world, touches):
+def test_touches_have_their_shapes_and_a_key_decides_them(world, touches, drawn):
     assert touches.clip.shape == (12, 2, 1, 32, 32, 3) and touches.clip.dtype == np.uint8
     assert touches.fields.shape == (12, 2, 16, 16, 1)
     assert set(touches.sensor.ravel()) == {0, 1} and set(touches.object) <= {0, 1, 2}
     assert -1 in touches.photo and set(touches.photo) <= {-1, 0, 1} and max(touches.photo) >= 0
     assert np.all(touches.labels["depth"].max(-1) > 0), "every still shows a touch"
     photographed = touches.photo >= 0
-    place = touches.inputs[0].place[photographed]
+    place = drawn.clip.place[photographed]
     np.testing.assert_array_equal(place[:, 0], world.places[touches.object[photographed], touches.photo[photographed]])
 
 
-def test_one_program_for_all_sensors_equals_the_program_of_a_sensor(touches):
+def test_one_program_for_all_sensors_equals_the_program_of_a_sensor(touches, drawn):
     """The numbers of the sensor are traced in the one, and constants of `SENSORS` in the other."""
     for row, take in ((0, 0), (1, 1), (2, 0)):
-        clip, numbers, pitch = jax.tree.map(lambda x, at=(row, take): x[at], touches.inputs)
+        clip, numbers, pitch = jax.tree.map(lambda x, at=(row, take): x[at], drawn[3:])
         name = ("digit", "gelsight_mini")[touches.sensor[row, take]]
         field = tuple(float(x) for x in numbers.field)
         sensor = replace(SENSORS[name], field=field)

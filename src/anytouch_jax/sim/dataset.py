@@ -35,7 +35,7 @@ from anytouch_jax.sim.world import captions, objects
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches in a part
-VERSION = 5  # a change of the simulator that changes the data of a seed raises it
+VERSION = 6  # a change of the simulator that changes the data of a seed raises it
 Row = dict[str, Any]
 
 
@@ -63,11 +63,6 @@ def simulate(
         raise UserError(
             f"{error.filename or out}: {error.strerror or error}; finished touches are kept, repeat to continue"
         ) from None
-
-
-def version(sensors: Sequence[str]) -> int:
-    """Return the version of the data that a seed gives for these sensors."""
-    return VERSION
 
 
 def _simulate(
@@ -102,7 +97,7 @@ def _simulate(
 
 def _claim(scenes: Scenes, out: Path) -> None:
     """Write the settings into the folder, or check that they equal those of the folder."""
-    settings = {"version": version(scenes.sensors)} | dataclasses.asdict(scenes)
+    settings = {"version": VERSION} | dataclasses.asdict(scenes)
     for name, default in (("units", "each"), ("first", 0)):  # data sets from before these settings continue
         if settings[name] == default:
             del settings[name]

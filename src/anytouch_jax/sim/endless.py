@@ -40,7 +40,7 @@ _BASE = 40  # pixels of an untouched gel's side
 
 
 class SensorFamily(NamedTuple):
-    """The numbers of a family of sensors, as arrays: `sensors.Sensor`, its look and its untouched gels."""
+    """The numbers of a family of sensors, as arrays: `sensors.Sensor` and its look."""
 
     field: Any  # (2,) mm
     gel: Any  # (2,) modulus kPa, thickness mm
@@ -48,7 +48,6 @@ class SensorFamily(NamedTuple):
     markers: Any  # (5,) pitch mm, radius mm, aspect, share, bend
     ink: Any  # (3,)
     photometry: Photometry
-    gels: Any  # (MOST_BASES, 40, 40, 3) untouched gels in 0..1, black where there are fewer
 
 
 class World(NamedTuple):
@@ -57,6 +56,7 @@ class World(NamedTuple):
     relief: Any  # f16 (n, RELIEF, RELIEF) mm
     material: Any  # f32 (n, 2) modulus kPa, friction
     families: SensorFamily  # stacked over the sensors
+    gels: Any  # f32 (sensors, MOST_BASES, 40, 40, 3) untouched gels in 0..1, black where there are fewer
     places: Any  # f32 (n, P, 2) mm, places of each object of which there is a photograph
 
 
@@ -96,18 +96,22 @@ class SimulatedTouches(NamedTuple):
     aspect: Any  # f32 (B, M) logarithm of the height over the width that the picture shows
     modulus: Any  # f32 (B, M) kPa of the family's gel
     labels: dict[str, Any]  # f32 (B, M, T) each, see `recorder.ClipOutput`
-    inputs: tuple[
-        ClipInput, SensorFamily, Any
-    ]  # clip, family and pitch mm that were simulated, with leading axes (B, M)
+
+
+class DrawnTouches(NamedTuple):
+    """What is simulated for touches of B places by M takes each. `sensor`, `object` and `photo` are as above."""
+
+    sensor: Any
+    object: Any
+    photo: Any
+    clip: ClipInput  # this and the next two have leading axes (B, M)
+    numbers: SensorFamily
+    pitch: Any  # mm of the solve grid
 
 
 def family(sensor: Sensor) -> SensorFamily:
     """Return the numbers of a camera sensor. Raises UserError for a field sensor."""
     photometry = look(sensor)
-    real = bases(sensor)[:MOST_BASES]
-    gels = np.zeros((MOST_BASES, _BASE, _BASE, 3), np.float32)
-    rows, columns = (np.rint(np.linspace(0, n - 1, _BASE)).astype(int) for n in real.shape[1:3])
-    gels[: len(real)] = np.maximum(real[:, rows][:, :, columns], 1e-3)
     markers = sensor.markers or Markers(pitch=2.0, radius=0.3, share=0.0)
     shade = (sensor.skin, sensor.contrast, sensor.vignette, sensor.halo, sensor.noise)
     lattice = (markers.pitch, markers.radius, markers.aspect, markers.share, markers.bend)
@@ -115,7 +119,16 @@ def family(sensor: Sensor) -> SensorFamily:
     numbers = (sensor.field, (sensor.gel.modulus, sensor.gel.thickness), shade, lattice, markers.ink)
     field, gel, shades, dots, ink = (np.asarray(x, np.float32) for x in numbers)
     light = jax.tree.map(lambda x: np.asarray(x, np.float32), photometry._replace(widest=widest))
-    return SensorFamily(field, gel, shades, dots, ink, light, gels)
+    return SensorFamily(field, gel, shades, dots, ink, light)
+
+
+def untouched(sensor: Sensor) -> np.ndarray:
+    """Return the untouched gels of a sensor as f32 (MOST_BASES, 40, 40, 3) in 0..1, black where there are fewer."""
+    real = bases(sensor)[:MOST_BASES]
+    gels = np.zeros((MOST_BASES, _BASE, _BASE, 3), np.float32)
+    rows, columns = (np.rint(np.linspace(0, n - 1, _BASE)).astype(int) for n in real.shape[1:3])
+    gels[: len(real)] = np.maximum(real[:, rows][:, :, columns], 1e-3)
+    return gels
 
 
 def as_sensor(numbers: SensorFamily) -> Sensor:
@@ -154,7 +167,10 @@ def make_world(things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, pl
     material = np.array([(thing.material.modulus, thing.material.friction) for thing in things], np.float32)
     rng = np.random.default_rng([seed, _PLACES])
     spots = np.stack([[draw_place(rng)[0] for _ in range(places)] for _ in things]).astype(np.float32)
-    return World(relief, material, stack_trees([family(SENSORS[name]) for name in sensors]), spots)
+    kinds = [SENSORS[name] for name in sensors]
+    return World(
+        relief, material, stack_trees([family(one) for one in kinds]), np.stack([*map(untouched, kinds)]), spots
+    )
 
 
 def over_cores(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
@@ -170,15 +186,23 @@ def sample_touches(
 
     The second take is by the family `gallery`, if given. A key gives the same touches on one machine.
     """
-    keys = jax.random.split(key, count)
-    sensor, thing, photo, inputs = jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
-    out = jax.vmap(jax.vmap(partial(simulate_take, sampling=sampling)))(*inputs)
-    field = inputs[1].field
+    drawn = draw_touches(key, world, sampling, count, gallery)
+    out = jax.vmap(jax.vmap(partial(simulate_take, sampling=sampling)))(drawn.clip, drawn.numbers, drawn.pitch)
+    field = drawn.numbers.field
     fields = None if out.field is None else out.field[:, :, -1]
     return SimulatedTouches(
-        out.image, out.background, sensor, thing, photo, fields, field[..., 1] * inputs[0].unit.zoom,
-        jnp.log(field[..., 0] / field[..., 1]), inputs[1].gel[..., 0], out.labels, inputs,
+        out.image, out.background, drawn.sensor, drawn.object, drawn.photo, fields,
+        field[..., 1] * drawn.clip.unit.zoom, jnp.log(field[..., 0] / field[..., 1]), drawn.numbers.gel[..., 0],
+        out.labels,
     )  # fmt: skip
+
+
+def draw_touches(
+    key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None
+) -> DrawnTouches:
+    """Return what `sample_touches` simulates for the same arguments."""
+    keys = jax.random.split(key, count)
+    return jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
 
 
 def simulate_take(clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling: Sampling) -> ClipOutput:
@@ -188,10 +212,8 @@ def simulate_take(clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling
     return simulate_clip(clip, sensor=as_sensor(numbers), fidelity=sampling.fidelity, fields=sampling.fields, view=view)
 
 
-def _draw(
-    key: Array, world: World, sampling: Sampling, gallery: Array | None
-) -> tuple[Array, Array, Array, tuple[ClipInput, SensorFamily, Array]]:
-    """Return the sensors (M,), the object, its photograph, and what is simulated for all takes of one touch."""
+def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -> DrawnTouches:
+    """Return what is simulated for all takes of one touch."""
     rng = Draws(key)
     thing = rng.integers(len(world.relief))
     place, yaw = draw_place(rng)
@@ -203,14 +225,14 @@ def _draw(
     gesture = draw_gesture(sampling.depth, rng)
     by_hand = rng.uniform() < sampling.coarse
     steps = sampling.frames - 1
-    relief = world.relief[thing].astype(jnp.float32)
+    relief = world.relief[thing]
 
-    def take(key: Array, number: Array) -> tuple[Array, tuple[ClipInput, SensorFamily, Array]]:
-        rng, families = Draws(key, 2048), len(world.families.gels)  # blotches are 1,600 values
+    def take(key: Array, number: Array) -> tuple[Array, ClipInput, SensorFamily, Array]:
+        rng, families = Draws(key, 2048), len(world.gels)  # blotches are 1,600 values
         sensor = rng.integers(families)
         if gallery is not None:
             sensor = jnp.where(number == 1, gallery, sensor)
-        numbers = jax.tree.map(lambda x: x[sensor], world.families)
+        own_gels, numbers = sensor, jax.tree.map(lambda x: x[sensor], world.families)
         if sampling.wild:
             is_wild = rng.uniform() < sampling.wild
             other = jax.tree.map(lambda x: x[rng.integers(families)], world.families)
@@ -218,7 +240,7 @@ def _draw(
             sensor = jnp.where(is_wild, families, sensor)
         pitch = jnp.max(numbers.field) / GRID
         numbers = numbers._replace(field=numbers.field * _cropped(rng))
-        unit = draw_unit(as_sensor(numbers), rng, numbers.gels)
+        unit = draw_unit(as_sensor(numbers), rng, world.gels, own_gels)
         unit = unit._replace(mirror=unit.mirror * jnp.stack([jnp.float32(1), rng.choice([-1.0, 1.0])]))  # upside down
         hand = draw_by_hand(sampling.depth, rng, gesture, yaw)
         straight = (gesture, yaw, jnp.zeros(2), jnp.zeros(2))
@@ -232,12 +254,12 @@ def _draw(
             relief, place, jnp.stack([*offset, turn]), motion, depth, tilt, world.material[thing, 0],
             world.material[thing, 1], unit, draw_drift(sampling.frames, rng), rng.integers(2**23).astype(jnp.uint32),
         )  # fmt: skip
-        return sensor, (clip, numbers, pitch)
+        return sensor, clip, numbers, pitch
 
     number = jnp.arange(sampling.takes)
     keys = jax.vmap(lambda n: jax.random.fold_in(jax.random.fold_in(key, 0), n))(number)
-    sensor, inputs = jax.vmap(take)(keys, number)
-    return sensor, thing, photo, inputs
+    sensor, clip, numbers, pitch = jax.vmap(take)(keys, number)
+    return DrawnTouches(sensor, thing, photo, clip, numbers, pitch)
 
 
 def _cropped(rng: Draws) -> Array:
@@ -258,4 +280,4 @@ def wild(one: SensorFamily, other: SensorFamily, rng: Draws) -> SensorFamily:
     radius = pitch * rng.uniform(0.08, 0.28)
     markers = jnp.stack([pitch, radius, rng.uniform(0.7, 1.6), rng.uniform(0.2, 0.9), rng.uniform(0.0, 0.15)])
     ink = rng.choice([0.1, 0.1, 0.9]) + rng.uniform(-0.1, 0.1, (3,))
-    return mixed._replace(photometry=photometry, markers=markers, ink=ink, gels=one.gels)
+    return mixed._replace(photometry=photometry, markers=markers, ink=ink)

@@ -62,9 +62,10 @@ def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.A
     """Return values of a centred `raster` (H, W) with `pitch` mm between pixels at `x`, `y` mm of equal shape.
 
     It is cubic (Catmull-Rom): exact at pixels, with continuous slopes between them. Outside of the raster and at NaN it
-    is the lowest value on the border. A point costs sixteen reads.
+    is the lowest value on the border. A point costs sixteen reads. A raster of half floats is read as float32.
     """
     rows, columns = raster.shape
+    dtype = jnp.promote_types(raster.dtype, jnp.float32)
     place = (jnp.asarray(y) / pitch + (rows - 1) / 2, jnp.asarray(x) / pitch + (columns - 1) / 2)
     index, weights, inside = [], [], jnp.ones(place[0].shape, bool)
     for at, count in zip(place, (rows, columns), strict=True):
@@ -72,14 +73,14 @@ def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.A
         inside = inside & (at >= -slack) & (at <= count - 1 + slack)
         at = jnp.clip(jnp.nan_to_num(at), 0, count - 1)
         first = jnp.floor(at)
-        weights.append(_cubic_weights((at - first).astype(raster.dtype)))
+        weights.append(_cubic_weights((at - first).astype(dtype)))
         index.append([jnp.clip(first.astype(jnp.int32) + i, 0, count - 1) for i in (-1, 0, 1, 2)])
     flat = jnp.asarray(raster).reshape(-1)
-    total = jnp.zeros(inside.shape, raster.dtype)
+    total = jnp.zeros(inside.shape, dtype)
     for row, across in zip(index[0], weights[0], strict=True):
         line = jnp.zeros_like(total)
         for column, along in zip(index[1], weights[1], strict=True):
             line = line + along * flat.at[row * columns + column].get(mode="promise_in_bounds")
         total = total + across * line
     border = jnp.concatenate([raster[0], raster[-1], raster[:, 0], raster[:, -1]])
-    return jnp.where(inside, total, jnp.min(border))
+    return jnp.where(inside, total, jnp.min(border).astype(dtype))

@@ -100,7 +100,7 @@ class View(NamedTuple):
     """How a sensor is solved and shown: the grid (rows, columns), its `pitch` mm, and the image (height, width).
 
     `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields` is the (height,
-    width) of the requested fields, that of the image if None.
+    width) of the requested fields of the last frame. If it is None, all frames have fields, in the size of the image.
     """
 
     grid: tuple[int, int]
@@ -127,7 +127,7 @@ def simulate_clip(
     press = partial(mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus)
     relief = surfaces(clip, x, y)
     contact = jax.vmap(press)(relief, clip.depth)
-    squeezed = jax.vmap(lambda p: mechanics.sideways(p, gel, pitch, fidelity=fidelity))(contact.pressure)
+    squeezed = jax.vmap(lambda p: mechanics.sideways(p, gel, pitch, fidelity=fidelity, coarse=True))(contact.pressure)
     sheared = _sheared(clip, contact, squeezed, gel, pitch, fidelity)
     sheared = sheared._replace(displacement=sheared.displacement + squeezed)
     labels = _labels(clip, contact, sheared, pitch) | {"depth": _depth(clip, relief)}
@@ -137,7 +137,7 @@ def simulate_clip(
     if sensor.kind == "field":
         points, noise = sensor.resolution[0], clip.unit.noise
         measure = partial(optics.measure_field, pitch=pitch, points=points, noise=noise, gel=gel)
-        measured = jax.vmap(lambda *maps: measure(*maps[:-1], key=maps[-1]))(
+        measured = jax.vmap(lambda z, xy, *maps: measure(z, mechanics.enlarged(xy, z.shape), *maps[:-1], key=maps[-1]))(
             contact.displacement, sheared.displacement, contact.pressure, sheared.traction, keys[1:]
         )
         return ClipOutput(None, None, measured, labels)
@@ -149,6 +149,8 @@ def simulate_clip(
     )
     background = optics.background(key=keys[0], **look)
     onto_picture = partial(optics.onto_picture, pitch=pitch, resolution=view.fields or view.image, **shown)
+    if view.fields:
+        contact, sheared = jax.tree.map(lambda x: x[-1:], (contact, sheared))
     mapped = _fields(fields, contact, sheared, onto_picture)
     return ClipOutput(image, background, mapped, labels)
 
@@ -156,19 +158,19 @@ def simulate_clip(
 def _sheared(
     clip: ClipInput, contact: PressResult, squeezed: Array, gel: Gel, pitch: float, fidelity: Fidelity
 ) -> shear.Shear:
-    """Return the tangential state of every frame, computed from the previous one."""
+    """Return the tangential state of every frame, computed from the previous one, its motion on the coarse grid."""
 
     slide = partial(shear.shear_step, gel=gel, pitch=pitch, friction=clip.friction, fidelity=fidelity,
-                    modulus_object=clip.modulus, centre=clip.unit.offset)  # fmt: skip
+                    modulus_object=clip.modulus, centre=clip.unit.offset, coarse=True)  # fmt: skip
 
-    def step(state: shear.Shear, frame: tuple[PressResult, Array, Array]) -> tuple[shear.Shear, shear.Shear]:
-        state = slide(state, frame[0], frame[1], squeezed=frame[2])
-        return state, state
+    def step(traction: Array, frame: tuple[PressResult, Array, Array]) -> tuple[Array, shear.Shear]:
+        state = slide(start._replace(traction=traction), frame[0], frame[1], squeezed=frame[2])
+        return state.traction, state
 
     _, rows, columns = contact.pressure.shape
     start = shear.at_rest((rows, columns), contact.pressure.dtype)
     change = jnp.diff(squeezed, axis=0, prepend=jnp.zeros_like(squeezed[:1]))
-    return jax.lax.scan(step, start, (contact, gel_motion(clip), change))[1]
+    return jax.lax.scan(step, start.traction, (contact, gel_motion(clip), change))[1]
 
 
 def _labels(clip: ClipInput, contact: PressResult, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
@@ -202,7 +204,7 @@ def _fields(
     compute = {
         "displacement": lambda: onto_picture(contact.displacement[..., None]),
         "pressure": lambda: jnp.maximum(onto_picture(contact.pressure[..., None]), 0),  # a spline overshoots at an edge
-        "shear": lambda: onto_picture(sheared.displacement, vectors=True),
+        "shear": lambda: onto_picture(sheared.displacement, vectors=True, grid=contact.pressure.shape[1:]),
     }
     return jnp.concatenate([compute[name]() for name in names], -1) if names else None
 

@@ -9,8 +9,9 @@ from tiny_models import tiny_config
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import convert, load
 from experiments.benchmarks import run as bench
-from experiments.benchmarks import workloads
+from experiments.benchmarks import simulator, workloads
 from experiments.benchmarks.pytorch import run as pytorch
+from experiments.benchmarks.table import simulated_table
 from experiments.records import read_records
 from tests.support.release_keys import release_names
 
@@ -67,3 +68,16 @@ def test_the_rival_gets_the_same_numbers_under_the_authors_names(tmp_path):
     old = "touch_mae_model.touch_decoder_blocks.0.attention.output.dense.weight"
     assert pytorch.renamed(old) == "touch_mae_model.touch_decoder_blocks.0.attention.o_proj.weight"
     assert pytorch.renamed("a.output.dense.bias") == "a.output.dense.bias"  # of the decoder's blocks only
+
+
+@pytest.mark.slow
+def test_the_simulator_is_measured_and_stored(tmp_path):
+    out = tmp_path / "simulator.jsonl"
+    options = "--sensors digit --sizes 28 --frames 2 --batch 2 --rounds 1 --objects 8 --peak-size 64 --out"
+    assert simulator.main([*options.split(), str(out)]) == 0
+    fast, exact = (read_records(out)[f"cpu, 28, 2, digit, {name}"] for name in ("fast", "exact"))
+    assert 0 < fast["mm"] < 0.1 and 0 < fast["levels"] < 10 and "mm" not in exact
+    assert min(fast[name] for name in ("frames_s", "processor_ms", "mflop", "mbyte", "roofline")) > 0
+    rows = simulated_table(tmp_path).rows
+    assert [row[1] for row in rows] == ["28 pixels, clips, exact", "28 pixels, clips, fast"]
+    assert rows[1][5] == fast["mm"]

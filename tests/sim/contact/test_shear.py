@@ -226,3 +226,51 @@ def test_friction_holds_back_what_pressing_squeezes_out(fidelity):
     inward = (partly.traction * jnp.asarray(np.stack([X, Y], -1))).sum(-1)
     assert np.asarray(inward)[inside].max() < 1e-3  # the object pulls toward the middle
     assert np.abs(partly.force).max() < 1e-3 * float(contact.force)
+
+
+@pytest.fixture(scope="module")
+def dragged():
+    """The force along x and the torque of three frames (dx, dy, turn, depth), as a function with its gradient."""
+    gel = Gel(MODULUS, 0.48, 4.0)
+
+    def total(frames, surface, friction):
+        def frame(before, now):
+            contact = press(surface, now[3], gel, 0.3, fidelity="fast", modulus_object=1e6)
+            squeezed = sideways(contact.pressure, gel, 0.3, fidelity="fast", coarse=True)
+            state = shear_step(
+                start._replace(traction=before[0]), contact, now[:3], gel, 0.3, friction, fidelity="fast",
+                modulus_object=1e6, squeezed=squeezed - before[1], coarse=True,
+            )  # fmt: skip
+            return (state.traction, squeezed), (state.force[0], state.twist_torque)
+
+        start = at_rest((N, N))
+        forces = jax.lax.scan(frame, (start.traction, jnp.zeros((N // 2, N // 2, 2))), frames)[1]
+        return jnp.sum(forces[0]) + jnp.sum(forces[1]) / 10
+
+    return jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2)))
+
+
+AWAY = np.hypot(*np.meshgrid(*[(np.arange(N) - (N - 1) / 2) * 0.3] * 2))
+BALL = np.sqrt(np.maximum(25 - AWAY**2, 0)) - 5
+SLIDE = [[0.05, 0.02, 0.01, 0.5], [0.1, 0, 0, 0.5], [0.2, 0.1, 0.05, 0.6]]
+
+
+@pytest.mark.parametrize("surface", [BALL, np.where(AWAY < 0.3, 0, -2.0)], ids=["ball", "spike"])
+@pytest.mark.parametrize("friction", [0.6, 0.05, 0.0])
+def test_gradients_through_frames_are_finite(dragged, surface, friction):
+    """The last steps of a descent are so small that their squares are no numbers."""
+    slips = [[0, 0, 0, 0.5], [1, 0, 0, 0.5], [1, 0, 0, 0.5]]
+    lands = [[0, 0, 0, -1], [0, 0, 0, 0.2], [0.1, 0, 0, 0.5]]
+    lifts = [[0, 0, 0, 0.5], [0.1, 0, 0, -1], [0.1, 0, 0, 0.3]]
+    drawn = np.random.default_rng(0).normal(0, 0.1, (4, 3, 4)) * [1, 1, 1, 3] + [0, 0, 0, 0.3]
+    for frames in (SLIDE, slips, lands, lifts, np.zeros((3, 4)), *drawn):
+        value, slopes = dragged(*(jnp.asarray(x, jnp.float32) for x in (frames, surface, friction)))
+        assert np.isfinite(value) and all(np.isfinite(slope).all() for slope in slopes), frames
+
+
+def test_the_gradient_through_frames_is_that_of_finite_differences(dragged):
+    frames, surface = jnp.asarray(SLIDE, jnp.float32), jnp.asarray(BALL, jnp.float32)
+    slope = dragged(frames, surface, jnp.float32(0.6))[1][0]
+    for at in ((0, 0), (1, 0), (2, 0), (2, 2), (2, 3)):
+        ends = [dragged(frames.at[at].add(step), surface, jnp.float32(0.6))[0] for step in (0.01, -0.01)]
+        np.testing.assert_allclose(slope[at], (ends[0] - ends[1]) / 0.02, rtol=0.1, atol=0.02)

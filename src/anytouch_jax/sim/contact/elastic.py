@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -21,6 +20,7 @@ from jax import Array
 Host = npt.NDArray[np.float64]
 
 FAR = 12.0  # thicknesses of the layer; the motion of a bonded layer decays exponentially and is zero beyond
+DISTANCE: Host = np.linspace(0, FAR, 513)
 # Up to this side length four matrix products are faster than two FFTs (twice as fast at 112, on two cores).
 MATMUL_LIMIT = 144
 
@@ -29,8 +29,8 @@ MATMUL_LIMIT = 144
 class Plan:
     """Fourier transforms of (rows, columns) fields, padded so that a convolution does not wrap around.
 
-    A transform is complex, or for small even sizes a real (2, 2, KH, KW) array. The latter holds the cosine and sine
-    sums of the parts that are even and odd about the centre in x and in y. A symmetric kernel does not mix them.
+    A transform is complex, or for small sizes a real (2, 2, KH, KW) array. The latter holds the cosine and sine sums of
+    the parts that are even and odd about the centre in x and in y. A symmetric kernel does not mix them.
     """
 
     rows: int
@@ -38,48 +38,51 @@ class Plan:
 
     @property
     def padded(self) -> tuple[int, int]:
-        return _smooth(2 * self.rows - 1), _smooth(2 * self.columns - 1)
+        rows, columns = 2 * self.rows, 2 * self.columns
+        if self.matmul:
+            return rows + rows % 4, columns + columns % 4  # of a field with an even number of rows and columns
+        return _smooth(rows - 1), _smooth(columns - 1)
 
     @property
     def matmul(self) -> bool:
-        return max(self.rows, self.columns) <= MATMUL_LIMIT and self.rows % 2 == 0 and self.columns % 2 == 0
+        return max(self.rows, self.columns) <= MATMUL_LIMIT
 
     def forward(self, field: Array) -> Array:
         if not self.matmul:
             return jnp.fft.rfft2(field, self.padded)
-        y, x = _waves(self.rows, self.padded[0], field.dtype), _waves(self.columns, self.padded[1], field.dtype)
-        parts = _split(_split(field, 0), 2)
+        y, x = (_waves(size, field.dtype) for size in self.padded)
+        parts = _split(_split(jnp.pad(field, ((0, self.rows % 2), (0, self.columns % 2))), 0), 2)
         return _einsum("xlj,xykj->xykl", x, _einsum("yki,xyij->xykj", y, parts))
 
     def inverse(self, transform: Array) -> Array:
         if not self.matmul:
             return jnp.fft.irfft2(transform, self.padded)[: self.rows, : self.columns]
-        y, x = _waves(self.rows, self.padded[0], transform.dtype), _waves(self.columns, self.padded[1], transform.dtype)
+        y, x = (_waves(size, transform.dtype) for size in self.padded)
         parts = _einsum("yki,xykj->xyij", y, _einsum("xlj,xykl->xykj", x, transform))
-        return _join(_join(parts, 2), 0)
+        return _join(_join(parts, 2), 0)[: self.rows, : self.columns]
 
     def even(self, transform: Array, spectrum: Array) -> Array:
         """Return the transform of a field's convolution with a kernel that is even in x and in y."""
-        return transform * (spectrum[None, None] if self.matmul else _unfold(spectrum, self.padded[0], 1, jnp))
+        return transform * (spectrum[None, None] if self.matmul else _unfold(spectrum, self.padded[0], 1))
 
     def odd(self, transform: Array, spectrum: Array) -> Array:
         """Return the transform of a field's convolution with a kernel that is odd in x and in y."""
         if not self.matmul:
-            return transform * _unfold(spectrum, self.padded[0], -1, jnp)
+            return transform * _unfold(spectrum, self.padded[0], -1)
         sign = jnp.array([[-1, 1], [1, -1]], transform.dtype)[:, :, None, None]  # sin(a - b), twice, and i squared
         return sign * transform[::-1, ::-1] * spectrum[None, None]
 
-    def spectrum(self, quadrant: Any, parity: int = 1, xp: ModuleType = np) -> Any:
-        """Return the spectrum of a kernel from its (rows, columns) coefficients at offsets >= 0."""
-        (high, wide), rows, columns = self.padded, self.rows, self.columns
-        half = xp.pad(quadrant, ((0, high // 2 + 1 - rows), (0, wide // 2 + 1 - columns)))
-        whole = _unfold(_unfold(half, high, parity, xp).T, wide, parity, xp).T
-        spectrum = xp.fft.rfft2(whole).real[: high // 2 + 1]
-        if not self.matmul:
-            return spectrum
-        y, x = np.full(high // 2 + 1, 2.0), np.full(wide // 2 + 1, 2.0)
-        y[[0, -1]] = x[[0, -1]] = 1.0
-        return spectrum * xp.asarray(np.outer(y, x) / (high * wide), spectrum.dtype)
+    def spectrum(self, quadrant: Any, parity: int = 1) -> Any:
+        """Return the spectrum of a kernel from its (rows, columns) coefficients at offsets >= 0.
+
+        Products with two small tables are cheaper than a transform of the unfolded kernel.
+        """
+        sizes = zip((self.rows, self.columns), self.padded, strict=True)
+        y, x = (_kernel_table(size, padded, parity, self.matmul) for size, padded in sizes)
+        if isinstance(quadrant, np.ndarray):
+            return parity * (y @ quadrant @ x.T)
+        along = _einsum("ij,lj->il", quadrant, jnp.asarray(x, quadrant.dtype))
+        return parity * _einsum("ki,il->kl", jnp.asarray(y, quadrant.dtype), along)
 
 
 def _smooth(least: int) -> int:
@@ -97,13 +100,24 @@ def _without(size: int, factor: int) -> int:
 
 
 @functools.lru_cache(maxsize=64)
-def _wave_table(size: int, padded: int) -> Host:
-    angle = 2 * np.pi / padded * np.outer(np.arange(padded // 2 + 1), np.arange(size // 2) + 0.5)
+def _wave_table(padded: int) -> Host:
+    angle = 2 * np.pi / padded * np.outer(np.arange(padded // 2 + 1), np.arange(padded // 4) + 0.5)
     return np.stack([np.cos(angle), np.sin(angle)])
 
 
-def _waves(size: int, padded: int, dtype: Any) -> Array:
-    return jnp.asarray(_wave_table(size, padded), dtype)
+@functools.lru_cache(maxsize=64)
+def _kernel_table(size: int, padded: int, parity: int, weighted: bool) -> Host:
+    """Return the sums (padded / 2 + 1, size) of a kernel that is even or odd, weighted as `Plan.inverse` needs it."""
+    wave, offset = np.arange(padded // 2 + 1), np.arange(size)
+    angle = 2 * np.pi / padded * np.outer(wave, offset)
+    table = np.cos(angle) * np.where(offset > 0, 2, 1) if parity > 0 else 2 * np.sin(angle)
+    if weighted:
+        table *= np.where(wave % (padded // 2) > 0, 2, 1)[:, None] / padded
+    return table
+
+
+def _waves(padded: int, dtype: Any) -> Array:
+    return jnp.asarray(_wave_table(padded), dtype)
 
 
 def _einsum(formula: str, a: Array, b: Array) -> Array:
@@ -123,9 +137,9 @@ def _join(parts: Array, axis: int) -> Array:
     return jnp.concatenate([jnp.flip(even - odd, axis), even + odd], axis)
 
 
-def _unfold(half: Any, size: int, parity: int, xp: ModuleType) -> Any:
+def _unfold(half: Array, size: int, parity: int) -> Array:
     """Return all `size` rows in FFT order from rows 0 .. size/2."""
-    return xp.concatenate([half, parity * half[1 : size // 2][::-1]], 0)
+    return jnp.concatenate([half, parity * half[1 : size // 2][::-1]], 0)
 
 
 def normal_coefficients(rows: int, columns: int) -> Host:
@@ -185,28 +199,27 @@ def sideways_symbol(wave: Host, poisson: float) -> Host:
 
 
 @functools.lru_cache(maxsize=1)
-def _hankel() -> tuple[Host, Host, Host, Host, Host]:
-    """Return waves, quadrature weights, distances, and J0 and J2 of distance times wave (distances, waves)."""
+def _hankel() -> tuple[Host, Host, Host, Host]:
+    """Return waves, quadrature weights, and J0 and J2 of `DISTANCE` times wave (distances, waves)."""
     nodes, weights = np.polynomial.legendre.leggauss(128)
     wave, weights = 7.0 * (nodes + 1), 7.0 * weights
-    distance = np.linspace(0, FAR, 513)
     turn = (np.arange(200) + 0.5) * np.pi / 200
-    phase = np.outer(distance, wave)[..., None] * np.sin(turn)
-    return wave, weights, distance, np.cos(phase).mean(-1), np.cos(2 * turn - phase).mean(-1)
+    phase = np.outer(DISTANCE, wave)[..., None] * np.sin(turn)
+    return wave, weights, np.cos(phase).mean(-1), np.cos(2 * turn - phase).mean(-1)
 
 
 @functools.lru_cache(maxsize=8)
-def layer_tables(poisson: float) -> tuple[Host, Host, Host, Host]:
-    """Return distances over thickness, and the motions of a half-space minus those of a layer by a point load there.
+def layer_tables(poisson: float) -> tuple[Host, Host, Host]:
+    """Return the motions of a half-space minus those of a layer by a point load at `DISTANCE` thicknesses.
 
     The motions are normal, tangential (mean over directions) and tangential (amplitude of cos 2 phi), in units of
     P / (pi E* thickness).
     """
-    wave, weights, distance, bessel0, bessel2 = _hankel()
+    wave, weights, bessel0, bessel2 = _hankel()
     normal, along, across = (1 - symbol for symbol in layer_symbols(wave, poisson))
     across = across / (1 - poisson)
     twofold = -bessel2 @ (weights * (along - across) / 2)
-    return distance, bessel0 @ (weights * normal), bessel0 @ (weights * (along + across) / 2), twofold
+    return bessel0 @ (weights * normal), bessel0 @ (weights * (along + across) / 2), twofold
 
 
 def is_infinite(value: Any) -> bool:
@@ -215,12 +228,12 @@ def is_infinite(value: Any) -> bool:
 
 
 @functools.lru_cache(maxsize=8)
-def sideways_table(poisson: float) -> tuple[Host, Host, float]:
-    """Return distances d over thickness, the smooth part of `sideways_kernel` there, and the factor of asinh(2 / d)."""
-    wave, weights, distance, bessel0, _ = _hankel()
+def sideways_table(poisson: float) -> tuple[Host, float]:
+    """Return the smooth part of `sideways_kernel` at `DISTANCE` d thicknesses, and the factor of asinh(2 / d)."""
+    wave, weights, bessel0, _ = _hankel()
     rest = (1 - 2 * poisson) / (2 * (1 - poisson))  # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
     smooth = (sideways_symbol(wave, poisson) + rest * np.expm1(-2 * wave)) / wave
-    return distance, bessel0 @ (weights * smooth), rest
+    return bessel0 @ (weights * smooth), rest
 
 
 def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Array:
@@ -228,16 +241,22 @@ def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtyp
 
     Its gradient is the sideways motion of a layer's surface by a load on a pixel.
     """
-    distance, table, rest = sideways_table(poisson)
+    table, rest = sideways_table(poisson)
     radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))  # at 0 the mean of log r over a pixel
     far = jnp.asarray(radius, dtype) * jnp.asarray(pitch / thickness, dtype)
-    smooth = jnp.interp(far, jnp.asarray(distance, dtype), jnp.asarray(table, dtype))
-    return jnp.where(far < FAR, smooth + rest * jnp.arcsinh(2 / far), 0)
+    return jnp.where(far < FAR, _between(far, table) + rest * jnp.arcsinh(2 / far), 0)
 
 
-def _looked_up(far: Array, distance: Host, table: Host, limit: float) -> Array:
-    near = jnp.interp(far, jnp.asarray(distance, far.dtype), jnp.asarray(table, far.dtype))
-    return jnp.where(far < FAR, near, limit / jnp.maximum(far, FAR))
+def _between(far: Array, table: Host) -> Array:
+    """Return values between those of a table at `DISTANCE`. Equal steps need no search."""
+    step = far / DISTANCE[1]
+    left = jnp.clip(step.astype(jnp.int32), 0, len(table) - 2)
+    lines = jnp.asarray(np.stack([table[:-1], np.diff(table)], 1), far.dtype)[left]
+    return lines[..., 0] + (step - left) * lines[..., 1]
+
+
+def _looked_up(far: Array, table: Host, limit: float) -> Array:
+    return jnp.where(far < FAR, _between(far, table), limit / jnp.maximum(far, FAR))
 
 
 def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
@@ -246,9 +265,9 @@ def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, shar
     if is_infinite(thickness):
         return deep
     scale = jnp.asarray(pitch / thickness, dtype)
-    distance, table, _, _ = layer_tables(poisson)
+    table, _, _ = layer_tables(poisson)
     radius = jnp.asarray(_radius(plan), dtype) * scale
-    return deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, distance, table, 1.0), 1, jnp)
+    return deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, table, 1.0))
 
 
 def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
@@ -257,14 +276,14 @@ def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, s
     if is_infinite(thickness):
         return deep
     scale = jnp.asarray(pitch / thickness, dtype)
-    distance, _, mean, twofold = layer_tables(poisson)
+    _, mean, twofold = layer_tables(poisson)
     radius = jnp.asarray(_radius(plan), dtype) * scale
     ratio = poisson / (1 - poisson)
-    mean_at = share * scale / np.pi * _looked_up(radius, distance, mean, 1 + ratio / 2)
-    twofold_at = share * scale / np.pi * _looked_up(radius, distance, twofold, ratio / 2)
+    mean_at = share * scale / np.pi * _looked_up(radius, mean, 1 + ratio / 2)
+    twofold_at = share * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
     cosine, sine = (jnp.asarray(table, dtype) for table in _twice_the_angle(plan))
     parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)
-    return deep - jnp.stack([plan.spectrum(part, p, jnp) for part, p in zip(parts, (1, -1, 1), strict=True)])
+    return deep - jnp.stack([plan.spectrum(part, p) for part, p in zip(parts, (1, -1, 1), strict=True)])
 
 
 @functools.lru_cache(maxsize=64)

@@ -24,6 +24,7 @@ from anytouch_jax.sim.contact.solver import (
     complementarity,
     conjugate_gradients,
     descent,
+    ratio,
     scaled,
 )
 
@@ -191,8 +192,7 @@ def _fast(
 def _sharpened(solution: Solution) -> Array:
     """Take one local step without a convolution and with the same load, which removes pressure from gaps."""
     local = jnp.maximum(solution.x - solution.excess / OWN, 0)
-    total = jnp.sum(local)
-    return jnp.where(total > 0, local * (jnp.sum(solution.x) / jnp.where(total > 0, total, 1)), solution.x)
+    return local * ratio(jnp.sum(solution.x), jnp.sum(local), 0.0)
 
 
 def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) -> Solution:
@@ -205,24 +205,29 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
     return Solution(factor * end.x, excess, complementarity(factor * end.x, excess), end.iterations)
 
 
-def sideways(pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact") -> Array:
+def sideways(pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False) -> Array:
     """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W) kPa alone.
 
     A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more under a wide block.
     A compressible one is also drawn toward the load. Friction reduces the motion (`shear_step`). With "fast" it is
-    computed on the coarsest grid. Raises UserError for a gel without a thickness.
+    computed on the coarsest grid, and stays there if `coarse`. Raises UserError for a gel without a thickness.
     """
     if is_infinite(gel.thickness):
         raise UserError("sideways motion needs a bonded layer: set the thickness of the gel")
-    shape, pitch = (*pressure.shape, 2), jnp.asarray(pitch, pressure.dtype)
+    shape, pitch = pressure.shape, jnp.asarray(pitch, pressure.dtype)
     for _ in grids(pressure.shape)[1:] if fidelity == "fast" else ():
         pressure, pitch = halved(pressure), 2 * pitch
     plan = Plan(*pressure.shape)
-    spectrum = plan.spectrum(sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype), 1, jnp)
+    spectrum = plan.spectrum(sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype))
     potential = plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)  # mm
     y, x = jnp.gradient(potential)
     motion = jnp.stack([x, y], -1)
-    return motion if motion.shape == shape else jax.image.resize(motion, shape, "cubic")
+    return motion if coarse else enlarged(motion, shape)
+
+
+def enlarged(motion: Array, shape: tuple[int, ...]) -> Array:
+    """Return a motion (h, w, 2) of a coarser grid on the grid of `shape`, by cubic interpolation."""
+    return motion if motion.shape[:2] == shape else jax.image.resize(motion, (*shape, 2), "cubic")
 
 
 def halved(field: Array) -> Array:
@@ -253,4 +258,4 @@ def centroid(pressure: Array, pitch: Any) -> Array:
     x, y = positions((pressure.shape[0], pressure.shape[1]), jnp.asarray(pitch, pressure.dtype))
     total = jnp.sum(pressure)
     moments = jnp.stack([jnp.sum(x * pressure), jnp.sum(y * pressure)])
-    return moments / jnp.where(total > 0, total, 1)
+    return ratio(moments, total, 0.0)

@@ -16,8 +16,8 @@ from jax import Array
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.elastic import Plan, is_infinite, tangential_spectra
-from anytouch_jax.sim.contact.mechanics import KPA_MM2, Fidelity, Gel, PressResult, centroid, grids, positions
-from anytouch_jax.sim.contact.solver import Compliance, descent
+from anytouch_jax.sim.contact.mechanics import KPA_MM2, Fidelity, Gel, PressResult, centroid, enlarged, grids, positions
+from anytouch_jax.sim.contact.solver import Compliance, descent, ratio
 
 SLIPPING = 0.999  # of the friction limit
 
@@ -55,6 +55,7 @@ def shear_step(
     modulus_object: Any = float("inf"),
     centre: Any = (0.0, 0.0),
     squeezed: Array | None = None,
+    coarse: bool = False,
     tolerance: float = 1e-3,
     iterations: int | None = None,
 ) -> Shear:
@@ -65,7 +66,8 @@ def shear_step(
     coefficients on the grid of the pressure reach `tolerance` in at most `iterations` (400). With "fast", an elastic
     predictor and the return to the friction cone are followed by `iterations` (6) corrections on a coarser grid.
     `squeezed` (H, W, 2) mm is the sideways motion by this step's change of pressure (from `mechanics.sideways`). The
-    traction then also resists it, and `displacement` is that of the traction alone. Use `jax.vmap` for a batch. Raises
+    traction then also resists it, and `displacement` is that of the traction alone. Both are on the coarser grid of
+    "fast" if `coarse`. Use `jax.vmap` for a batch. Raises
     UserError for a negative untraced friction.
     """
     _check(contact, pitch, friction, fidelity)
@@ -77,18 +79,18 @@ def shear_step(
     unit = jnp.asarray(gel.plane, dtype) * share / pitch  # kPa of traction per mm
     plan = grids(pressure.shape)[-1] if fidelity == "fast" else Plan(*pressure.shape)
     times = pressure.shape[0] // plan.rows
-    coarse, before = _pooled(pressure, times), _pooled(state.traction, times) / unit * times
+    load, before = _pooled(pressure, times), _pooled(state.traction, times) / unit * times
     spectra = tangential_spectra(plan, pitch * times, gel.poisson, gel.thickness, share, dtype)
     apply = _compliance(plan, spectra)
-    limit = jnp.where(coarse > 0, friction * coarse, 0) / unit * times
+    limit = jnp.where(load > 0, friction * load, 0) / unit * times
     moved = _rigid(plan, pitch * times, jnp.asarray(motion, dtype), jnp.asarray(centre, dtype))
     if squeezed is not None:
-        moved = moved - _pooled(squeezed, times)
+        moved = moved - (squeezed if coarse else _pooled(squeezed, times))
 
     def within(step: Array) -> Array:
         return _returned(before + step, limit) - before
 
-    start = within(_stiffness(coarse > 0, gel.poisson) * moved)
+    start = within(_stiffness(load > 0, gel.poisson) * moved)
     scale = jnp.max(jnp.abs(moved)) + jnp.max(jnp.abs(within(jnp.zeros_like(moved))))
     scale = jnp.where(scale > 0, scale, 1)
     most = iterations or (6 if fidelity == "fast" else 400)
@@ -99,9 +101,9 @@ def shear_step(
     if not is_infinite(modulus_object):  # minus the object's part
         deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
         displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
-    if times > 1:
-        displacement = jax.image.resize(displacement, state.displacement.shape, "cubic")
-    per_pressure = total * unit / times / jnp.where(coarse > 0, coarse, 1)[..., None]
+    if not coarse:
+        displacement = enlarged(displacement, pressure.shape)
+    per_pressure = ratio(total * unit / times, load[..., None], 0.0)
     traction = _repeated(per_pressure, times) * pressure[..., None]
     sliding = _length(total) >= SLIPPING * limit
     slipping = _repeated(sliding, times) & (pressure > 0)

@@ -65,9 +65,9 @@ def _round(apply: Compliance, target: Array, state: _Conjugate) -> _Conjugate:
     touching = state.pressure > 0
     gap = jnp.where(touching, state.excess, 0)
     squared = jnp.sum(gap * gap)
-    factor = jnp.where(state.free, _ratio(squared, state.squared, 0.0), 0)
+    factor = jnp.where(state.free, ratio(squared, state.squared, 0.0), 0)
     direction = jnp.where(touching, gap + factor * state.direction, 0)
-    step = _ratio(jnp.sum(gap * direction), jnp.sum(direction * apply(direction)), 1 / OWN)
+    step = ratio(jnp.sum(gap * direction), jnp.sum(direction * apply(direction)), 1 / OWN)
     step = jnp.maximum(step, 0)
     pressure = jnp.maximum(jnp.where(touching, state.pressure - step * direction, 0), 0)
     overlap = (pressure <= 0) & (state.excess < 0)
@@ -108,9 +108,9 @@ def descent(
         way = project(s.x - s.step * s.excess) - s.x
         bent_by = apply(way)
         bent = jnp.sum(way * bent_by)
-        share = jnp.clip(_ratio(-jnp.sum(s.excess * way), bent, 0.0), 0, 1)
+        share = jnp.clip(ratio(-jnp.sum(s.excess * way), bent, 0.0), 0, 1)
         x, excess = s.x + share * way, s.excess + share * bent_by
-        step = _ratio(jnp.sum(way * way), bent, 1 / OWN)
+        step = ratio(jnp.sum(way * way), bent, 1 / OWN)
         change = s.residual if tolerance is None else residual(x, excess)
         return _Descent(x, excess, step, change, s.iterations + 1)
 
@@ -128,8 +128,13 @@ def descent(
 
 def scaled(start: Array, moved: Array, target: Array) -> Array:
     """Return the factor on `start` of least energy. `moved` is K of `start`."""
-    return _ratio(jnp.sum(start * target), jnp.sum(start * moved), 0.0)
+    return ratio(jnp.sum(start * target), jnp.sum(start * moved), 0.0)
 
 
-def _ratio(above: Array, below: Array, otherwise: float) -> Array:
-    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1), otherwise)
+def ratio(above: Array, below: Array, otherwise: float) -> Array:
+    """Return `above` over `below`, or `otherwise` where `below` is not above a tiny number.
+
+    The gradient divides by the square of `below`, which must not overflow: the last steps of a descent are tiny.
+    """
+    is_large = below > jnp.finfo(below.dtype).tiny ** 0.45
+    return jnp.where(is_large, above / jnp.where(is_large, below, 1), otherwise)

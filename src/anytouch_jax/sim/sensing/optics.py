@@ -8,6 +8,7 @@ noise.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -92,7 +93,7 @@ def _light(uneven: Array, tint: Array, place: PictureView, sensor: Sensor) -> Ar
 
 
 def render(
-    displacement: Array,
+    displacement: Array | None,
     tangential: Array | None,
     pitch: float | Array,
     sensor: Sensor,
@@ -108,34 +109,25 @@ def render(
     """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
 
     The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
-    mm (x, y) moves the markers. `key` draws the noise, and None omits it. `resolution` is (height, width), by default
-    square pixels with a short side of 224. `photometry` replaces that of the sensor. `sensor` and `resolution` are
-    static under jit. `behind` is the `backdrop` of the same unit and resolution. `drift` (3, 3) changes the light
-    (`sensors.draw_drift`). `stretched` is as in `picture_view`. Raises UserError for a sensor without a camera.
+    mm (x, y), on that grid or a coarser one, moves the markers. None is an untouched gel. `key` draws the noise, and
+    None omits it. `resolution` is (height, width), by default square pixels with a short side of 224. `photometry`
+    replaces that of the sensor. `sensor` and `resolution` are static under jit. `behind` is the `backdrop` of the same
+    unit and resolution. `drift` (3, 3) changes the light (`sensors.draw_drift`). `stretched` is as in `picture_view`.
+    Raises UserError for a sensor without a camera.
     """
     resolution = resolution or picture_size(sensor)
     place = picture_view(sensor, unit, resolution, stretched=stretched)
     photometry = look(sensor) if photometry is None else photometry
-    matrices = _resample(displacement.shape, pitch, place)
-    skin = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
-    nx, ny = tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
-    glow: tuple[Array, ...] | None = None
-    if is_traced(photometry.halo) or np.any(np.asarray(photometry.halo)):
-        soft = _blurred(displacement, sensor.halo / pitch)
-        depth = matrices[0] @ soft @ matrices[2].T
-        lit = (*rotated(*_slopes(soft, matrices, pitch), unit.light_angle), depth)
-        glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
+    change = (lambda c: 0.0) if displacement is None else _shading(displacement, pitch, sensor, unit, photometry, place)
     ink = None
     if sensor.markers is not None:
-        ink = unit.marked * _ink(tangential, matrices, place, sensor.markers, sensor, unit)
+        grid = None if displacement is None else displacement.shape
+        ink = unit.marked * _ink(tangential, grid, pitch, place, sensor.markers, sensor, unit)
     bits = None if key is None else jax.random.bits(key, resolution, jnp.uint32)
 
     def channel(c: dict[str, Array]) -> Array:
-        change = colour_change(c["normal"], nx, ny, place.u, place.v)
-        if glow is not None:
-            change = change + halo_change(c["halo"], glow, place.u, place.v)
         light = _light(c["uneven"], c["tint"], place, sensor)
-        image = c["behind"] + c["gain"] * change * light
+        image = c["behind"] + c["gain"] * change(c) * light
         if ink is not None:
             image = image + ink * (c["ink"] * light - image)
         if drift is not None:
@@ -149,6 +141,24 @@ def render(
     # arithmetic into the transpose, whose inner loop over three channels is not vectorised (six times slower).
     planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift))
     return planes.transpose(1, 2, 0)
+
+
+def _shading(
+    displacement: Array, pitch: Any, sensor: Sensor, unit: Unit, photometry: Photometry, place: PictureView
+) -> Callable[[dict[str, Array]], Array]:
+    """Return the change (H, W) of one channel by the dent, as a function of the channel's numbers."""
+    matrices = _resample(displacement.shape, pitch, place)
+    skin = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
+    nx, ny = tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
+    if not is_traced(photometry.halo) and not np.any(np.asarray(photometry.halo)):
+        return lambda c: colour_change(c["normal"], nx, ny, place.u, place.v)
+    soft = _blurred(displacement, sensor.halo / pitch)
+    depth = matrices[0] @ soft @ matrices[2].T
+    lit = (*rotated(*_slopes(soft, matrices, pitch), unit.light_angle), depth)
+    glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
+    return lambda c: (
+        colour_change(c["normal"], nx, ny, place.u, place.v) + halo_change(c["halo"], glow, place.u, place.v)
+    )
 
 
 def tilt(slope_x: Array, slope_y: Array, steepest: float | Array) -> tuple[Array, Array]:
@@ -210,18 +220,20 @@ def _channels(
 
 def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: Any) -> Array:
     """Render the background image of a unit, u8 (H, W, 3) RGB, with its markers and noise. `options` of `render`."""
-    return render(jnp.zeros((8, 8)), None, 1.0, sensor, unit, key, **options)
+    return render(None, None, 1.0, sensor, unit, key, **options)
 
 
 def onto_picture(
     maps: Array, *, pitch: Any, sensor: Sensor, unit: Unit, resolution: tuple[int, int], vectors: bool = False,
-    stretched: bool = False,
+    stretched: bool = False, grid: tuple[int, int] | None = None,
 ) -> Array:  # fmt: skip
     """Resample maps (..., h, w, C) of the solve grid at the pixels of a unit's image of (height, width).
 
-    With `vectors`, the two channels are x and y of a vector, which is mirrored with the image.
+    With `vectors`, the two channels are x and y of a vector, which is mirrored with the image. `grid` is the size of
+    the solve grid if that of the maps is coarser.
     """
-    ay, _, ax, _ = _resample(maps.shape[-3:-1], pitch, picture_view(sensor, unit, resolution, stretched=stretched))
+    place = picture_view(sensor, unit, resolution, stretched=stretched)
+    ay, ax = _enlarging(maps.shape[-3:-1], grid, pitch, place)
     mapped = jnp.einsum("ih,...hwc,jw->...ijc", ay, maps, ax)
     return mapped * unit.mirror.reshape((1,) * (mapped.ndim - 1) + (2,)) if vectors else mapped
 
@@ -230,6 +242,17 @@ def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrice
     """Return value and derivative matrices from the solve grid to the image's rows and columns."""
     rows = interpolation.spline(place.y / pitch + (shape[0] - 1) / 2, shape[0])
     return *rows, *interpolation.spline(place.x / pitch + (shape[1] - 1) / 2, shape[1])
+
+
+def _enlarging(shape: tuple[int, ...], grid: Any, pitch: Any, place: PictureView) -> tuple[Array, Array]:
+    """Return the value matrices from a map of `shape`, on a grid of (rows, columns) with `pitch` or a coarser one."""
+    grid = grid or shape
+    ay, _, ax, _ = _resample(grid, pitch, place)
+    if shape[:2] == grid[:2]:
+        return ay, ax
+    # One product of small matrices, and not a large map between them.
+    wide = [jax.image.resize(jnp.eye(n), (most, n), "cubic") for n, most in zip(shape[:2], grid[:2], strict=True)]
+    return ay @ wide[0], ax @ wide[1]
 
 
 def _slopes(field: Array, matrices: Matrices, pitch: Any) -> tuple[Array, Array]:
@@ -244,12 +267,12 @@ def _blurred(field: Array, sigma: Any) -> Array:
 
 
 def _ink(
-    tangential: Array | None, matrices: Matrices, place: PictureView, ink: Markers, sensor: Sensor, unit: Unit
+    tangential: Array | None, grid: Any, pitch: Any, place: PictureView, ink: Markers, sensor: Sensor, unit: Unit
 ) -> Array:
     """Return the share of ink (H, W): the lattice at the undeformed places of the skin at the pixels."""
-    ay, _, ax, _ = matrices
     x, y = (jnp.broadcast_to(a, (len(place.y), len(place.x))) for a in (place.x[None, :], place.y[:, None]))
     if tangential is not None:
+        ay, ax = _enlarging(tangential.shape, grid, pitch, place)
         x = x - ay @ tangential[..., 0] @ ax.T
         y = y - ay @ tangential[..., 1] @ ax.T
     soft = 1.5 * jnp.abs(place.x[1] - place.x[0]) + 2 * unit.focus

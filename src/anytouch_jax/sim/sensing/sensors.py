@@ -176,8 +176,10 @@ SPECKS = 6
 MOST_BASES = 16  # untouched gels of a sensor; so many weights are drawn for each
 
 
-def draw_unit(sensor: Sensor, rng: Rng, real: Any = None) -> Unit:
+def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Unit:
     """Return a unit of `sensor` drawn from `rng`. `real` (n, h, w, 3) replaces the untouched gels of `bases`.
+
+    Gels of F sensors (F, n, h, w, 3) are given with the number `of` the sensor, so that none is copied.
 
     "Measured" is on real pictures scaled to 128 pixels: GelSight Mini with dots (8 gels, 39 recordings) and without (3
     units), DIGIT (3 units), 9DTact (3 units). The number of draws does not depend on the sensor, so several sensors can
@@ -190,7 +192,7 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None) -> Unit:
     room = (1 - zoom) / 2 * xp.asarray(sensor.field[::-1])
     dirt = rng.uniform(size=SPECKS) < rng.uniform(0, 0.6)  # measured: 0 to 4 specks or scratches a gel
     return _unit(
-        base=_draw_base(bases(sensor) if real is None else real, rng),
+        base=_draw_base(bases(sensor) if real is None else real, rng, of),
         tint=xp.exp(rng.normal(0, 0.09) + rng.normal(0, 0.05, 3)),  # measured: means differ by 9 %, colours by 5 %
         gain=sensor.contrast * xp.exp(rng.normal(0, 0.25) + rng.normal(0, 0.15, 3)),
         light_angle=rng.normal(0, np.deg2rad(10)),
@@ -218,15 +220,20 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None) -> Unit:
     )  # fmt: skip
 
 
-def _draw_base(real: Any, rng: Rng) -> Any:
+def _draw_base(real: Any, rng: Rng, of: Any) -> Any:
     """Return an untouched gel: mostly one of the `real` ones (n, h, w, 3), mixed with others, with faint blotches.
 
     A picture that is black everywhere only fills an array and does not take part.
     """
     xp = namespace_of(rng)
-    weights = (rng.gamma(0.3, size=MOST_BASES)[: len(real)] + 1e-9) * (real.max((1, 2, 3)) > 0)
-    blotches = rng.normal(0, rng.uniform(0, 0.03), (40, 40))[: real.shape[1], : real.shape[2], None]
-    return xp.clip(xp.tensordot(weights / xp.maximum(weights.sum(), 1e-9), real, 1) * (1 + blotches), 0, 1)
+    count, height, width, _ = real.shape[-4:]
+    drawn = rng.gamma(0.3, size=MOST_BASES)[:count] + 1e-9
+    weights = (drawn if of is None else drawn[None]) * (real.max((-3, -2, -1)) > 0)
+    if of is not None:
+        weights = weights * (xp.arange(len(real)) == of)[:, None]
+    blotches = rng.normal(0, rng.uniform(0, 0.03), (40, 40))[:height, :width, None]
+    mixed = xp.tensordot(weights / xp.maximum(weights.sum(), 1e-9), real, weights.ndim)
+    return xp.clip(mixed * (1 + blotches), 0, 1)
 
 
 def draw_drift(frames: int, rng: Rng) -> Any:

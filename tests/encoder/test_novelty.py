@@ -56,7 +56,7 @@ def test_a_limit_covers_new_groups_as_often_as_asked(alike, count, above):
 def test_too_few_recordings_promise_nothing(groups, is_finite):
     limit = novelty.conformal_limit(np.arange(groups, dtype=float), np.arange(groups), 0.9)
     assert np.isfinite(limit) == is_finite
-    for share in (0.0, 1.0, np.nan):
+    for share in (0.0, 1.0, np.nan, None):
         with pytest.raises(UserError, match="between 0 and 1"):
             novelty.conformal_limit(np.zeros(groups), np.arange(groups), share)
     for scores in ([], [np.nan] * groups, [0.5] * (groups - 1)):

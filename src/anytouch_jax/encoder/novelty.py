@@ -191,8 +191,8 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     infinite below share / (1 - share) groups. Raises UserError for a `share` outside 0..1, no scores or NaN.
     """
     scores, groups = np.asarray(scores, np.float64), np.asarray(groups)
-    if not 0 < share < 1:
-        raise UserError(f"A coverage must lie between 0 and 1, not {share:g}.")
+    if not isinstance(share, int | float | np.number) or not 0 < share < 1:
+        raise UserError(f"A coverage must lie between 0 and 1, not {share!r}.")
     if not scores.size or scores.shape != groups.shape or np.isnan(scores).any():
         raise UserError(
             f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape}, {groups.shape}."

@@ -175,7 +175,7 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
     shot = cv2.imread(str(table.file(row)))
     cv2.imwrite(str(frames / "0.png"), shot)
     ground = table.file(row, "background_path")
-    monkeypatch.setattr("anytouch_jax.encoder.encoder.load_encoder", lambda _: encoder)
+    monkeypatch.setattr("anytouch_jax.encoder.encoder.load_encoder", lambda _, **__: encoder)
     words = ["embed", "--model", "unused", "--data", str(frames), "--sensor", str(table.value(row, "sensor"))]
     assert main([*words, "--out", str(tmp_path / "a.npz"), "--background", str(ground)]) == 0
     assert "first frame" not in capsys.readouterr().err

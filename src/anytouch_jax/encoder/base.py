@@ -346,7 +346,7 @@ class Encoder:
         `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over width.
         """
         if self.measures and (run := self.exported(clips.shape[1], pooling, fields=True)) is not None:
-            return run.measure(clips, rows, aspect)
+            return run.measure(np.asarray(clips), np.asarray(rows), np.asarray(aspect))
         if (key := ("fields", pooling)) not in self._compiled:
             net = build(usable(self.whole or self.config.model))
             self._compiled[key] = jax.jit(partial(features_and_fields, net=net, pooling=pooling))

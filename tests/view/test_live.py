@@ -71,7 +71,9 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
         for name in ("cup", "../../cup"):
             order = {"do": "record", "object": name}
             assert page.post("/api/0/control", json=order, headers=PAGE).status_code == 200
-            assert page.post("/api/0/control", json=order, headers=PAGE).status_code == 400  # it is on
+            turn = {"do": "orient", "rotate": 90, "flip": "none"}
+            for again in (order, turn):
+                assert page.post("/api/0/control", json=again, headers=PAGE).status_code == 400  # it is on
             until(lambda about: about["recording"]["on"] and about["recording"]["written"] >= 3)
             assert page.post("/api/0/control", json={"do": "stop"}, headers=PAGE).status_code == 200
             until(lambda about: not about["recording"]["on"])  # packets under way are of the recording before
@@ -113,6 +115,10 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
             pressed, picture = until(layer, lambda about: about["fields"]["area"] > 0)
             assert picture.shape == shape and pressed["fields"]["force"][2] > 0.1 > free["fields"]["force"][2]
             assert {"contact", "force, N", "depth, mm", "slip"} == set(pressed["curves"])
+        for rotate in (90, 0) * 40:  # no frame is read in one way and measured in another
+            live.orient(rotate, "none")
+            live.capture_background()
+            time.sleep(0.003)
         live.orient(90, "none")  # another shape than the sensor's: it is said
         until("depth", lambda about: any("height" in fault for fault in about["fields"]["faults"]))
     finally:

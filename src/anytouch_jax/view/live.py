@@ -28,7 +28,7 @@ from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.encoder import Encoder
-from anytouch_jax.encoder.fields import Fields
+from anytouch_jax.encoder.fields import Fields, Measure
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.stream import Embedded, stream
 from anytouch_jax.errors import UserError
@@ -81,6 +81,31 @@ class _Shown(NamedTuple):
     fields: Fields | None = None
 
 
+class _Setup(NamedTuple):
+    """How frames are read. A frame is read by one of them, whatever the page asks for meanwhile."""
+
+    rotate: int
+    flip: Flip
+    running: RunningGel | None  # None if a picture of the untouched gel was given
+    gel: Array | None
+    small: tuple[Array, UntouchedGel] | None
+    preprocess: Preprocess
+    measure: Measure | None
+
+    def turned(self, picture: Array) -> Array:
+        return np.ascontiguousarray(orient_frame(picture, self.rotate, self.flip))
+
+
+class _Kept(NamedTuple):
+    """One of the last frames: its number, its picture as read, turned and prepared, and how."""
+
+    number: int
+    raw: Array
+    turned: Array
+    prepared: Array
+    setup: _Setup
+
+
 class Live:
     """The newest frame of a source, with everything that the page shows of it. `start` begins, `stop` ends.
 
@@ -101,13 +126,11 @@ class Live:
         self._encoder, self._head, self._space = encoder, head, space
         self._sensor, self._camera, self._log = sensor, camera, log
         self._row = encoder.sensor_row(sensor or UNIVERSAL, log)
-        self._rotate = 0
-        self._flip: Flip = "none"
-        self._running: RunningGel | None = RunningGel()  # None with a picture of it
         self._looker = ThreadPoolExecutor(1)
         self._looking: Future[None] | None = None
-        self._use_gel(None)
-        self._raw: deque[tuple[int, Array, Array]] = deque(maxlen=8)  # last frames: number, picture, prepared
+        self._lock = threading.Lock()  # the page and the camera both set up
+        self._setup = self._with_gel(0, "none", None)
+        self._kept: deque[_Kept] = deque(maxlen=8)
         self._count = 0
         self._near: tuple[dict[str, Any], float] = ({}, 0.0)
         self._times: deque[tuple[float, float]] = deque(maxlen=_KEPT)
@@ -143,13 +166,18 @@ class Live:
 
     def orient(self, rotate: int, flip: Flip) -> None:
         """Turn the frames clockwise by `rotate` degrees, then mirror them. The untouched gel is estimated again."""
-        self._rotate, self._flip = rotate, flip
-        self.set_background(None)
+        with self._lock:
+            self._setup = self._with_gel(rotate, flip, None)
+
+    @property
+    def gel(self) -> Array | None:
+        """The untouched gel in use, RGB u8 (h, w, 3), turned as frames are."""
+        return self._setup.gel
 
     def capture_background(self) -> None:
         """Take the newest frame as the untouched gel."""
-        if self._raw:
-            self.set_background(self._oriented(self._raw[-1][1]))
+        if self._kept:
+            self.set_background(self._setup.turned(self._kept[-1].raw))
 
     async def packets(self, layer: str) -> AsyncIterator[bytes]:
         """Yield each newest frame as a layer for one page: length u32, JSON, length u32, JPEG, little endian.
@@ -167,52 +195,56 @@ class Live:
 
     def set_background(self, picture: Array | None) -> None:
         """Take a picture RGB u8 (h, w, 3) as the untouched gel, or None to estimate it from the next frames."""
-        self._running = RunningGel() if picture is None else None
-        self._use_gel(picture)
+        with self._lock:
+            self._setup = self._with_gel(self._setup.rotate, self._setup.flip, picture)
 
-    def _use_gel(self, picture: Array | None) -> None:
+    def _with_gel(self, rotate: int, flip: Flip, gel: Array | None, running: RunningGel | None = None) -> _Setup:
+        estimate = running or RunningGel() if gel is None or running else None
+        small = None if gel is None else (scale_down(gel), UntouchedGel(gel))
+        known = self._sensor or UNIVERSAL, gel
+        measure = self._encoder.measure_of(*known, log=lambda _: None) if self._encoder.measures else None
         # Frames are turned before, so the encoder's preprocessing does not.
-        self.gel = picture  # of the untouched gel, RGB u8 (h, w, 3), turned as frames are
-        self._gel = None if picture is None else (scale_down(picture), UntouchedGel(picture))
-        self._preprocess = Preprocess(self._encoder, picture)
-        known = self._sensor or UNIVERSAL, picture
-        self._measure = self._encoder.measure_of(*known, log=lambda _: None) if self._encoder.measures else None
+        return _Setup(rotate, flip, estimate, gel, small, Preprocess(self._encoder, gel), measure)
 
-    def _find_gel(self, picture: Array) -> None:
+    def _find_gel(self, setup: _Setup, picture: Array) -> _Setup:
         """Look for the untouched gel by the rule of `data.gels`: that of the head's unit, or a running estimate."""
-        running, head = self._running, self.teacher.head or self._head
+        running, head = setup.running, self.teacher.head or self._head
         if running is None:
-            return
+            return setup
         if not self._count and head is not None and head.gels:
             known, why = same_unit(head.gels, picture)
             if known is not None and not why:
-                self.set_background(known)
-                return
+                return self._replace(setup, known, None)
             self._log(other_unit(why))
         if self._looking is None or self._looking.done():  # an estimate takes longer than a frame may be old
             self._looking = self._looker.submit(running.add, picture)
             if running.picture is None:
                 self._looking.result()
-        if running.picture is not self.gel and running is self._running:
-            self._use_gel(running.picture)
+        return setup if running.picture is setup.gel else self._replace(setup, running.picture, running)
 
-    def _oriented(self, picture: Array) -> Array:
-        return np.ascontiguousarray(orient_frame(picture, self._rotate, self._flip))
+    def _replace(self, setup: _Setup, gel: Array | None, running: RunningGel | None) -> _Setup:
+        """Return a setup with another untouched gel, and use it if the page has not asked for another meanwhile."""
+        new = self._with_gel(setup.rotate, setup.flip, gel, running)
+        with self._lock:
+            if self._setup is setup:
+                self._setup = new
+        return new
 
     def _prepare(self, picture: Any) -> Array:
         """Keep the picture of a frame and return it for the encoder: frames come here one by one, from 0."""
-        turned = self._oriented(picture)
-        self._find_gel(turned)
-        prepared = self._preprocess(turned)
-        self._raw.append((self._count, picture, prepared))
+        setup = self._setup
+        turned = setup.turned(picture)
+        setup = self._find_gel(setup, turned)
+        prepared = setup.preprocess(turned)
+        self._kept.append(_Kept(self._count, picture, turned, prepared, setup))
         self._count += 1
         return prepared
 
     def _run(self, source: Any) -> None:
         try:
-            if self._measure is not None:  # compiled before the first frame
-                self._fields(self._encoder.blank, [self._encoder.blank])
-                self._use_gel(self.gel)
+            if (measure := self._setup.measure) is not None:  # compiled before the first frame
+                self._fields(measure, self._encoder.blank, [self._encoder.blank])
+                self.set_background(self.gel)
             prepare: Any = self._prepare
             frames = stream(
                 self._encoder, source, prepare, live=True, sensor=self._row, log=self._log,
@@ -227,13 +259,15 @@ class Live:
             self._newest = _Shown(self._newest.number + 1, {"error": str(error)})
 
     def _show(self, frame: Embedded) -> None:
-        kept = [one for one in tuple(self._raw) if one[0] <= frame.number]
-        if not kept or kept[-1][0] != frame.number:
+        kept = [one for one in tuple(self._kept) if one.number <= frame.number]
+        if not kept or kept[-1].number != frame.number:
             return
-        picture, gel = self._oriented(kept[-1][1]), self._gel
+        *_, picture, _, setup = kept[-1]
         threshold = THRESHOLDS.get(self._sensor or UNIVERSAL, DEFAULT_THRESHOLD)
-        score = touch_layer(picture, gel, threshold, "frame")[1]
-        fields = self._fields(picture, [prepared for *_, prepared in kept]) if score == score else None
+        score, fields = touch_layer(picture, setup.small, threshold, "frame")[1], None
+        if score == score and setup.measure is not None:
+            like = [one.prepared for one in kept if (one.setup.rotate, one.setup.flip) == (setup.rotate, setup.flip)]
+            fields = self._fields(setup.measure, picture, like)
         measured = {} if fields is None else field_numbers(fields)
         self.recorder.add(picture, score, frame.values)
         self._times.append((frame.seconds[-1], frame.age))
@@ -241,19 +275,17 @@ class Live:
         about: dict[str, Any] = {
             "frame": frame.number, "grabbed": 1e3 * (frame.started + frame.at), "picture": frame.picture,
             "contact": None if score != score else bool(score > threshold), "threshold": threshold,
-            "gel": "captured" if self._running is None else "estimated",
+            "gel": "captured" if setup.running is None else "estimated",
             "curves": {} if score != score else {"contact": round(score, 2)} | measured.get("curves", {}),
             "fields": measured or None,
             "encoder": encoder.round(2).tolist(), "age": age.round(2).tolist(), "missed": frame.missed,
             "recording": self.recorder.state(), "taught": self.teacher.version,
         }  # fmt: skip
         about |= self._classify(frame.values) | self._nearest(frame.values)
-        self._newest = _Shown(self._newest.number + 1, about, picture, gel, fields)
+        self._newest = _Shown(self._newest.number + 1, about, picture, setup.small, fields)
 
-    def _fields(self, picture: Array, prepared: list[Array]) -> Fields | None:
-        """Measure a picture, the last of some prepared frames, if the encoder can."""
-        if (measure := self._measure) is None:
-            return None
+    def _fields(self, measure: Measure, picture: Array, prepared: list[Array]) -> Fields:
+        """Measure a picture, the last of some prepared frames."""
         clip = last_clip(prepared, self._encoder.config.model.frames)
         row, aspect = np.array([self._row], np.int32), np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
         return measure(self._encoder.encode_and_measure(clip[None], row, aspect)[1], picture)

@@ -283,6 +283,8 @@ def _control(live: Live, order: Any) -> None:
     action, name, sequence = (order.get(key) for key in ("do", "object", "sequence"))
     rotate, flip = order.get("rotate"), order.get("flip")
     if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
+        if live.recorder.state()["on"]:
+            raise UserError("A recording is on. Stop it before you turn the picture.")
         live.orient(rotate, flip)
     elif action == "background":
         live.capture_background()

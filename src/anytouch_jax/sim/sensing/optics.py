@@ -139,8 +139,9 @@ def render(
         behind = backdrop(sensor, unit, resolution, stretched=stretched)
     # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU backend cannot fuse the
     # arithmetic into the transpose, whose inner loop over three channels is not vectorised (six times slower).
-    planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift))
-    return planes.transpose(1, 2, 0)
+    planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift)).astype(jnp.uint32)
+    packed = planes[0] | planes[1] << 8 | planes[2] << 16  # a transposition of bytes would take longer than a channel
+    return jax.lax.bitcast_convert_type(packed, jnp.uint8)[..., :3]
 
 
 def _shading(

@@ -75,7 +75,7 @@ def backdrop(
     rows = interpolation.spline((place.v + 1) / 2 * shape[0] - 0.5, shape[0])[0]
     columns = interpolation.spline((place.u + 1) / 2 * shape[1] - 0.5, shape[1])[0]
     image = jnp.einsum("ih,hwc,jw->cij", rows, unit.base, columns)
-    bits = jax.random.bits(jax.random.key(unit.grain[1].astype(jnp.uint32)), resolution, jnp.uint32)
+    bits = _pixel_bits(jax.random.key(unit.grain[1].astype(jnp.uint32)), resolution)
     grain = unit.grain[0] / 255 * _noise(bits)
     u0, v0, radius, *absorbed = jnp.split(unit.specks, 6, 1)  # dirt and wear
     across = jnp.exp(-0.5 * ((place.x[None] - u0 * sensor.field[1] / 2) / radius) ** 2)
@@ -123,7 +123,7 @@ def render(
     if sensor.markers is not None:
         grid = None if displacement is None else displacement.shape
         ink = unit.marked * _ink(tangential, grid, pitch, place, sensor.markers, sensor, unit)
-    bits = None if key is None else jax.random.bits(key, resolution, jnp.uint32)
+    bits = None if key is None else _pixel_bits(key, resolution)
 
     def channel(c: dict[str, Array]) -> Array:
         light = _light(c["uneven"], c["tint"], place, sensor)
@@ -302,6 +302,23 @@ def ink_coverage(markers: Markers, x: Array, y: Array, phase: Array, size: Array
 def is_traced(value: Any) -> bool:
     """Return whether a value is known only while a compiled program runs."""
     return isinstance(value, jax.core.Tracer)
+
+
+def _pixel_bits(key: Array, shape: tuple[int, int]) -> Array:
+    """Return a random word u32 (H, W) for each pixel: its number, mixed with the key.
+
+    `jax.random.bits` takes ten times as long, and a picture's noise needs no cryptography.
+    """
+    step = jnp.uint32(0x9E3779B9)
+    first, second = _mixed(jax.random.key_data(key) + step)
+    return _mixed(_mixed(jnp.arange(shape[0] * shape[1], dtype=jnp.uint32).reshape(shape) * step + first) ^ second)
+
+
+def _mixed(word: Array) -> Array:
+    """Return words in which every bit depends on all bits of `word` u32."""
+    word = (word ^ word >> 16) * jnp.uint32(0x21F0AAAD)
+    word = (word ^ word >> 15) * jnp.uint32(0x735A2D97)
+    return word ^ word >> 15
 
 
 def _noise(bits: Array) -> Array:

@@ -49,7 +49,7 @@ def simulation(count: int, rounds: int) -> Row:
     times = []
     for number in range(rounds + 1):
         begin = time.perf_counter()
-        jax.block_until_ready(draw(jax.random.key(number), world).image)
+        jax.block_until_ready(draw(jax.random.key(number), world).clip)
         times.append(time.perf_counter() - begin)
     seconds = sorted(times[1:])[rounds // 2]
     return {"variant": "float32", "samples": count, "seconds": seconds, "frames_per_second": count / seconds,

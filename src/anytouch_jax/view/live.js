@@ -163,7 +163,13 @@ function showLive(source, about) {
     stopped.abort();
     stopped = new AbortController();
     const reader = (await api(`${source}/stream?layer=${state.layer}`, { signal: stopped.signal })).body.getReader();
-    let data = new Uint8Array(0);
+    let data = new Uint8Array(0), newest = null, drawing = false;
+    const draw = guard(async () => { // while one is decoded, others arrive: only the newest is drawn next
+      drawing = true;
+      try {
+        while (newest) { const next = newest; newest = null; await show(...next); }
+      } finally { drawing = false; }
+    });
     for (;;) {
       const { value, done } = await reader.read();
       if (done) { say("The stream has ended. Start `anytouch view` again.", true); return; }
@@ -171,15 +177,14 @@ function showLive(source, about) {
       joined.set(data);
       joined.set(value, data.length);
       data = joined;
-      let newest = null;
-      for (;;) { // only the newest whole packet is drawn
+      for (;;) {
         const view = new DataView(data.buffer, data.byteOffset, data.length);
         const text = data.length >= 4 ? view.getUint32(0, true) : 0, end = data.length >= 8 + text ? view.getUint32(4 + text, true) : 0;
         if (data.length < 8 + text || data.length < 8 + text + end || data.length < 8) break;
         newest = [JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + text))), data.slice(8 + text, 8 + text + end)];
         data = data.slice(8 + text + end);
       }
-      if (newest) await show(...newest);
+      if (newest && !drawing) draw();
     }
   });
 

@@ -174,7 +174,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         columns["label.material"] = [("steel", "wool")[one == "hard"] for one in columns["label.hardness"]]
         columns["label.roughness"] = columns["label.slip"] = [float(one > 3) for one in columns["label.force"]]
         columns["license"] = ["MIT"] * count
-        for name in ("manifest.parquet", "manifest.csv"):
+        for name in ("manifest.parquet", "manifest.csv", "mine.parquet"):
             manifests.write(manifests.from_columns(columns, Path(name)), Path(name))
         make_recordings(Path("recordings.parquet"))
         columns["sensor"] = ["my_gel" if one == "digit" else one for one in columns["sensor"]]
@@ -187,6 +187,10 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for i in range(4):  # no two pictures are equal
                 pixels = press(20 * i % 120) // 2 + rng.integers(0, 9, (48, 48, 3), np.uint8)
                 cv2.imwrite(f"{place}/{i:03d}.png", pixels)
+        for parent in ("classes/cotton", "classes/silk", "data/train/cotton", "data/valid/cotton", "data/Test_Set/silk"):
+            Path(parent).mkdir(parents=True)
+            for i in range(8):
+                cv2.imwrite(f"{parent}/p{i}_0.png", rng.integers(0, 255, (48, 48, 3), np.uint8))
         for name in ("mine/mug/background", "mine/sponge/background"):
             cv2.imwrite(f"{name}.png", press(0) // 2)
         for folder_of, sensor in (("frames", "digit"), ("trust", "gelsight")):
@@ -194,6 +198,10 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for i in range(24):
                 shutil.copy(f"cup{i // 4}_{sensor}_{i % 4}.png", f"{folder_of}/{i:03d}.png")
         shutil.copy("digit.png", "gel.png")
+        film = cv2.VideoWriter("press.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 25, cv2.imread("gel.png").shape[1::-1])
+        for i in range(4):
+            film.write(cv2.imread(f"cup0_digit_{i}.png"))
+        film.release()
         shutil.copy("test0_digit_3.png", "press.png")
         make_units(Path("units"))
         Path("labels.csv").write_text("object,material,hardness\nmug,ceramic,9\nsponge,foam,2\n")
@@ -213,6 +221,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run("anytouch train --stage 1 --data manifest.parquet --run runs/stage1")
         run("anytouch train --stage 2 --data manifest.parquet --run runs/stage2 --init runs/stage1")
         run("anytouch embed --data manifest.parquet --out mine.npz")
+        run("anytouch probe label --data recordings.parquet --label object --save recordings/head.npz")
     return folder
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from measuring import gel, measuring_weights
@@ -143,6 +144,15 @@ def test_a_fault_is_logged_and_no_value_is_sure(encoder, kind, word):
     for name in ("depth", "force", "torque", "area"):
         assert (getattr(bad, f"{name}_std") >= np.abs(getattr(bad, name))).all()
     assert bad.depth_std.min() >= LENGTH * 18.88 and bad.slip_std.min() >= 1
+
+
+def test_a_wide_press_is_not_called_recoloured():
+    real, _ = faulty("none")
+    rng, alarms = np.random.default_rng(0), 0
+    for _ in range(100):
+        press = cv2.resize(rng.uniform(-90, 90, (3, 4, 3)), real.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+        alarms += bool(fields.faults_of(np.clip(real + press, 0, 255).astype(np.uint8), real, "gelsight_mini", 0.75))
+    assert alarms <= 5
 
 
 def test_the_part_is_kept_in_the_package_and_its_calibration_too(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -86,6 +87,19 @@ def test_a_good_unit_that_looks_odd_raises_no_alarm():
     known = [a * own + b * own[:, ::-1] + 0.2 * grain for (a, b), grain in zip(shares, noise, strict=True)]
     own, *known = (np.clip(128 + look, 0, 255).astype(np.uint8) for look in (own, *known))
     assert health.check_layout(replace(UNITS[0], background=own), known).ok
+
+
+@pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
+def test_a_lamp_that_is_stronger_is_no_fault_and_a_turned_or_recoloured_unit_is(sensor):
+    """Real units of a family, each against the others. One side is up to a fifth brighter in one colour."""
+    for number, gel_of_unit in enumerate(gels := health.known_gels(sensor)):
+        others, side = gels[:number] + gels[number + 1 :], np.linspace(-1, 1, gel_of_unit.shape[1])
+        for colour, share in product(range(3), (-0.2, -0.1, 0.1, 0.2)):
+            gain = 1 + share * side[:, None] * (np.arange(3) == colour)
+            lit = np.clip(gel_of_unit * gain, 0, 255).astype(np.uint8)
+            assert health.check_layout(UnitFrames(sensor, "", [[lit]]), others).ok
+        for wrong in (gel_of_unit[::-1, ::-1], gel_of_unit[::-1], gel_of_unit[..., ::-1]):
+            assert health.check_layout(UnitFrames(sensor, "", [[np.ascontiguousarray(wrong)]]), others).ok is False
 
 
 def test_recordings_of_another_unit_are_reported():

@@ -34,7 +34,6 @@ LIMITS = {
     "orientation": 0.10, "exposure": 0.25, "focus": 0.5, "detail": 0.7, "frozen": 0.02, "dropped": 0.01, "tint": 0.20,
     "dead pixels": 0.0, "scratch": 12.0, "scratch length": 36.0, "background": 20.0, "two units": 16.0,
 }  # fmt: skip
-_OTHER_SIGN = -0.25  # share of a family's asymmetry; one good unit of eleven has -0.18
 _SHARE = 0.25  # of recordings that look like another unit
 _ALIKE = 0.6  # distance within another unit, as a share of that between the two
 _DOTS = 21  # pixels of the widest marker dots, at 160 pixels
@@ -205,31 +204,25 @@ def known_gels(sensor: str) -> list[Array]:
 def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
     """Compare orientation and colour order with the references: which turn and order of colours fits them best?
 
-    A sensor may look nearly the same when it is mirrored. Then the small part that changes sign decides, if it has the
-    same sign in the references.
+    A sensor that looks nearly the same when it is mirrored, as a GelSight Mini does, is not called mirrored.
     """
     name = "orientation and colours"
     if not references:
         return Check(name, None, "no reference of this sensor")
     picture, known = unit.untouched(), np.stack([_layout(reference) for reference in references])
-    own, scores, signs = _layout(picture), dict[tuple[tuple[int, bool], bool], float](), list[float]()
+    own, scores = _layout(picture), dict[tuple[tuple[int, bool], bool], float]()
     shapes = np.log([reference.shape[1] / reference.shape[0] for reference in references])
     shape = np.log(picture.shape[1] / picture.shape[0])
     for turn, swap in product(_TURNS, (False, True)):
         if abs((-shape if turn[0] % 2 else shape) - np.median(shapes)) > 0.2:
             continue
         scores[turn, swap] = float(np.median(np.sort((known * _turned(own, turn, swap)).sum((1, 2, 3)))[-3:]))
-        change = known.mean(0) - np.mean([_turned(one, turn, swap) for one in known], axis=0)
-        along = float((known.mean(0) * change).sum())
-        agrees = len(known) >= _FEWEST and np.mean((known * change).sum((1, 2, 3)) > 0) >= 0.8
-        if agrees and along > 1e-3 and (own * change).sum() < _OTHER_SIGN * along:
-            signs.append(scores[turn, swap])
     if not scores or max(scores.values()) < _LIKE:
         return Check(name, None, f"unlike its family ({max(scores.values(), default=0):.2f})")
     upright = scores.pop((_TURNS[0], False), -1.0)
     best = max(scores, key=lambda key: scores[key])
     margin = scores[best] - upright
-    if margin <= LIMITS["orientation"] and not signs:
+    if margin <= LIMITS["orientation"]:
         return Check(name, True, f"fits ({upright:.2f})")
     # The picture was turned by the inverse of what makes it fit.
     (turns, mirrored), swap = best

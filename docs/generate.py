@@ -34,6 +34,7 @@ _ROOMS = {
     "config": "Settings",
     "data": "Data",
     "weights": "Weights",
+    "sim": "Simulated touch",
     "errors": "Errors",
 }
 

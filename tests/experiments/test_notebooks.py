@@ -9,7 +9,7 @@ from markdown_it import MarkdownIt
 import anytouch_jax as at
 from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
-from docs.generate import tutorial
+from docs.generate import api_page, tutorial
 from experiments.notebooks.execute import notebooks
 
 FILES = notebooks([])
@@ -37,6 +37,11 @@ def test_what_a_notebook_shows_of_a_name_is_text(name, tmp_path):
     assert "&lt;img src=x" in page and "<img" not in page
     for one in (at.Manifest, at.Encoder, at.Preprocess, at.FamilyEncoder, at.Config):  # a notebook shows their `repr`
         assert not {"_repr_html_", "_repr_markdown_", "_repr_svg_", "_repr_javascript_"} & {*dir(one)}
+
+
+def test_every_public_name_has_a_place_in_the_reference():
+    lines = api_page().splitlines()
+    assert sum(line.startswith("::: ") for line in lines) == len(at.__all__)
 
 
 @pytest.fixture(scope="session")

@@ -187,13 +187,13 @@ def normalised(batch: Any) -> Any:
     touch = lambda clip: np.asarray(objectives.normalise_touch(jnp.asarray(clip)))  # noqa: E731
     if isinstance(batch, TouchBatch):
         return batch._replace(clip=touch(batch.clip))
-    align, match = batch
+    align, match = batch.align, batch.match
     if align is not None:
         image = np.asarray(objectives.normalise_image(jnp.asarray(align.image)))
         align = align._replace(clip=touch(align.clip), image=image)
     if match is not None:
         match = match._replace(**{name: touch(getattr(match, name)) for name in ("clip", "positive", "negative")})
-    return Stage2Batch(align, match)
+    return batch._replace(align=align, match=match)
 
 
 # Useful operations ----------------------------------------------------------------------------------------------------

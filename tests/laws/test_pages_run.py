@@ -187,7 +187,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for i in range(4):  # no two pictures are equal
                 pixels = press(20 * i % 120) // 2 + rng.integers(0, 9, (48, 48, 3), np.uint8)
                 cv2.imwrite(f"{place}/{i:03d}.png", pixels)
-        for parent in ("classes/cotton", "classes/silk", "data/train/cotton", "data/valid/cotton", "data/Test_Set/silk"):
+        for parent in "classes/a", "classes/b", "data/train/a", "data/valid/a", "data/Test_Set/b":
             Path(parent).mkdir(parents=True)
             for i in range(8):
                 cv2.imwrite(f"{parent}/p{i}_0.png", rng.integers(0, 255, (48, 48, 3), np.uint8))

@@ -46,5 +46,5 @@ def test_the_wheel_works_in_an_empty_folder(tmp_path):
     assert "usage: anytouch COMMAND" in ran(home / "bin" / "anytouch", "--help", cwd=empty)
     assert "--on-bad-sample" in ran(home / "bin" / "anytouch", "train", "--help", cwd=empty)
     shape = "at.load_encoder('anytouch-tiny').encode_touch(at.example_touches()[0].frame[:112, :112]).shape"
-    assert ran(python, "-c", f"import anytouch_jax as at; print({shape})", cwd=empty).strip() == "(1, 128)"
+    assert ran(python, "-c", f"import anytouch_jax as at; print({shape})", cwd=empty).strip() == "(1, 192)"
     assert not list(empty.iterdir())

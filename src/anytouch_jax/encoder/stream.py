@@ -37,7 +37,7 @@ HANG = 20.0  # seconds to wait for a read that does not return; V4L2 itself give
 STUCK = 0.3  # seconds of the same bytes, or of black, until they are reported: the noise of a sensor never repeats
 BLACK = 8.0  # mean pixel below which a picture is black; untouched gels have 30 and more
 CELL = 14  # pixels of a side over which a change is averaged
-CONSTANT = 32_000_000  # bytes of parameters that are laid out for the processor when the program of one touch is compiled
+CONSTANT = 32_000_000  # bytes of parameters that are laid out for the processor when one touch is compiled
 LEARNED, CHANGES = 30, 1000  # changes from which the noise of a camera is known, at first and later
 _PATIENCE = 2.0  # seconds to wait for the reader after the last frame
 _PAUSE = 0.01  # seconds from a missed read to the next
@@ -264,6 +264,7 @@ def compile_for_one(
     run = encoder.traceable(pooling, join)
     with precision(encoder.config):
         params, *given = jax.device_put((encoder.params, touch, np.full(1, sensor, "i4")))
+        compiled: Any
         if sum(leaf.nbytes for leaf in jax.tree.leaves(params)) <= CONSTANT:
             compiled = jax.jit(partial(run, params)).lower(*given).compile()
         else:

@@ -265,9 +265,9 @@ def _but_last(blocks: Block, x: Array, remat: bool) -> Array:
         block = jax.tree.map(lambda values: jax.lax.dynamic_index_in_dim(values, number, keepdims=False), blocks)
         return block(x), None
 
-    steps = _depth(blocks) - 1
+    steps, is_one = _depth(blocks) - 1, isinstance(x.shape[0], int) and x.shape[0] == 1  # an export's batch is a symbol
     # One touch by few blocks: with constant parameters nothing is taken out of the stack, and it takes a tenth less.
-    return jax.lax.scan(body, x, jnp.arange(steps), unroll=steps if len(x) == 1 and steps < 12 else 1)[0]
+    return jax.lax.scan(body, x, jnp.arange(steps), unroll=steps if is_one and steps < 12 else 1)[0]
 
 
 def _but_last_forward(blocks: Block, x: Array, remat: bool) -> Any:

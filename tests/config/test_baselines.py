@@ -65,10 +65,7 @@ def test_a_recipe_changes_exactly_what_it_says(name: str, stage: int, recipe: st
 def test_a_configuration_from_before_these_fields_reads_as_the_paper_model() -> None:
     config = preset("tiny", stage=2)
     data = json.loads(to_json(config))
-    for section, names in {
-        "model": ("patch_encoder",),
-        "data": ("require", "contact_only", "aligned_text"),
-    }.items():
+    for section, names in {"model": ("patch_encoder",), "data": ("require", "contact_only", "aligned_text")}.items():
         for name in names:
             del data[section][name]
     assert from_json(json.dumps(data)) == config

@@ -24,12 +24,7 @@ from anytouch_jax.encoder.linear_head import load_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache
 from anytouch_jax.evaluate.feature_cache import RAW, FeatureSource, FeatureStore
-from anytouch_jax.evaluate.probing import (
-    probe_benchmark,
-    probe_label,
-    probe_table,
-    probe_tasks,
-)
+from anytouch_jax.evaluate.probing import probe_benchmark, probe_label, probe_table, probe_tasks
 from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, label_task, select
 
 WORLD = simulated()

@@ -65,10 +65,7 @@ def test_a_row_outside_the_table_is_nan_not_the_last_sensor():
         assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
 
 
-@pytest.mark.parametrize(
-    "model",
-    [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)],
-)
+@pytest.mark.parametrize("model", [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)])
 def test_the_shapes_written_down_are_those_of_the_network(model):
     wanted = {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
     assert {name: tuple(shape) for name, shape in param_shapes(model).items()} == wanted

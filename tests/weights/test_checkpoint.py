@@ -360,10 +360,7 @@ CHILD = """
 """
 
 
-@pytest.mark.parametrize(
-    ("where", "last"),
-    [("arrays written", 2), ("renamed", 3), ("removing", 3), ("writing", 2)],
-)
+@pytest.mark.parametrize(("where", "last"), [("arrays written", 2), ("renamed", 3), ("removing", 3), ("writing", 2)])
 def test_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, where, last):
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(CHILD), str(tmp_path), where],

@@ -7,11 +7,7 @@ import pytest
 from tiny_models import tiny_config
 
 from anytouch_jax.config import UNIVERSAL
-from anytouch_jax.weights.compatible import (
-    match_sensors,
-    resize_position,
-    serve_unseen,
-)
+from anytouch_jax.weights.compatible import match_sensors, resize_position, serve_unseen
 
 # torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x 3 image
 UP = [

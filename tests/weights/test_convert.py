@@ -6,26 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from weights_world import (
-    DECODER_TOKENS,
-    MLP,
-    NO_LORA,
-    STAGE1,
-    STAGE2,
-    assert_same,
-    openclip_of,
-    params_of,
-    weights_of,
-)
+from weights_world import DECODER_TOKENS, MLP, NO_LORA, STAGE1, STAGE2, assert_same, openclip_of, params_of, weights_of
 
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.convert import (
-    detect_layout,
-    to_params,
-    to_release,
-)
+from anytouch_jax.weights.convert import detect_layout, to_params, to_release
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten

@@ -26,12 +26,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.compatible import resize_position
 from anytouch_jax.weights.convert import to_params, to_release
-from anytouch_jax.weights.load import (
-    first_params,
-    load_init,
-    load_model,
-    read_weights,
-)
+from anytouch_jax.weights.load import first_params, load_init, load_model, read_weights
 from anytouch_jax.weights.safetensors import MODEL_KEY, export_safetensors, write_safetensors
 
 TRAINED = ["digit", "gelsight_mini"]

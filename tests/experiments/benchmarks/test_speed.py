@@ -17,11 +17,7 @@ from anytouch_jax import objectives
 from anytouch_jax.config import preset
 from anytouch_jax.nn.functional import build
 from experiments.benchmarks import speed, variants
-from experiments.benchmarks.workloads import (
-    Workload,
-    make_batch,
-    normalised,
-)
+from experiments.benchmarks.workloads import Workload, make_batch, normalised
 from experiments.records import read_records
 
 STAGE1 = Workload("stage1 clips", tiny_config(1), 4, 4)

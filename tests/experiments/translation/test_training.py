@@ -14,13 +14,7 @@ from anytouch_jax.config import Stack
 from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.weights.tree import flatten
 from experiments.translation import training
-from experiments.translation.generator import (
-    GENERATOR,
-    Fit,
-    Generator,
-    load,
-    save,
-)
+from experiments.translation.generator import GENERATOR, Fit, Generator, load, save
 from experiments.translation.networks import Translation
 
 pytestmark = pytest.mark.slow

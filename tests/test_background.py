@@ -1,7 +1,3 @@
-"""Touches less the untouched gel (`data.background` subtract): in training, in probes, and in what users embed."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,3 @@
-"""Progress bars: with the time left on a terminal, after a while, and silent elsewhere."""
-
-from __future__ import annotations
-
 import io
 import sys
 import time

@@ -1,5 +1,3 @@
-"""A file is written whole or not at all."""
-
 import io
 import os
 import stat

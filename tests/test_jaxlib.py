@@ -1,7 +1,3 @@
-"""What is taken for granted of the installed jaxlib."""
-
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import jaxlib

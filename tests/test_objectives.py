@@ -1,5 +1,3 @@
-"""The two sums: what they see, what they weigh, what they cost, and that the real step makes them fall."""
-
 from dataclasses import replace
 from functools import cache, partial
 
@@ -49,9 +47,6 @@ def flops(function, *args):
 
 def changed(config, **objective):
     return replace(config, objective=replace(config.objective, **objective))
-
-
-# Stage 1 ------------------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -109,9 +104,6 @@ def test_bfloat16_stays_near_float32():
     norm = lambda tree: np.sqrt(sum(np.sum(np.square(x)) for x in jax.tree.leaves(tree)))  # noqa: E731
     grads, wanted = jax.device_get((grads, wanted))
     assert norm(jax.tree.map(np.subtract, grads, wanted)) < 0.03 * norm(wanted)
-
-
-# Stage 2 ------------------------------------------------------------------------------------------------------------
 
 
 def align_batch():
@@ -296,9 +288,6 @@ def test_a_batch_without_matching_or_without_alignment_costs_nothing_for_it():
     assert both == pytest.approx(align + match, rel=0.01) and match > 0.2 * both
 
 
-# Universal tokens ---------------------------------------------------------------------------------------------------
-
-
 def drawn(monkeypatch, config, progress, rows=64):
     """The sensor rows that stage 2 ends up with: (align, anchor, positive, negative), each (rows,)."""
     received = []
@@ -336,9 +325,6 @@ def test_at_the_start_no_universal_token_is_touched():
         grad, metrics = loss(PARAMS1, batch, KEY, np.float32(progress))
         rows = np.abs(np.asarray(grad["touch"]["sensor_tokens"])).max(axis=(1, 2))
         assert np.flatnonzero(rows).tolist() == used and metrics["p_u"] == np.float32(0.75 * min(progress, 1))
-
-
-# The real step ------------------------------------------------------------------------------------------------------
 
 
 def real_config(stage):

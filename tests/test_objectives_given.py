@@ -1,5 +1,3 @@
-"""What the sums are given and what they give at the edges: pixels, groups, verdicts, keep ratios, accumulation."""
-
 from dataclasses import replace
 from functools import partial
 
@@ -33,9 +31,6 @@ def changed(config, model=None, **objective):
     return replace(
         config, model=replace(config.model, **(model or {})), objective=replace(config.objective, **objective)
     )
-
-
-# Pixels -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("head", ["mlp", "cosine"])
@@ -104,9 +99,6 @@ def test_an_empty_batch_has_a_loss_of_0(stage):
     assert float(value) == 0 and all(np.isfinite(one).all() for one in jax.tree.leaves(slopes))
 
 
-# Stage 2 ------------------------------------------------------------------------------------------------------------
-
-
 def half(batch, i):
     """Half 0 or 1 of eight rows, and of the six slots of each kind."""
     rows, slots = slice(4 * i, 4 * i + 4), slice(3 * i, 3 * i + 3)
@@ -157,9 +149,6 @@ def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
     _, metrics = terms(params, Stage2Batch(None, match))
     right = np.count_nonzero(same > 0) + np.count_nonzero(other < 0)
     np.testing.assert_allclose(metrics["match_accuracy"], right / 10, rtol=1e-6)
-
-
-# Stage 1 ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frames", [1, 4], ids=["still", "clip"])

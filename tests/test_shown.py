@@ -1,7 +1,3 @@
-"""Every public object has a short `repr`: no array is printed, and no field that has its default."""
-
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

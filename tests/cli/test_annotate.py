@@ -1,7 +1,3 @@
-"""`anytouch data annotate`: estimate, consent, captions, a key that stays in the environment."""
-
-from __future__ import annotations
-
 import io
 
 import cv2

@@ -1,7 +1,3 @@
-"""The command line as a whole: help, exit statuses, old names, and errors that every command shares."""
-
-from __future__ import annotations
-
 import errno
 import json
 import os

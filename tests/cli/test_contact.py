@@ -1,7 +1,3 @@
-"""`anytouch data contact`: frames marked, dropped, drawn and compared with what is known."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

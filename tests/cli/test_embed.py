@@ -1,7 +1,3 @@
-"""`anytouch embed`: manifests, folders and videos, and the head that names what is touched."""
-
-from __future__ import annotations
-
 import json
 import shutil
 import zlib
@@ -176,9 +172,6 @@ def test_mistakes_are_named_before_the_encoder_is_loaded(mistake, tmp_path, monk
     out = [] if "--out" in words else ["--out", "f.npz"]
     sentence = mistake("embed", "--model", "nowhere", "--data", *words, *out)
     assert all(name in sentence for name in named), sentence
-
-
-# A head that names what is touched ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

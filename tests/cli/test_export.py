@@ -1,7 +1,3 @@
-"""`anytouch export`: an encoder for jax alone, weights by both kinds of names, and weights between two runs."""
-
-from __future__ import annotations
-
 import stat
 from dataclasses import replace
 

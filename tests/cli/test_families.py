@@ -1,7 +1,3 @@
-"""Encoders of other families through every command: embed, stream, probe, retrieve, export, and a start of training."""
-
-from __future__ import annotations
-
 import json
 import shutil
 

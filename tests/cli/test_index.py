@@ -1,7 +1,3 @@
-"""`anytouch data index`: from a folder as it was unpacked to a manifest."""
-
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

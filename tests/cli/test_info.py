@@ -1,7 +1,3 @@
-"""`anytouch info`: what a file or folder is, from its content."""
-
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

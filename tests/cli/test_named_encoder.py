@@ -1,7 +1,3 @@
-"""Commands without --model use the encoder of the package, and export writes such an encoder."""
-
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,3 @@
-"""`anytouch data pack`: the same rows and the same pictures, from shards."""
-
-from __future__ import annotations
-
 import subprocess
 
 import numpy as np

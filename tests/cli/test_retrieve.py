@@ -1,5 +1,3 @@
-"""`anytouch retrieve` and `anytouch report` on a small world of touches felt by three sensors."""
-
 import json
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""`anytouch data simulate`: mistakes, messages, and a small data set."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blank_recorder import BlankRecorder

@@ -1,5 +1,3 @@
-"""`anytouch stream`: features of a video or a camera, saved also after Ctrl-C."""
-
 import json
 import signal
 import threading

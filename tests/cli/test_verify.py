@@ -1,7 +1,3 @@
-"""`anytouch data verify`: what is wrong, its exit status, and the copies that it writes."""
-
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,3 @@
-"""`anytouch view`: mistakes, and what it opens."""
-
-from __future__ import annotations
-
 import numpy as np
 
 from anytouch_jax.view import server

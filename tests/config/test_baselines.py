@@ -1,7 +1,3 @@
-"""Baselines are recipes: each changes exactly what it says, and nothing else."""
-
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path
@@ -70,8 +66,6 @@ def test_a_configuration_from_before_these_fields_reads_as_the_paper_model() -> 
             del data[section][name]
     assert from_json(json.dumps(data)) == config
 
-
-# The command line ----------------------------------------------------------------------------------------------------
 
 TRAIN = ["--data", "m.csv", "--run", "r"]
 

@@ -1,5 +1,3 @@
-"""The configuration: the tables of presets and recipes, strict JSON, the rules over parameter names."""
-
 import json
 from dataclasses import replace
 from itertools import product

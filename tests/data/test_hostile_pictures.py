@@ -1,7 +1,3 @@
-"""Pictures that are made to take minutes, or to print millions of lines, are refused before they are decoded."""
-
-from __future__ import annotations
-
 import contextlib
 import io
 import sys

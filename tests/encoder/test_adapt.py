@@ -1,7 +1,3 @@
-"""`anytouch adapt`: one row of tokens is fitted, nothing else moves, and the sensor is served better."""
-
-from __future__ import annotations
-
 import json
 
 import jax
@@ -124,9 +120,6 @@ def test_frames_come_from_as_many_recordings_as_there_are(table):
     )
     with pytest.raises(UserError, match="'train' has 24 usable frames of gelslim, not 30"):
         choose_frames(table, "gelslim", "train", 30)
-
-
-# With labels ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

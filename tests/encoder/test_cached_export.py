@@ -1,5 +1,3 @@
-"""Encoders on the fastest exact engine: equal features, exports that are made once and never serve other weights."""
-
 import importlib.util
 import json
 import pickle

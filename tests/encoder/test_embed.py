@@ -1,5 +1,3 @@
-"""One function runs in equal batches; frames of folders and videos become clips."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Encoders and the features they give: of arrays, of a manifest, from a run, from weights, at random."""
-
 import zipfile
 from dataclasses import replace
 
@@ -76,9 +74,6 @@ def test_a_sensor_of_the_table_that_training_never_used_is_reported(encoder, tmp
     assert load_encoder(tmp_path / "w.safetensors").trained_sensors == ("digit",)
 
 
-# Where encoders come from -------------------------------------------------------------------------------------------
-
-
 def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
     params, _, _ = checkpoint.load_params(tiny_run)
     assert set(encoder.params) == {"touch"} and encoder.source == str(tiny_run)
@@ -89,9 +84,6 @@ def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
     assert "array" not in repr(encoder) and "kernel" not in repr(encoder) and len(repr(encoder)) < 400
     wanted = load_encoder(tiny_run / "checkpoints", step=2).encode_touch(CLIPS[:, 0], "digit")
     np.testing.assert_array_equal(wanted, encoder.encode_touch(CLIPS[:, 0], "digit"))
-
-
-# Manifests ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_manifest_gives_what_its_pictures_give(encoder, world):
@@ -115,9 +107,6 @@ def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
         embed_rows(encoder, manifest, np.asarray([1]), 3)
     with pytest.raises(UserError, match="no rows"):
         embed_rows(encoder, manifest, np.asarray([], np.int64))
-
-
-# Files --------------------------------------------------------------------------------------------------------------
 
 
 def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):

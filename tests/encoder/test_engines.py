@@ -1,5 +1,3 @@
-"""Encoders as ONNX: the live model's features in every form of the network, int8, and encoders on engines."""
-
 import json
 from dataclasses import replace
 
@@ -110,9 +108,6 @@ def test_openvino_gives_the_same_features(exported, encoder):
             live = encoder.encode_touch(CLIPS[:count, :3], ROWS[:count])
             run = load(path, "openvino")
             assert np.abs(run(CLIPS[:count, :3], ROWS[:count]) - live).max() < tolerance * np.abs(live).max()
-
-
-# What is refused ----------------------------------------------------------------------------------------------------
 
 
 def test_what_cannot_be_run_is_one_sentence(exported, encoder, calibration, tmp_path, monkeypatch):

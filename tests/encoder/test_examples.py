@@ -1,7 +1,3 @@
-"""Example touches of the package."""
-
-from __future__ import annotations
-
 import numpy as np
 
 import anytouch_jax as at

@@ -1,5 +1,3 @@
-"""Exported encoders: the live model's features, any number of touches, and files that are refused."""
-
 import json
 import shutil
 import subprocess
@@ -38,9 +36,6 @@ def copied(artefact, tmp_path):
     for path in (artefact[0], describes(artefact[0])):
         shutil.copy(path, tmp_path)
     return tmp_path / "model.bin"
-
-
-# Round trip ---------------------------------------------------------------------------------------------------------
 
 
 def test_any_number_of_touches_gives_the_features_of_the_live_model(artefact, encoder):
@@ -89,9 +84,6 @@ def test_an_artefact_needs_no_code_of_the_network(artefact):
         "assert not ours, ours"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
-
-
-# What is refused ----------------------------------------------------------------------------------------------------
 
 
 def test_wrong_touches_and_sensors_are_one_sentence(artefact):

@@ -1,7 +1,3 @@
-"""Search by touch: exact neighbours, the same by a graph, and files that are no index."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Streams: every frame of a video, the newest of a camera, and where the time went."""
-
 import os
 import signal
 import threading
@@ -103,9 +101,6 @@ def features_of(encoder, frames, numbers):
     return encoder.encode_touch(np.stack([small[list(one)] for one in numbers]), "digit")
 
 
-# Videos -------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("frames", "stride", "clips"),
     [
@@ -144,9 +139,6 @@ def test_a_slow_reader_of_a_video_loses_nothing(encoder, video):
     first = next(embedded)
     assert len(received) <= 3  # one embedded, one in the slot, one that waits for the slot
     assert [first.number, *(one.number for one in embedded)] == list(range(8))
-
-
-# Cameras ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
@@ -224,9 +216,6 @@ def test_times_of_a_video_are_those_of_its_frames(encoder, tmp_path):
     np.testing.assert_allclose([one.time for one in outcome], np.array(stamps) / 1000, atol=1e-6)
 
 
-# Reuse --------------------------------------------------------------------------------------------------------------
-
-
 class Film:
     """A video of given frames BGR u8 (n, h, w, 3), without the errors of a codec."""
 
@@ -300,14 +289,8 @@ def test_noise_is_reused_and_a_small_touch_is_not():
         Reuse(-1.0)
 
 
-# The mailbox --------------------------------------------------------------------------------------------------------
-
-
 def clip(number: int) -> Clip:
     return Clip(Frame(number, np.zeros(0), 0.0, 0.0), np.zeros(0), 0.0)
-
-
-# Results ------------------------------------------------------------------------------------------------------------
 
 
 def some(count: int):

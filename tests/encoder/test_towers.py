@@ -1,7 +1,3 @@
-"""Image and text towers of an encoder: equal to those of training, zero-shot similarity, mistakes."""
-
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import jax

@@ -1,7 +1,3 @@
-"""Does touch matter? Controls that remove one thing each, and what their paired differences say."""
-
-from __future__ import annotations
-
 import json
 
 import cv2

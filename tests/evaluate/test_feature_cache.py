@@ -1,7 +1,3 @@
-"""Feature caches: what is computed again, what is not; raw pixels; features files."""
-
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import replace
@@ -79,9 +75,6 @@ def test_another_picture_of_the_gel_is_seen_in_the_same_process(tmp_path, subtra
     assert np.abs(again - first).max() > 1e-3
     second = encoder_features(subtracting, world(tmp_path / "new", 40)).get(ROWS, 1)
     np.testing.assert_array_equal(again, second)
-
-
-# ---- an untrained encoder on pictures ----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -167,8 +160,6 @@ def test_the_order_of_frames(monkeypatch, encoder, pictures):
     assert np.abs(values["right"] - values["repeated"]).max() > 1e-4
 
 
-# ---- raw pixels ---------------------------------------------------------------------------------------------
-
 HALF = 24 * 32 * 3
 
 
@@ -203,9 +194,6 @@ def test_components_are_those_of_train() -> None:
     wild = features.copy()
     wild[~train] *= 100
     np.testing.assert_allclose(principal_components(wild, train, 2)[train], kept[train], atol=1e-5)
-
-
-# ---- features files ----------------------------------------------------------------------------------------
 
 
 def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):

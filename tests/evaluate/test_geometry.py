@@ -1,7 +1,3 @@
-"""Alignment, uniformity, silhouettes and t-SNE on spaces whose figures are known."""
-
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Probes on data whose answer is known: separable, shuffled, leaking and measured labels; tables, JSON."""
-
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -135,9 +131,6 @@ def test_parts_of_the_test_rows() -> None:
     assert (none.n_test, none.low) == (0, None)
 
 
-# ---- regression --------------------------------------------------------------------------------------------
-
-
 def measured(noise: float, groups: int = 60) -> tuple[Array, Array, Array, Array]:
     features, _, group, split = table(groups=groups, apart=0.0)
     weights = np.arange(8) - 3.0
@@ -153,9 +146,6 @@ def test_regression_of_a_linear_quantity() -> None:
     assert noisy.low < noisy.r2 < noisy.high < result.r2
     assert noisy.mae_low < noisy.mae < noisy.mae_high
     assert 0.3 < noisy.r2 < 0.85
-
-
-# ---- a user's mistakes -------------------------------------------------------------------------------------
 
 
 def refused(*words: str, probe: Any = linear_probe, options: Any = None, **changes: Any) -> None:
@@ -187,9 +177,6 @@ def test_rows_that_cannot_be_probed_are_refused(probe: Any) -> None:
 
 def wild(x: Array) -> Array:
     return np.isin(np.arange(len(x)), (4, 17))
-
-
-# ---- tables and JSON ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,3 @@
-"""Probing tasks on features whose answer is known, from pictures, and the public benchmarks; label probes."""
-
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

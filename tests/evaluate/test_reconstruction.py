@@ -1,5 +1,3 @@
-"""Pixels that stage 1 is not shown: its errors and those of guesses without a model, by hand."""
-
 from dataclasses import replace
 
 import jax

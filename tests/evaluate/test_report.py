@@ -1,7 +1,3 @@
-"""Reports: what stands in them, that they are whole, and the demo's report from a manifest and two runs."""
-
-from __future__ import annotations
-
 import contextlib
 import json
 import re

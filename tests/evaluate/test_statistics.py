@@ -1,7 +1,3 @@
-"""Intervals over groups and seeds."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,3 @@
-"""The comparison of encoders: forms of the released sizes, operations, both protocols, and the page."""
-
-from __future__ import annotations
-
 import json
 
 import pytest

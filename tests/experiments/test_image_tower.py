@@ -1,7 +1,3 @@
-"""No tactile pre-training: the image tower as a touch encoder gives what the tower gives."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

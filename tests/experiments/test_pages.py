@@ -1,7 +1,3 @@
-"""Pages of results: every committed page is what its data give, and data that disagree give no page."""
-
-from __future__ import annotations
-
 import ast
 import re
 import shutil

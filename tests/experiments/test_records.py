@@ -1,7 +1,3 @@
-"""Files of results: a record replaces that of its key, writers do not lose each other's records."""
-
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

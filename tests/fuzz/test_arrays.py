@@ -1,7 +1,3 @@
-"""Hostile .npz files that users pass on: features, heads, weights and policies."""
-
-from __future__ import annotations
-
 import io
 import json
 import shutil
@@ -30,9 +26,6 @@ def packed(arrays: Arrays, *, compress: bool = False, twice: str | None = None) 
         if twice:
             archive.filelist.append(archive.getinfo(f"{twice}.npy"))
     return stream.getvalue()
-
-
-# Each changes whole arrays and returns (name, bytes, whether no command may accept them). ----------------------------
 
 
 def dropped(rng, arrays: Arrays, needed):

@@ -1,7 +1,3 @@
-"""Hostile manifests: CSV tables and Parquet files as editors, spreadsheets and faulty disks leave them."""
-
-from __future__ import annotations
-
 import csv
 import io
 import shutil
@@ -118,9 +114,6 @@ def long(rng, rows):
 WRONG_ENDS = (("\u2028",), ("\x0b",))
 LINE_ENDS = (("\n", "\r\n"), ("\r",), ("\r\n",), ("\n", "\n\n"), ("\n", "\r", "\r\n"), ("\n\r",), *WRONG_ENDS)
 CSV = (cell, cell, cell, text, text, text, columns, long)
-
-
-# Parquet -------------------------------------------------------------------------------------------------------------
 
 
 def table(rows) -> dict[str, pa.Array]:

@@ -1,7 +1,3 @@
-"""Hostile pictures and films: cut, padded, of odd kinds, with sizes that nobody has, or no pictures at all."""
-
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""Hostile vectors: of every length that float32 holds, zero, NaN or infinite, in functions of features."""
-
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 from typing import Any

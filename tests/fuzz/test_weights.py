@@ -1,7 +1,3 @@
-"""Hostile weights: pickles that flood the machine of .pth files, safetensors with wrong headers, shards, and NaN."""
-
-from __future__ import annotations
-
 import io
 import json
 import pickle
@@ -34,9 +30,6 @@ def safetensors(
     text = edit(header)
     text = (text if isinstance(text, str) else json.dumps(header)).encode("utf-8", "surrogatepass")
     return struct.pack("<Q", len(text) if length is None else length) + text + body
-
-
-# Each returns (name, bytes, ending, refused by every command, refused where weights are used). ------------------------
 
 
 def header(rng, arrays, metadata):

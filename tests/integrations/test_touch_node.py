@@ -1,7 +1,5 @@
 """The ROS 2 node, run against the documented interface of rclpy (docs.ros.org, rclpy.node.Node)."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from types import ModuleType, SimpleNamespace

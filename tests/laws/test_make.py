@@ -1,7 +1,3 @@
-"""The targets of the Makefile: the commands that they would run, and the help."""
-
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,3 @@
-"""What the README and the pages in docs tell a user: commands that parse, targets that are there, Python that runs."""
-
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

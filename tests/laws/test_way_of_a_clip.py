@@ -1,7 +1,3 @@
-"""The pages "The way of a clip" and "The way of a touch": stops are files, and the functions they name are in them."""
-
-from __future__ import annotations
-
 import ast
 import re
 

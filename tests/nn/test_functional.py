@@ -1,5 +1,3 @@
-"""Building networks: shapes without memory, reproducible first values, parts that do not exist."""
-
 import jax
 import numpy as np
 import pytest

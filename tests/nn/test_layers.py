@@ -1,5 +1,3 @@
-"""Layers against plain formulas, and the scanned stack against the loop."""
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,3 @@
-"""Patch encoders of the sensors' own (T3): who learns from whom, and what a sensor never seen is served by."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -74,9 +70,6 @@ def test_the_shapes_written_down_are_those_of_the_network(model):
 def test_the_authors_files_have_no_place_for_several_patch_encoders():
     with pytest.raises(WeightsError, match="one patch projection for all sensors"):
         to_release(parameters(OWN), OWN)
-
-
-# Sensors that training never saw -------------------------------------------------------------------------------------
 
 
 def touch(model):

@@ -1,5 +1,3 @@
-"""The touch encoder and decoder: what they see, what they cannot see, what they cost."""
-
 import functools
 import math
 

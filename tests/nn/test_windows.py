@@ -1,7 +1,3 @@
-"""Windows of pixels, by which a convolution is a product of matrices."""
-
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

@@ -1,7 +1,3 @@
-"""Pure functions at their edges: array-likes, empty batches, garbage that does not count, strict types, mistakes."""
-
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,3 @@
-"""The losses of bfloat16 inputs: computed in float32, so as near to float64 as float32 is, gradients included."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -4,8 +4,6 @@ One runner a kind of case, found by the letter its name starts with. Nothing is 
 come from `objectives`, gradients from `jax.grad` of them, optimiser steps from `train.step`, weights from `io.release`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

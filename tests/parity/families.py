@@ -1,7 +1,5 @@
 """Encoders of other families against outputs of their authors' code: from raw frames, through the public interface."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -3,8 +3,6 @@
 A case is `<name>.json` and `<name>.npz`: arrays in/..., out/..., grad/..., final/... and what they mean.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 import zlib

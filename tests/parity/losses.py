@@ -1,7 +1,5 @@
 """Golden cases of the two losses: outputs, gradients and which parameters have none, through `objectives`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

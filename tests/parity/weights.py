@@ -1,7 +1,5 @@
 """Golden cases of weights: full-size keys, shapes and decay groups, what is loaded from where, stored parameters."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace

@@ -5,8 +5,6 @@ words. Some phrases are not used anywhere. The README has at most 700 words. Cod
 are not prose.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re

@@ -1,7 +1,5 @@
 """The prose rules find what they name, and pass what is fine."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""The statistics count what they name, and the pages keep their limits."""
-
-from __future__ import annotations
-
 from places import ROOT
 
 from tests.prose.statistics import longest_without_heading, main, pages, statistics

@@ -1,5 +1,3 @@
-"""Touches as a pure function of a key: the distributions of data sets, the program of data sets, held-out objects."""
-
 from dataclasses import replace
 from functools import partial
 

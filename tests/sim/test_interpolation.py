@@ -1,5 +1,3 @@
-"""Interpolation: matrices against polynomials, and cubic lookup against analytic surfaces."""
-
 import jax
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""A recording computed: the surface under the gel, its motion, labels that agree with physics, only what is asked."""
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,5 +1,3 @@
-"""Drawn scenes: seeds, splits, grades and motions. Nothing is simulated here."""
-
 import math
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""One touch from a height map and a pose: its geometry, its gradient, and its mistakes."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Small manifests for checks and repairs."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

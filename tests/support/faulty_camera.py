@@ -1,7 +1,5 @@
 """A stand-in for cv2.VideoCapture that fails at one frame, as real tactile sensors do, and a video with odd times."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

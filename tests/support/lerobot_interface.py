@@ -3,8 +3,6 @@
 Source: github.com/huggingface/lerobot, `cameras/camera.py`, `cameras/configs.py`, `utils/import_utils.py`.
 """
 
-from __future__ import annotations
-
 import abc
 import sys
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Manifests without pictures for probing tasks, and features like those of a network."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,3 @@
-"""Which parameters a loss uses, seen through every construct that hides a program inside another."""
-
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import jax

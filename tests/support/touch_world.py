@@ -1,7 +1,5 @@
 """A world on disk where several sensors feel the same places: each touch has its texture, place and force."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

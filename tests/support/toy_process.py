@@ -1,7 +1,5 @@
 """One of several processes that train the toy problem together: a script for the tests, and how they start it."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -1,7 +1,5 @@
 """A small loss with two heads, its batches and configs; run as a script it trains, for the tests that kill it."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import os

@@ -1,7 +1,5 @@
 """Small models with their parameters and weights files, for the tests of weights."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,3 @@
-"""Runs of several processes: joining, training as one, stopping as one, and the end when one is lost."""
-
-from __future__ import annotations
-
 import json
 import signal
 
@@ -112,9 +108,6 @@ def test_in_one_process_nothing_is_exchanged(tmp_path):
 def test_a_ballot_gives_the_largest_vote():
     ballot = distributed.Ballot(make_mesh(fsdp=2))
     assert [[int(one) for one in ballot.cast(number, 3)] for number in (0, 15)] == [[0, 3], [15, 3]]
-
-
-# Two processes ------------------------------------------------------------------------------------------------------
 
 
 def lock(run_dir, mesh=None, **more):

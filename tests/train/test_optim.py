@@ -1,7 +1,3 @@
-"""Rules, rates, AdamW and layer decay against plain numpy; small leaves as one vector."""
-
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -161,9 +157,6 @@ def test_the_rate_is_given_or_follows_the_step_never_a_counter():
         update(config, params, start, params)
 
 
-# Layer decay ----------------------------------------------------------------------------------------------------------
-
-
 def decayed(decay, **optim):
     config = tiny_config(2)
     model = dataclasses.replace(config.model, touch=dataclasses.replace(config.model.touch, depth=3))
@@ -201,9 +194,6 @@ def test_a_layer_decay_scales_the_step_and_none_is_no_change():
     np.testing.assert_array_equal(still["touch/blocks/mlp/up/kernel"][2], plain["touch/blocks/mlp/up/kernel"][2])
     np.testing.assert_array_equal(still["touch/projection/kernel"], plain["touch/projection/kernel"])
     np.testing.assert_array_equal(still["image/patch/kernel"], plain["image/patch/kernel"])
-
-
-# Packing --------------------------------------------------------------------------------------------------------------
 
 
 TREE = {

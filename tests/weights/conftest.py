@@ -1,7 +1,5 @@
 """Files as torch.save writes them, made by hand: torch is not needed, and a wicked pickle is as easy as a good one."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zipfile

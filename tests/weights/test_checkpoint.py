@@ -1,7 +1,3 @@
-"""Checkpoints: bit-exact, asynchronous, self-describing, whole or not there, and clear about what is wrong."""
-
-from __future__ import annotations
-
 import json
 import resource
 import shutil

@@ -1,7 +1,3 @@
-"""Positions resized, sensor rows by name, and options named that weights need."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiny_models import tiny_config

@@ -1,7 +1,3 @@
-"""Weights in and out: every key accounted for, every value in its place, there and back bit for bit."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

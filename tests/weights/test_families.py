@@ -1,7 +1,3 @@
-"""Files of other families of any size and in any form: the form follows the arrays, damaged files are one sentence."""
-
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -125,8 +121,6 @@ def test_the_number_of_a_layer_takes_no_memory(tmp_path):
     with pytest.raises(UserError, match=r"'blocks\.1\.norm1\.weight' is missing"):
         load_family(tmp_path / "model.safetensors", heads=7)
 
-
-# Files of every family in every form ----------------------------------------------------------------------------------
 
 KINDS = ("safetensors", "pth", "ckpt", "safetensors parts", "bin parts")
 SMALL = {form[0]: form for form in reversed(FORMS) if form[0] != T3}

@@ -1,7 +1,3 @@
-"""The authors' files and full-size key lists, where the golden vectors are present beside the checkout."""
-
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Loading: runs and files give the same model, and what starts a run is checked, fitted and reported."""
-
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -30,9 +26,6 @@ from anytouch_jax.weights.load import first_params, load_init, load_model, read_
 from anytouch_jax.weights.safetensors import MODEL_KEY, export_safetensors, write_safetensors
 
 TRAINED = ["digit", "gelsight_mini"]
-
-
-# Runs and files -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -86,9 +79,6 @@ def test_the_authors_weights_are_known_by_their_table(tmp_path):
     few = replace(config.model, sensors=("digit", UNIVERSAL))
     write_safetensors(path, to_release(params_of(few), few), {})
     assert load_model(path).trained_sensors is None  # of another table, and without metadata
-
-
-# The start of a run ---------------------------------------------------------------------------------------------------
 
 
 def start(config, **paths):
@@ -180,9 +170,6 @@ def test_a_start_that_does_not_fit_names_the_options(stage1, tmp_path):
     assert np.array_equal(result[1]["touch"]["class_token"], params["touch"]["class_token"])
 
 
-# CLIP -----------------------------------------------------------------------------------------------------------------
-
-
 def test_clip_gives_the_towers_and_without_stage_one_the_touch_encoder(stage1, tmp_path):
     config = tiny_config(2, "paper", "pretrained")
     clip = params_of(config.model, seed=9)
@@ -252,9 +239,6 @@ def test_files_of_every_kind_hold_the_same(torch_files, tmp_path):
     for name in ("w.safetensors", "w.npz", "w.pth", "w.bin"):
         assert_same(to_params(read_weights(tmp_path / name), STAGE1), params)
     assert not list(tmp_path.glob(".*"))  # no leftovers of the atomic write
-
-
-# Files of other programs ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod.", "model.", "model._orig_mod."])

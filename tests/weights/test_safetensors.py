@@ -1,7 +1,3 @@
-"""Files of flat arrays: written whole or not at all, types kept."""
-
-from __future__ import annotations
-
 import jax
 import ml_dtypes
 import numpy as np

@@ -1,7 +1,3 @@
-"""Encoders of photographs as the start of the touch encoder: DINOv2, ViT-MAE, ViT and CLIP."""
-
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,3 @@
-"""Preprocessing that timm and Hugging Face state beside weights is used whole, or what is ignored is named."""
-
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""torch files without torch: every view of a storage comes out right, nothing in a file is ever run."""
-
-from __future__ import annotations
-
 import os
 import pickle
 import random

@@ -1,7 +1,3 @@
-"""Parameter trees and their flat form."""
-
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

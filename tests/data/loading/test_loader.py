@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import hashlib
 import threading
 from dataclasses import replace
@@ -23,7 +21,6 @@ def _clips(sequences=3, length=7, stride=1, **extra):
     ]
 
 
-# Determinism -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("stage", "recipe"), [(1, "paper"), (1, "release"), (2, "paper"), (2, "release")])
 def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(make, settings, rich, stage, recipe):
     manifest = make(rich)
@@ -59,7 +56,6 @@ def test_contrast_reads_no_third_touch_and_knows_which_pairs_are_of_one_place(ma
     assert len(places) > 1
 
 
-# Stage 1 ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("batch", [1, 4, 5, 10])
 def test_an_epoch_of_stills_and_of_clips_holds_every_row_once(make, settings, read_back, batch):
     manifest = make(_clips(3, 7))
@@ -152,7 +148,6 @@ def test_what_cannot_be_loaded_is_refused(make, settings, row, data, more, messa
         Loader(make([row]), settings(**data), **more)
 
 
-# Stage 2 ---------------------------------------------------------------------------------------------------------
 def _check_align(batch, rows, read_back, tokenizer):
     size = len(batch.clip)
     drawn = read_back(batch.clip)[:, -1]

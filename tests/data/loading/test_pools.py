@@ -1,7 +1,3 @@
-"""Pools: which rows a run draws, how often, with which modalities, and the notes and errors about them."""
-
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

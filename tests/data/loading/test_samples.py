@@ -1,7 +1,3 @@
-"""Samples: cache, augmentation, and bad files that are named, or replaced and counted."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Object stores that answer over HTTP: a corpus in S3 and on the Hugging Face hub, both served here."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import threading

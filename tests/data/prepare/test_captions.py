@@ -69,9 +69,6 @@ def _words(body):
     return body["messages"][1]["content"][0]["text"]
 
 
-# What is asked ----------------------------------------------------------------------------------------------------
-
-
 def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, tmp_path):
     loose = make(_rows())
     with serve() as server:
@@ -168,9 +165,6 @@ def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):
         find_caption_jobs(loose, families={"mine": "photo"})
 
 
-# Money ------------------------------------------------------------------------------------------------------------
-
-
 def test_nothing_is_asked_before_it_is_confirmed(make, tmp_path):
     estimates = []
     with serve() as server:
@@ -228,9 +222,6 @@ def test_an_interrupted_run_goes_on_and_asks_a_cut_line_again(make, tmp_path):
         assert len(server.asked) == 5 and len(done.captions) == 8
         _run(loose, server, tmp_path / "answers")
         assert len(server.asked) == 5
-
-
-# Failures ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_passing_failure_is_tried_again_and_a_refusal_is_not():
@@ -365,9 +356,6 @@ def test_a_run_of_failures_stops_the_spending(make, tmp_path):
     assert threading.active_count() < 8
 
 
-# The key ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_key_is_in_no_file_and_no_message(make, tmp_path, capfd):
     """A server that quotes the key in its answers and its errors, one of which is cut within the key."""
     said = []
@@ -455,9 +443,6 @@ def test_other_servers_can_be_spoken_to():
     assert set(server.asked[0]) == {"model", "messages", "max_completion_tokens"}
     with serve(lambda *_: (200, {}, chat(None, message={"refusal": "I will not"}))) as server:
         assert _ask(server)[:2] == ("I will not", "refusal")
-
-
-# The sheet --------------------------------------------------------------------------------------------------------
 
 
 def test_the_sheet_holds_its_pictures_and_escapes_words(make, tmp_path):

@@ -1,7 +1,3 @@
-"""The contact filter on gels drawn here: a lit slope with marker dots, pressed or not, sheared or not."""
-
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -294,9 +290,6 @@ def test_one_odd_file_ends_nothing(tmp_path):
     at = lines.index("pictures that cannot be used:")
     assert [line.split()[1] for line in lines[at + 1 : at + 6]] == ["3", "6", "7", "8", "9"]
     assert "7.png" in lines[at + 3] and "`anytouch data verify`" in lines[at + 6]
-
-
-# Quality ------------------------------------------------------------------------------------------------------------
 
 
 def _manifest(folder, splits=None, **columns):

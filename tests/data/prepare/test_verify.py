@@ -30,9 +30,6 @@ def _encoded(suffix, image=IMAGE):
     return cv2.imencode(suffix, image)[1].tobytes()
 
 
-# Files ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_clean_manifest_has_no_findings(make):
     report = verify(make(plain_rows(license="MIT")))
     assert report.ok and report.findings == () and (report.rows, report.files) == (6, 6)
@@ -151,9 +148,6 @@ def test_a_size_that_is_not_the_sensors_is_found(make):
     assert finding_rows(report) == {"wrong_size": [2, 7]} and report.ok
     assert "20 x 20, where most of its sensor or sequence are 16 x 12" in report.findings[0].examples[0]
     assert "12 x 16, where most of its sensor or sequence are 50 x 40" in report.findings[0].examples[1]
-
-
-# Rows -------------------------------------------------------------------------------------------------------------
 
 
 def test_duplicates_leaks_and_repeated_rows_are_told_apart(make):
@@ -280,9 +274,6 @@ def test_the_report_is_whole_as_json(make):
     assert finding["count"] == 1100 and finding["rows"] == list(range(1000)) and len(finding["examples"]) == 5
 
 
-# Swapped ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("witness", [True, False])
 def test_some_swapped_rows_are_pointed_at_and_what_is_not_swapped_is_not_suspected(make, tmp_path, witness):
     loose = image_pairs(tmp_path, make, swap=lambda i: i % 4 == 1, witness=witness)
@@ -293,9 +284,6 @@ def test_some_swapped_rows_are_pointed_at_and_what_is_not_swapped_is_not_suspect
     if not witness:  # a photograph is none
         loose = replace_column(loose, "background_path", ["see3.png"] * 24)
     assert {"swapped", "swapped_rows"}.isdisjoint(finding_rows(verify(loose)))
-
-
-# Splits -----------------------------------------------------------------------------------------------------------
 
 
 def test_the_split_hash_sees_splits_and_nothing_else(make):
@@ -313,9 +301,6 @@ def test_the_split_hash_sees_splits_and_nothing_else(make):
     assert split_hash(select_rows(loose, np.arange(5))) != base
     without, dash = (replace_column(loose, "unit", ["u"] * 5 + [end]) for end in (None, "-"))
     assert split_hash(without) != split_hash(dash)
-
-
-# Manifests that come from elsewhere -------------------------------------------------------------------------------
 
 
 def test_a_csv_with_bom_quotes_and_strange_names_is_verified(make, tmp_path):

@@ -1,7 +1,3 @@
-"""Recordings of robots: MCAP files, ROS 1 and ROS 2 bags written in the test, images by time and labels by nearest."""
-
-from __future__ import annotations
-
 import base64
 import json
 import sys

@@ -1,7 +1,3 @@
-"""What readers share: listings without a look at the frames, numbers, hash splits, columns."""
-
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

@@ -1,7 +1,3 @@
-"""Corpora in shards: small look-alikes of gelsight-mini-pretrain and FoTa, on disk and in an object store."""
-
-from __future__ import annotations
-
 import io
 import json
 import tarfile

@@ -1,7 +1,3 @@
-"""Pictures that readers write belong to their source, and nothing of the user is changed."""
-
-from __future__ import annotations
-
 import os
 
 import cv2

@@ -1,7 +1,3 @@
-"""TacBench, ToucHD-Force and FreeTacMan: small look-alikes of their layouts."""
-
-from __future__ import annotations
-
 import json
 import pickle
 

@@ -1,7 +1,3 @@
-"""Indexing: options, places of the manifest, links, missing folders, and edited manifests."""
-
-from __future__ import annotations
-
 import os
 
 import pytest

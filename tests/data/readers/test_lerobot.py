@@ -1,7 +1,3 @@
-"""A LeRobot data set (version 3) made here: read, embedded, written back; frame indices and time stamps agree."""
-
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,3 @@
-"""Recordings of a user: what counts as a recording, as its frames, and as other files."""
-
-from __future__ import annotations
-
 import os
 
 import cv2

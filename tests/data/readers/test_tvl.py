@@ -1,5 +1,3 @@
-"""TVL (HCT) and SSVTP."""
-
 import json
 
 import cv2

@@ -1,5 +1,3 @@
-"""The benchmark script: its records, its table, mistakes; our side of the PyTorch comparison."""
-
 import json
 
 import numpy as np
@@ -46,9 +44,6 @@ def test_mistakes(tiny, tmp_path, capsys):
         error = capsys.readouterr().err.splitlines()[-1]
         assert str(words[-2 if len(words) > 2 else 0]).removeprefix("--variants") in error
     assert not any(tmp_path.iterdir())
-
-
-# The comparison with PyTorch ------------------------------------------------------------------------------------------
 
 
 def test_the_rival_gets_the_same_numbers_under_the_authors_names(tmp_path):

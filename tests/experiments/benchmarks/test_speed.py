@@ -1,5 +1,3 @@
-"""Speed against error: what is counted, what is compared, what is read from a compiled program."""
-
 import json
 import subprocess
 import sys
@@ -42,9 +40,6 @@ def noise_of(work):
     return jnp.zeros((work.samples, work.config.model.patches))
 
 
-# Useful operations --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("work", [
     Workload("stage1 clips", shallow(preset("small")), 2, 4),
     pytest.param(Workload("stage1 stills", shallow(preset("small")), 2, 1), marks=pytest.mark.slow),
@@ -65,9 +60,6 @@ def test_useful_operations_are_nearly_all_that_xla_counts(work):
     else:
         run = jax.grad(lambda p: two(p, batch, None)[0])
     assert 1 < counted(run, net.abstract()) / work.operations < 1.06  # the rest: norms, softmax, GELU, the loss
-
-
-# Timing -------------------------------------------------------------------------------------------------------------
 
 
 NOWHERE = {"dtype": "float7"}

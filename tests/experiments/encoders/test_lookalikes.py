@@ -1,7 +1,3 @@
-"""Recall@1 among look-alikes: perfect encoders, noise, pixels, and the page."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from touch_world import make_touches

@@ -1,7 +1,3 @@
-"""The head that tells which way an object turns or slides."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,3 @@
-"""The recipe of the encoder: both stages are understood, mix simulated touches with real ones, and fit the package."""
-
-from __future__ import annotations
-
 import pytest
 
 from anytouch_jax.config import from_json, to_json

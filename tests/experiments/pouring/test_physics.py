@@ -1,7 +1,3 @@
-"""Pouring: the flow (mass, repose, chance) and the load on the gel, and the touch that comes of it."""
-
-from __future__ import annotations
-
 import math
 from functools import partial
 

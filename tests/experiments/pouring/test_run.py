@@ -1,5 +1,3 @@
-"""The pouring script: masses, mean errors of the policy and of both bounds, a film; mistakes in one sentence."""
-
 import json
 
 import pytest

@@ -1,7 +1,3 @@
-"""The pouring table: its intervals are over seeds, its differences are paired by run."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,3 @@
-"""Errors on balls: the circle that is found, the sphere that is fitted, the surface that is integrated."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

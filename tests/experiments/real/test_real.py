@@ -1,7 +1,3 @@
-"""Scores of whole recordings: planted answers, held-out choices, and the page."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,3 @@
-"""What is taken for the untouched gel of real recordings."""
-
-from __future__ import annotations
-
 import csv
 
 import cv2

@@ -1,7 +1,3 @@
-"""The graph of the matrix: what is shared, and what a run's result depends on."""
-
-from __future__ import annotations
-
 import dataclasses
 
 from experiments.tables import plan

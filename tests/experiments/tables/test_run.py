@@ -1,7 +1,3 @@
-"""The command `make experiments`: sizes, the plan, mistakes, and (slow) the whole way at the smallest size."""
-
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,3 @@
-"""What of a folder counts as finished: data sets by size and simulator, trainings by the data they saw."""
-
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 

@@ -1,7 +1,3 @@
-"""Pairs: the same frame of the same touch, fine data only, no test object in training; pixels and fields in order."""
-
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

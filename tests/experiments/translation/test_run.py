@@ -1,7 +1,3 @@
-"""The translation script: train a translation, use it, mistakes."""
-
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,3 @@
-"""Translations: what is trained and what stays, the two references, the units of the error, files."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -38,9 +34,6 @@ def regressed() -> Generator:
     return training.fit(ENCODER, X, FIELDS, source="digit", target="tac3d", options=options, shape=FIELD)[0]
 
 
-# Training -----------------------------------------------------------------------------------------------------------
-
-
 def test_frozen_encoders_stay_bit_for_bit(made):
     for name, value in flatten(ENCODER.params).items():
         np.testing.assert_array_equal(flatten(made.params["encoder"])[name], value)
@@ -56,9 +49,6 @@ def test_the_state_that_does_best_on_other_objects_is_kept():
     np.testing.assert_allclose(training.errors(result, *val).mean(), min(reported), rtol=1e-5)
     empty = X[:0], FIELDS[:0]
     assert "val" not in training.fit(None, X, FIELDS, **SENSORS, val=empty, options=options, shape=FIELD)[1][-1]
-
-
-# Files --------------------------------------------------------------------------------------------------------------
 
 
 def test_a_saved_generator_comes_back_bit_for_bit(made, regressed, tmp_path):

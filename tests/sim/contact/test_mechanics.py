@@ -1,7 +1,3 @@
-"""Normal contact against Hertz, a punch, a line load, and cases that break solvers. One grid for all: 64 x 64."""
-
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

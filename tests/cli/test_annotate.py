@@ -71,14 +71,11 @@ def test_nothing_is_asked_without_consent(anytouch, mistake, touches, tmp_path, 
         monkeypatch.setattr("builtins.input", lambda _: (_ for _ in ()).throw(EOFError))  # Ctrl-D
         assert "not confirmed" in mistake(*words)
         for wrong, named in (
-            (["--timeout", "-1"], "timeout"), (["--tries", "0"], "tries"),
-            (["--price-in", "2.5"], "--price-out"),
+            (["--timeout", "-1"], "timeout"), (["--tries", "0"], "tries"), (["--price-in", "2.5"], "--price-out"),
             (["--sheet", str(tmp_path / "s.png"), "--sheet-count", "-1"], "--sheet-count"),
-            (["--sheet", str(touches)], "--sheet"),
-            (["--limit", "0"], "limit"), (["--out", "captions.txt"], "captions.txt"),
-            (["--url", "http://127.0.0.1:9/\u00e9/v1"], "http"),
-            (["--url", "https://api..example.org/v1"], "http"),
-            (["--second-image", "image_2_path"], "image_2_path"),
+            (["--sheet", str(touches)], "--sheet"), (["--limit", "0"], "limit"),
+            (["--out", "captions.txt"], "captions.txt"), (["--url", "http://127.0.0.1:9/\u00e9/v1"], "http"),
+            (["--url", "https://api..example.org/v1"], "http"), (["--second-image", "image_2_path"], "image_2_path"),
         ):  # fmt: skip
             assert named in mistake(*words, *wrong)
         assert server.heads == [] and not (tmp_path / "touch_captions.parquet").exists()

@@ -11,8 +11,8 @@ OWN = {"objective.universal_end": 0.0}  # it starts at 0 anyway
 STILLS = {"data.clip_share": 0.0}
 # (name, stage) -> every field that differs from the paper's model, with its value
 CHANGED = {
-    ("anytouch", 1): {}, ("anytouch", 2): {}, ("no_stage2", 1): {}, ("no_stage1", 2): {},
-    ("no_text", 1): {}, ("no_vision", 1): {}, ("no_text_aligned", 1): {}, ("no_matching", 1): {},
+    ("anytouch", 1): {}, ("anytouch", 2): {}, ("no_stage2", 1): {}, ("no_stage1", 2): {}, ("no_text", 1): {},
+    ("no_vision", 1): {}, ("no_text_aligned", 1): {}, ("no_matching", 1): {},
     ("unitouch", 2): {**OWN, **STILLS, "model.text": None, "model.match_head": "none", "data.require": ("image",)},
     ("tlv_link", 2): {
         **OWN, **STILLS, "model.match_head": "none", "model.sensor_tokens": 0, "data.require": ("image", "text"),
@@ -23,12 +23,9 @@ CHANGED = {
     ("static_only", 1): {**STILLS, "objective.next_frame": False},
     ("static_only", 2): {**STILLS, "objective.next_frame": False},
     ("no_dynamic", 1): {**STILLS, "objective.next_frame": False},
-    ("no_dynamic", 2): {**STILLS, "objective.next_frame": False},
-    ("no_text", 2): {"model.text": None},
-    ("no_vision", 2): {"model.image": None},
-    ("no_matching", 2): {"model.match_head": "none"},
-    ("no_universal", 1): OWN, ("no_universal", 2): OWN,
-    ("no_text_aligned", 2): {"data.aligned_text": False},
+    ("no_dynamic", 2): {**STILLS, "objective.next_frame": False}, ("no_text", 2): {"model.text": None},
+    ("no_vision", 2): {"model.image": None}, ("no_matching", 2): {"model.match_head": "none"}, ("no_universal", 1): OWN,
+    ("no_universal", 2): OWN, ("no_text_aligned", 2): {"data.aligned_text": False},
 }  # fmt: skip
 
 

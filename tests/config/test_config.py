@@ -158,11 +158,8 @@ def test_settings_that_cannot_be_are_errors(kind, options, message):
     """From Python nothing else reads them: a slip would train something else."""
     config = preset("tiny")
     sound = {
-        Config: config,
-        ModelConfig: config.model,
-        Stack: config.model.touch,
-        TextTower: TextTower(Stack(8, 1, 2, 32)),
-    }
+        Config: config, ModelConfig: config.model, Stack: config.model.touch, TextTower: TextTower(Stack(8, 1, 2, 32)),
+    }  # fmt: skip
     with pytest.raises(ConfigError, match=f"^{message}$"):
         replace(sound.get(kind) or kind(), **options)
 

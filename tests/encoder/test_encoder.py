@@ -42,13 +42,10 @@ def test_what_cannot_be_embedded_is_one_sentence(encoder):
     for clips, word in (
         (CLIPS.astype(np.float32), r"float32.*np\.asarray\(frames, np\.uint8\)"),
         (CLIPS[:, 0].tolist(), r"int64.*np\.asarray\(frames, np\.uint8\)"),
-        ([CLIPS[0, 0], CLIPS[0, 0, :5]], "differ in size"),
-        (CLIPS[:, :, :27], "28 x 28"),
-        (CLIPS[..., :1], r"preprocess"),
-        (CLIPS[:, :0], "a clip needs 3 frames"),
-        (CLIPS[:, :2], "a clip needs 3 frames"),
-        (CLIPS[0, 0, 0], "28 x 28"),
-    ):
+        ([CLIPS[0, 0], CLIPS[0, 0, :5]], "differ in size"), (CLIPS[:, :, :27], "28 x 28"),
+        (CLIPS[..., :1], r"preprocess"), (CLIPS[:, :0], "a clip needs 3 frames"),
+        (CLIPS[:, :2], "a clip needs 3 frames"), (CLIPS[0, 0, 0], "28 x 28"),
+    ):  # fmt: skip
         with pytest.raises(UserError, match=word):
             encoder.encode_touch(clips, "digit")
     for ids, word in (([0, 10], "0 to 9"), ([-1, 0], "0 to 9"), ([0], "2 touches")):

@@ -102,9 +102,7 @@ def test_votes():
 def test_the_gradient_head_takes_adamw_steps_of_its_loss(classes):
     """The first step of Adam is the sign of the gradient; decoupled decay shrinks weights and bias."""
     rng = np.random.default_rng(1)
-    x, params = (
-        rng.normal(size=(6, 3)).astype(np.float32), [rng.normal(size=(3, max(1, classes * (classes > 2))))],
-    )  # fmt: skip
+    x, params = (rng.normal(size=(6, 3)).astype(np.float32), [rng.normal(size=(3, max(1, classes * (classes > 2))))])
     params = (params[0].astype("f4"), rng.normal(size=params[0].shape[1]).astype("f4"))
     y = rng.integers(classes, size=6) if classes else rng.normal(size=6).astype(np.float32)
     target = y.astype(np.int32 if classes > 2 else np.float32)

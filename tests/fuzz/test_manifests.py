@@ -182,16 +182,13 @@ def make(rng, folder: Path, things) -> Case:
     for picture in things.manifest.parent.glob("*.png"):
         shutil.copyfile(picture, folder / picture.name)
     commands = {
-        "info": ("info", file),
-        "verify": ("data", "verify", "--no-decode", file),
-        "decode": ("data", "verify", file),
+        "info": ("info", file), "verify": ("data", "verify", "--no-decode", file), "decode": ("data", "verify", file),
         "embed": ("embed", "--model", things.run, "--data", file, "--out", folder / "f.npz"),
         "contact": ("data", "contact", file, "--out", folder / "c.csv"),
         "pack": ("data", "pack", file, "--out", folder / "packed" / "m.parquet"),
-        "two": ("info", file, things.manifest),
-        "repair": ("data", "verify", file, "--repair", folder / "r.csv"),
+        "two": ("info", file, things.manifest), "repair": ("data", "verify", file, "--repair", folder / "r.csv"),
         "probe": ("probe", "label", "--features", things.features, "--data", file, "--no-controls"),
-    }
+    }  # fmt: skip
     command = pick(
         rng, ("info",) * 5 + ("verify",) * 4 + ("decode",) * 3 + ("embed", "contact", "pack", "two", "repair", "probe")
     )

@@ -175,9 +175,7 @@ def raw_pickle(rng, arrays, metadata):
     return f"pickle machine: {kind}", data, "pth", True, True
 
 
-KINDS = (
-    header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, raw_pickle,
-)  # fmt: skip
+KINDS = (header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, raw_pickle)
 
 
 def make(rng, folder: Path, things) -> Case:

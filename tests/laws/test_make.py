@@ -154,10 +154,7 @@ NOT_RUN = {
     "train-stage2": "the tests above read its command, which is that of train-stage1",
 }  # fmt: skip
 SMALL = " ".join(f"--{name} {value}" for name, value in SIZES.items())
-RUN = {
-    "parity": [],
-    "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"],
-}  # fmt: skip
+RUN = {"parity": [], "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"]}
 
 
 def test_every_target_of_the_pages_is_run_or_has_a_reason() -> None:

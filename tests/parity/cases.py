@@ -131,15 +131,10 @@ def _optimizer(case: Case) -> None:
     args, epochs = case.info["args"], case.info["epoch_fraction"]
     per_epoch = int(np.lcm.reduce([Fraction(t).limit_denominator(1000).denominator for t in epochs]))
     optim = replace(
-        config.optim,
-        learning_rate=args["lr"],
-        min_rate=args["min_lr"],
-        warmup=args["warmup_epochs"] * per_epoch,
-        beta1=case.info["optimizer"]["betas"][0],
-        beta2=case.info["optimizer"]["betas"][1],
-        eps=case.info["optimizer"]["eps"],
-        weight_decay=case.info["optimizer"]["weight_decay"],
-    )
+        config.optim, learning_rate=args["lr"], min_rate=args["min_lr"], warmup=args["warmup_epochs"] * per_epoch,
+        beta1=case.info["optimizer"]["betas"][0], beta2=case.info["optimizer"]["betas"][1],
+        eps=case.info["optimizer"]["eps"], weight_decay=case.info["optimizer"]["weight_decay"],
+    )  # fmt: skip
     config = replace(config, optim=optim, run=replace(config.run, steps=args["epochs"] * per_epoch))
 
     def loss(p: Params, batch: Any, key: Any, progress: Any) -> Any:

@@ -144,14 +144,10 @@ def test_damaged_and_hostile_files_get_one_sentence(tmp_path, capsys):
     other = tmp_path / "other.safetensors"
     save_file({"layer.weight": np.zeros((2, 2), np.float32)}, other)
     for file, reason in {
-        cut: "not a whole safetensors file",
-        part: r"missing keys \(4\)",
-        distilled: "is a distilled DeiT",
-        alone: "put its trunk.pth",
-        HERE / "t3/trunk.pth": "trunk of T3 alone",
-        other: "not weights of",
+        cut: "not a whole safetensors file", part: r"missing keys \(4\)", distilled: "is a distilled DeiT",
+        alone: "put its trunk.pth", HERE / "t3/trunk.pth": "trunk of T3 alone", other: "not weights of",
         torch_file(tmp_path / "harmful.ckpt", {"model": {}, "scheduler": Harmful()}): "nothing was run",
-    }.items():
+    }.items():  # fmt: skip
         with pytest.raises(UserError, match=reason) as raised:
             load_encoder(file, heads=None if file in (other,) else 4 if file == distilled else 3)
         assert "\n" not in str(raised.value)

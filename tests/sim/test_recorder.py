@@ -28,17 +28,11 @@ BUMPY = sum(
 def clip(**change):
     unit = identity_unit(DIGIT)
     values = {
-        "relief": BUMPY * 0.1,
-        "place": np.zeros(2, np.float32),
-        "start": np.zeros(3, np.float32),
-        "motion": np.zeros((2, 3), np.float32),
-        "depth": np.full(2, 0.5, np.float32),
-        "tilt": np.zeros(2, np.float32),
-        "modulus": np.float32(1e5),
-        "friction": np.float32(0.6),
-        "unit": unit._replace(**change.pop("unit", {})),
+        "relief": BUMPY * 0.1, "place": np.zeros(2, np.float32), "start": np.zeros(3, np.float32),
+        "motion": np.zeros((2, 3), np.float32), "depth": np.full(2, 0.5, np.float32), "tilt": np.zeros(2, np.float32),
+        "modulus": np.float32(1e5), "friction": np.float32(0.6), "unit": unit._replace(**change.pop("unit", {})),
         "seed": np.uint32(1),
-    }
+    }  # fmt: skip
     values |= change
     return ClipInput(**values, drift=np.zeros((len(values["depth"]), 3, 3), np.float32))
 

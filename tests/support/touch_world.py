@@ -66,13 +66,11 @@ def row(
 ) -> dict[str, Any]:
     name = f"{split} thing {thing}"
     return {
-        "path": path, "sensor": sensor, "sequence": f"{split}/{number}/{sensor}", "frame_index": frame,
-        "split": split, "unit": f"{split} unit", "touch": f"{split}/{number}", "object": name,
-        "image_path": "photo.png" if number % 2 else None,
-        "text": f"{name} | feels coarse" if number % 3 else None,
-        "background_path": f"{sensor}.png",
-        "grade": "fine" if number % 2 else "coarse",
+        "path": path, "sensor": sensor, "sequence": f"{split}/{number}/{sensor}", "frame_index": frame, "split": split,
+        "unit": f"{split} unit", "touch": f"{split}/{number}", "object": name,
+        "image_path": "photo.png" if number % 2 else None, "text": f"{name} | feels coarse" if number % 3 else None,
+        "background_path": f"{sensor}.png", "grade": "fine" if number % 2 else "coarse",
         "label.hardness": ("soft", "hard")[thing % 2], "label.indenter": ("ball", "cube", "ring")[thing % 3],
-        "label.force": force, "label.depth": force / 5, "label.area": 3.1 * force,
-        "label.x": place[0], "label.y": place[1],
+        "label.force": force, "label.depth": force / 5, "label.area": 3.1 * force, "label.x": place[0],
+        "label.y": place[1],
     }  # fmt: skip

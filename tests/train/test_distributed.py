@@ -113,15 +113,9 @@ def test_a_ballot_gives_the_largest_vote():
 def lock(run_dir, mesh=None, **more):
     """The same run in this process."""
     return fit(
-        config_of(**{"steps": 12} | more.pop("run", {})),
-        params=toy_params(WIDE),
-        loss_fn=toy_loss,
-        batches=batches_of(0, 1),
-        run_dir=run_dir,
-        mesh=mesh or make_mesh(1),
-        log=lambda sentence: None,
-        **more,
-    )
+        config_of(**{"steps": 12} | more.pop("run", {})), params=toy_params(WIDE), loss_fn=toy_loss,
+        batches=batches_of(0, 1), run_dir=run_dir, mesh=mesh or make_mesh(1), log=lambda sentence: None, **more,
+    )  # fmt: skip
 
 
 def column(run_dir, name="loss"):

@@ -111,12 +111,9 @@ def test_adamw_with_skipped_parameters_equals_plain_numpy():
     got, state = run_updates(config, params, grads, uses)
     rates = [float(schedule(config)(step)) for step in range(9)]
     expected, count, m, v2 = adamw_by_hand(
-        flatten(params),
-        [flatten(g) for g in grads],
-        [flatten(u) for u in uses],
-        rates,
+        flatten(params), [flatten(g) for g in grads], [flatten(u) for u in uses], rates,
         decay=match_rules(config.weight_decay, flatten(params)),
-    )
+    )  # fmt: skip
     assert count["decoder/still_head/kernel"] == 3 and count["idle/kernel"] == 0
     held = flatten(moments(state, params))
     for name, value in flatten(got).items():

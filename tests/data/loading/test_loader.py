@@ -260,9 +260,7 @@ def test_tokenizers(make, settings, tmp_path):
 def _check_match(match, rows, read_back, size, frames, other_object=False):
     anchor, positive, negative = (read_back(clip) for clip in (match.clip, match.positive, match.negative))
     ids = {"digit": 1, "gelslim": 2}
-    for clip, sensor in (
-        (anchor, match.sensor), (positive, match.positive_sensor), (negative, match.negative_sensor)
-    ):  # fmt: skip
+    for clip, sensor in ((anchor, match.sensor), (positive, match.positive_sensor), (negative, match.negative_sensor)):
         assert clip.shape == (size, frames)
         assert (np.diff(clip, axis=1) == 1).all()
         assert sensor.tolist() == [ids[rows[r]["sensor"]] for r in clip[:, -1]]

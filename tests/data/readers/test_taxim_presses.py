@@ -12,12 +12,9 @@ def test_taxim_presses_become_pictures(tmp_path, read):
     images[:, :, :, 0] = np.arange(5, dtype=np.uint8)[:, None, None]  # blue: the pack is BGR
     (calib / "gelsight").mkdir(parents=True)
     np.savez(
-        calib / "gelsight/dataPack.npz",
-        f0=images[0],
-        imgs=images,
-        touch_center=np.ones((5, 2)),
+        calib / "gelsight/dataPack.npz", f0=images[0], imgs=images, touch_center=np.ones((5, 2)),
         touch_radius=np.arange(5),
-    )
+    )  # fmt: skip
     root = tmp_path / "out"
     root.mkdir()
     table = read("taxim_presses", root, lists=calib, val=0, test=0)

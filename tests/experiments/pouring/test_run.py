@@ -27,14 +27,11 @@ def test_a_run_pours(script, tiny_run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--model", "nowhere"], "nowhere"),
-        (["--model", "x", "--trials", "0"], "--trials"),
-        (["--model", "x", "--demos", "0"], "--demos"),
-        (["--model", "x", "--steps", "0"], "--steps"),
-        (["--record", "y", "--demos", "1"], "--demos"),
-        (["--recordings", "x.parquet"], "--model"),
+        (["--model", "nowhere"], "nowhere"), (["--model", "x", "--trials", "0"], "--trials"),
+        (["--model", "x", "--demos", "0"], "--demos"), (["--model", "x", "--steps", "0"], "--steps"),
+        (["--record", "y", "--demos", "1"], "--demos"), (["--recordings", "x.parquet"], "--model"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_one_sentence(script, words, named):
     logged = script(pour, *words)
     assert logged.status == 2 and named in logged.err and len(logged.err.strip().splitlines()) == 1

@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.nn.vit import VitConfig
 from anytouch_jax.weights.convert import file_shapes
 from anytouch_jax.weights.families import FAMILIES, entries_of, load_family
+from anytouch_jax.weights.load import load_model
 from tests.weights.conftest import Call, Global, tensor, zip_bytes
 
 BY_TITLE = {family.title: family for family in FAMILIES}
@@ -102,25 +104,23 @@ def test_the_form_follows_the_arrays(title, stack, patch, more, size, given, tmp
 
 
 def test_what_the_arrays_do_not_say_is_asked_for(tmp_path):
-    _, _, arrays = made(*FORMS[-1][:5])
-    save_file(arrays, tmp_path / "model.safetensors")
-    with pytest.raises(UserError, match="no grid of patches; give the image_size"):
-        load_family(tmp_path / "model.safetensors", heads=7)
-    with pytest.raises(UserError, match=r"number of attention heads of touch \(width 28\)"):
-        load_family(tmp_path / "model.safetensors", image_size=(24, 40))
-    with pytest.raises(UserError, match="no multiple of the patches of 8"):
-        load_family(tmp_path / "model.safetensors", heads=7, image_size=(24, 44))
+    save_file(made(*FORMS[-1][:5])[2], file := tmp_path / "model.safetensors")
+    for given, words in (
+        ({"heads": 7}, "no grid of patches; give the image_size"),
+        ({"image_size": (24, 40)}, r"number of attention heads of touch \(width 28\)"),
+        ({"heads": 7, "image_size": (24, 44)}, "no multiple of the patches of 8"),
+    ):
+        with pytest.raises(UserError, match=words):
+            load_family(file, **given)
     (tmp_path / "config.json").write_text(json.dumps({"num_attention_heads": 7, "hidden_act": "quick_gelu"}))
     with pytest.raises(UserError, match=r"hidden_act of the config\.json is quick_gelu"):
-        load_family(tmp_path / "model.safetensors", image_size=(24, 40))
-
-
-def test_the_number_of_a_layer_takes_no_memory(tmp_path):
+        load_family(file, image_size=(24, 40))
+    (tmp_path / "config.json").unlink()
     _, _, arrays = made(*FORMS[-2][:5])
-    arrays["blocks.999999999.norm1.weight"] = arrays.pop("blocks.1.norm1.weight")
-    save_file(arrays, tmp_path / "model.safetensors")
+    arrays["blocks.999999999.norm1.weight"] = arrays.pop("blocks.1.norm1.weight")  # it takes no memory
+    save_file(arrays, file)
     with pytest.raises(UserError, match=r"'blocks\.1\.norm1\.weight' is missing"):
-        load_family(tmp_path / "model.safetensors", heads=7)
+        load_family(file, heads=7)
 
 
 KINDS = ("safetensors", "pth", "ckpt", "safetensors parts", "bin parts")
@@ -190,11 +190,14 @@ def test_a_whole_file_is_read_and_a_damaged_one_is_one_sentence(title, kind, tmp
 
 
 @pytest.mark.parametrize("part", ["trunk.pth", "encoders/digit.pth"])
-def test_a_damaged_part_of_t3_is_one_sentence(part, tmp_path):
+def test_a_damaged_or_lonely_part_of_t3_is_one_sentence(part, tmp_path):
     _, stack, patch, more, size, _ = next(form for form in FORMS if form[0] == T3)
-    _, _, arrays = made(T3, stack, patch, more, size)
-    file = write_t3(tmp_path / "t3", arrays)
-    damaged = tmp_path / "t3" / part
+    file, damaged = write_t3(tmp_path / "t3", made(T3, stack, patch, more, size)[2]), tmp_path / "t3" / part
+    refused(tmp_path / "t3" / "trunk.pth", tmp_path / "trunk.pth", stack[2], "trunk of T3 alone")
+    refused(alone := Path(shutil.copy(file, tmp_path)), alone, stack[2], "put its trunk.pth")
+    save_file({"layer.weight": np.zeros((2, 2), "f4")}, other := tmp_path / "other.safetensors")
+    with pytest.raises(UserError, match="not weights of"):
+        load_model(other)
     data = damaged.read_bytes()
     for length in (0, len(data) // 3, len(data) - 1000):
         damaged.write_bytes(data[:length])

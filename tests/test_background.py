@@ -3,6 +3,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from faulty_camera import Film
 from tiny_models import tiny_config
 from touch_world import make_touches
 
@@ -263,33 +264,13 @@ def test_an_encoder_of_either_kind_works_with_and_without_a_background(encoder):
     assert (camera(gel) == 90).all() and (camera(gel) == 90).all()
 
 
-class Source:
-    """A camera or a film in memory, as stream reads it."""
-
-    def __init__(self, frames):
-        self.frames, self.at = frames, -1
-
-    def grab(self):
-        self.at += 1
-        return self.at < len(self.frames)
-
-    def retrieve(self):
-        return True, self.frames[self.at][..., ::-1]
-
-    def get(self, _):
-        return 0.0
-
-    def release(self):
-        pass
-
-
 def test_a_stream_is_marked_until_its_untouched_gel_is_settled_or_captured(encoder):
     frames = [GEL] * (SETTLED + 2)
     frames[0] = np.clip(GEL.astype(int) + 60, 0, 255).astype(np.uint8)  # it begins with a press
     for background, marked in ((None, SETTLED - 1), (GEL, 0)):
         preprocess = Preprocess(encoder, background)
         gate = ContactGate(preprocess, "digit")
-        arrived = list(stream(encoder, Source(frames), preprocess, live=False, sensor=0, contact=gate))
+        arrived = list(stream(encoder, Film(np.flip(frames, -1)), preprocess, live=False, sensor=0, contact=gate))
         assert [one.estimated for one in arrived] == [True] * marked + [False] * (len(frames) - marked)
         np.testing.assert_array_equal(preprocess.background, GEL)
         assert not any(one.contact for one in arrived[4:])

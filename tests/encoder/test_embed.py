@@ -6,7 +6,6 @@ from anytouch_jax.config import SENSORS
 from anytouch_jax.encoder import search
 from anytouch_jax.encoder.arrays import spread_lines, unit_rows
 from anytouch_jax.encoder.embed import embed_frames, run_in_batches
-from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.encoder.search import load_index
 from anytouch_jax.errors import UserError
 
@@ -31,11 +30,6 @@ def test_results_that_are_not_finite_are_refused():
     huge = RNG.standard_normal((3, 2)).astype(np.float32) * np.float32(1e30)
     with np.errstate(over="ignore"), pytest.raises(UserError, match="the features are not finite"):
         run_in_batches(lambda batch: batch * batch, huge, 2)
-
-
-@pytest.fixture(scope="module")
-def encoder(tiny_run):
-    return load_encoder(tiny_run)
 
 
 def test_no_clip_spans_a_gap_or_an_unreadable_frame(encoder):

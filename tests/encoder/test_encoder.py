@@ -20,11 +20,6 @@ RNG = np.random.default_rng(0)
 CLIPS = RNG.integers(0, 256, (2, 7, 28, 28, 3), np.uint8)
 
 
-@pytest.fixture(scope="module")
-def encoder(tiny_run):
-    return load_encoder(tiny_run)
-
-
 def test_shapes_of_what_is_embedded(encoder):
     still = CLIPS[:, 0]
     z = encoder.encode_touch(still, "digit")

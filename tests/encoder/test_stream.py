@@ -3,20 +3,18 @@ import signal
 import threading
 from itertools import pairwise
 
-import cv2
 import jax
 import numpy as np
 import pytest
-from faulty_camera import KINDS, FaultyCamera, write_uneven_video
+from faulty_camera import KINDS, FaultyCamera, Film, write_uneven_video
+from films import write_film
 
 from anytouch_jax.data.images import frames_from_video
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder import stream as streams
-from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.encoder.stream import (
     PARTS,
     CameraError,
-    Clip,
     Embedded,
     Frame,
     Mailbox,
@@ -38,20 +36,10 @@ def impatient(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def encoder(tiny_run):
-    return load_encoder(tiny_run)
-
-
-@pytest.fixture(scope="module")
 def video(tmp_path_factory):
-    path = tmp_path_factory.mktemp("video") / "touch.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (40, 32))
-    rng = np.random.default_rng(0)
-    for frame in range(8):
-        blue_to_red = np.full((32, 40, 3), (20, 30 * frame, 200), np.uint8)
-        writer.write(blue_to_red + rng.integers(0, 30, blue_to_red.shape, np.uint8))
-    writer.release()
-    return path
+    noise = np.random.default_rng(0).integers(0, 30, (8, 32, 40, 3), np.uint8)
+    frames = [np.full((32, 40, 3), (20, 30 * number, 200), np.uint8) + one for number, one in enumerate(noise)]
+    return write_film(tmp_path_factory.mktemp("video") / "touch.avi", frames)
 
 
 class Camera:
@@ -216,26 +204,6 @@ def test_times_of_a_video_are_those_of_its_frames(encoder, tmp_path):
     np.testing.assert_allclose([one.time for one in outcome], np.array(stamps) / 1000, atol=1e-6)
 
 
-class Film:
-    """A video of given frames BGR u8 (n, h, w, 3), without the errors of a codec."""
-
-    def __init__(self, frames) -> None:
-        self.frames = iter(frames)
-
-    def grab(self) -> bool:
-        self.frame = next(self.frames, None)
-        return self.frame is not None
-
-    def retrieve(self):
-        return True, self.frame
-
-    def get(self, name) -> float:
-        return 0.0
-
-    def release(self) -> None:
-        pass
-
-
 @pytest.fixture
 def embedded_clips(monkeypatch):
     """The clips that reached the encoder."""
@@ -287,10 +255,6 @@ def test_noise_is_reused_and_a_small_touch_is_not():
     assert not any(exact(noisy()) for _ in range(streams.LEARNED + 20))
     with pytest.raises(UserError, match="must be 0 or more, not -1"):
         Reuse(-1.0)
-
-
-def clip(number: int) -> Clip:
-    return Clip(Frame(number, np.zeros(0), 0.0, 0.0), np.zeros(0), 0.0)
 
 
 def some(count: int):

@@ -212,16 +212,9 @@ def test_every_repr_is_short_and_shows_no_array(tmp_path, world, tiny_run):
         assert text.startswith(type(one).__name__), (name, text)
 
 
-@pytest.mark.parametrize(
-    ("config", "text"),
-    [
-        (at.LossConfig(), "LossConfig()"),
-        (at.LossConfig(mask_ratio=0.5), "LossConfig(mask_ratio=0.5)"),
-        (at.DataConfig(manifests=("a.csv",)), "DataConfig(manifests=('a.csv',))"),
-    ],
-)
-def test_a_configuration_shows_what_is_not_the_default(config, text):
-    assert repr(config) == text and eval(text, vars(at) | {type(config).__name__: type(config)}) == config
+@pytest.mark.parametrize("text", ["LossConfig()", "LossConfig(mask_ratio=0.5)", "DataConfig(manifests=('a.csv',))"])
+def test_a_configuration_shows_what_is_not_the_default(text):
+    assert repr(eval(text, vars(at))) == text
 
 
 def test_a_sum_is_that_of_its_parts_whatever_the_number_of_rows() -> None:

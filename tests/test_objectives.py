@@ -160,20 +160,15 @@ def loop(a, b, rows):
 
 
 def test_garbage_in_unused_slots_changes_nothing():
-    spoilt = ALIGN._replace(
-        image=set_at(ALIGN.image, 2, np.nan),
-        text=set_at(ALIGN.text, 2, 1_000_000),
-        text_mask=set_at(ALIGN.text_mask, 2, False),
-    )
+    text, mask = set_at(ALIGN.text, 2, 1_000_000), set_at(ALIGN.text_mask, 2, False)
+    spoilt = ALIGN._replace(image=set_at(ALIGN.image, 2, np.nan), text=text, text_mask=mask)
     jax.tree.map(np.testing.assert_array_equal, terms2(spoilt), terms2())
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(terms2(spoilt)))
 
 
 def test_towers_that_nothing_is_shown_to_cost_nothing_and_need_not_exist():
-    none = ALIGN._replace(
-        image=ALIGN.image[:0], image_row=ALIGN.image_row[:0],
-        text=ALIGN.text[:0], text_mask=ALIGN.text_mask[:0], text_row=ALIGN.text_row[:0],
-    )  # fmt: skip
+    slots = ("image", "image_row", "text", "text_mask", "text_row")
+    none = ALIGN._replace(**{name: getattr(ALIGN, name)[:0] for name in slots})
     terms = lambda p, b: objectives.stage2_terms(p, Stage2Batch(b, None), None, net=NET2, config=CONFIG2)  # noqa: E731
     touch = {name: PARAMS2[name] for name in ("touch", "logit_scale")}  # no towers, no decoder, no matching head
     encode = flops(lambda p: NET2.encode_touch(p, ALIGN.clip, SENSOR), touch)
@@ -191,11 +186,8 @@ def test_the_weights_of_the_sum(recipe):
     align = ALIGN._replace(clip=CLIP4)
     total, m = terms(net.params, Stage2Batch(align, MATCH), NOISE)
     text = {"paper": 0.5, "release": 1.0}[recipe]  # the release does not halve the touch-text pair (golden Q9)
-    by_hand = (
-        0.5 * (m["touch_to_vision"] + m["vision_to_touch"])
-        + text * (m["touch_to_text"] + m["text_to_touch"])
-        + 0.1 * (m["vision_to_text"] + m["text_to_vision"])
-    )
+    weights = (("touch", "vision", 0.5), ("touch", "text", text), ("vision", "text", 0.1))
+    by_hand = sum(weight * (m[f"{a}_to_{b}"] + m[f"{b}_to_{a}"]) for a, b, weight in weights)
     np.testing.assert_allclose(m["align"], by_hand, rtol=1e-6)
     pixel_loss = m["reconstruction"] + m["next_frame"] if recipe == "release" else 0.0
     assert ("reconstruction" in m) == (recipe == "release")

@@ -96,14 +96,12 @@ def _no_physics(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--sensors", "nose"], "no simulated sensor 'nose'"),
-        (["--depth", "1", "0.5"], "depth is a range of mm"),
+        (["--sensors", "nose"], "no simulated sensor 'nose'"), (["--depth", "1", "0.5"], "depth is a range of mm"),
         (["--threads", "0"], "--threads must be 1 to 1024"),
         (["--sensors", "tac3d", "--fields", "pressure"], "no sensor has a camera"),
-        (["--size", "8"], "size is 16 to 4096"),
-        (["--size", "20000"], "size is 16 to 4096"),
+        (["--size", "8"], "size is 16 to 4096"), (["--size", "20000"], "size is 16 to 4096"),
     ],
-)
+)  # fmt: skip
 def test_a_mistake_is_one_sentence_and_leaves_nothing(mistake, tmp_path, words, named):
     assert named in mistake("data", "simulate", "--out", tmp_path / "x", *words)
     assert not (tmp_path / "x").exists()

@@ -209,12 +209,10 @@ def test_settings_of_an_older_version_are_read_under_their_new_names():
 @pytest.mark.parametrize(
     "change",
     [
-        {"optim__ema": 0.9},
-        {"objective__differences": 1.0},
-        {"model__force_head": True},
+        {"optim__ema": 0.9}, {"objective__differences": 1.0}, {"model__force_head": True},
         {"objective__reconstruct": True},
     ],
-)
+)  # fmt: skip
 def test_a_retired_setting_with_an_effect_stops_a_run_but_not_an_encoder(change):
     text = old_json(**change)
     assert from_json(text).model == preset("tiny", stage=2).model

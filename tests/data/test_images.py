@@ -247,10 +247,8 @@ def test_strips_and_tiffs_that_opencv_would_read_wrong_are_refused(tmp_path):
     clear.save(tmp_path / "clear.tif")
     Image.fromarray(np.zeros((1, 2000, 3), np.uint8)).save(tmp_path / "strip.tif")
     sentences = {
-        "several": "holds several pictures",
-        "clear": "colours would be multiplied",
-        "strip": "that is a strip",
-    }
+        "several": "holds several pictures", "clear": "colours would be multiplied", "strip": "that is a strip",
+    }  # fmt: skip
     for name, sentence in sentences.items():
         with pytest.raises(images.ImageError, match=rf"{name}\.tif .*{sentence}"):
             images.decode(tmp_path / f"{name}.tif")

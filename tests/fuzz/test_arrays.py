@@ -115,16 +115,14 @@ def make(rng, folder: Path, things) -> Case:
     embed = ("embed", "--model", things.run, "--data", things.frames, "--out", folder / "o.npz")
     commands = {
         "features": (
-            ("info", file),
-            ("probe", "label", "--features", file, "--data", things.manifest, "--no-controls"),
+            ("info", file), ("probe", "label", "--features", file, "--data", things.manifest, "--no-controls"),
         ),
         "head": (("info", file), ("info", file), ("info", file), (*embed, "--head", file)),
         "weights": (
-            ("info", file),
-            ("export", "--to", "safetensors", "--model", file, "--out", folder / "w.safetensors"),
+            ("info", file), ("export", "--to", "safetensors", "--model", file, "--out", folder / "w.safetensors"),
         ),
         "policy": (lambda: (load_policy(folder), 0)[1],),
-    }[kind]
+    }[kind]  # fmt: skip
     at = int(rng.integers(len(commands)))
     words = commands[at]
     if kind == "features" and at == 0:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from checked_world import columns
 from PIL import Image
 from places import ROOT
 from tiny_models import tiny_config
@@ -23,13 +24,7 @@ from anytouch_jax.nn.functional import build
 
 MAKEFILE = (ROOT / "Makefile").read_text()
 FILES = ["README.md", *(file.relative_to(ROOT).as_posix() for file in sorted((ROOT / "docs").rglob("*.md")))]
-MADE = (
-    "docs/results/",
-    "docs/tutorials/",
-    "docs/reference/",
-    "docs/contributing.md",
-    "docs/changelog.md",
-)  # by docs/generate.py
+MADE = tuple(f"docs/{name}" for name in ("results/", "tutorials/", "reference/", "contributing.md", "changelog.md"))
 PAGES = {name: (ROOT / name).read_text() for name in FILES if not name.startswith(MADE)}
 TEXT = "\n".join(PAGES.values())
 BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\n+^```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
@@ -101,8 +96,7 @@ def test_the_python_of_a_page_runs_and_prints_what_it_shows(
         arrays = (np.array(["ball", "cube"]), np.ones((width, 1)), np.zeros(1), np.zeros(width), np.ones(width))
         save_head("head.npz", LinearHead(*arrays, "object", "class", 1, "f", known))
         Image.fromarray(np.full((60, 80, 3), 90, np.uint8)).save("a.png")
-        row = {"path": ["a.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
-        names["manifest"] = from_columns(row, tmp_path / "m.parquet")
+        names["manifest"] = from_columns(columns(path=["a.png"]), tmp_path / "m.parquet")
     for code, shown in BLOCK.findall(PAGES[name]):
         capsys.readouterr()
         if "runs/" in code:  # test_pages_run.py trains that run

@@ -232,11 +232,9 @@ def _clip(case: Case) -> None:
     }
     ids = {name: np.asarray(case.inputs(f"input_ids_{name}")) for name in ("pad_eot", "pad_zero")}
     texts = {
-        "pad_eot": (ids["pad_eot"], masks["attention_mask"]),
-        "pad_zero": (ids["pad_zero"], masks["attention_mask"]),
-        "hole": (ids["pad_eot"], masks["attention_mask_with_hole"]),
-        "nomask": (ids["pad_eot"], None),
-    }
+        "pad_eot": (ids["pad_eot"], masks["attention_mask"]), "pad_zero": (ids["pad_zero"], masks["attention_mask"]),
+        "hole": (ids["pad_eot"], masks["attention_mask_with_hole"]), "nomask": (ids["pad_eot"], None),
+    }  # fmt: skip
     for sub, clip in case.info["subcases"].items():
         info = {**case.info, "clip_config": {**case.info["clip_config"], **clip}}
         config = golden_config(info, stage=2)

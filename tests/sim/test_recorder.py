@@ -172,11 +172,9 @@ def test_an_object_that_turns_about_itself_does_not_slide():
     motion[:, 2] = np.linspace(0, 0.2, 5)
     round_ = -(AXIS[:, None] ** 2 + AXIS[None, :] ** 2) / 16
     turning = clip(
-        relief=round_.astype(np.float32),
-        unit={"offset": np.array([0.6, 0.6], np.float32)},
-        motion=motion,
+        relief=round_.astype(np.float32), unit={"offset": np.array([0.6, 0.6], np.float32)}, motion=motion,
         depth=np.full(5, 0.6, np.float32),
-    )
+    )  # fmt: skip
     simulate = partial(record.simulate_clip, sensor=DIGIT, fidelity="fast", size=48, fields=("shear",))
     take = jax.jit(simulate)(turning)
     shear = np.asarray(take.field[-1])

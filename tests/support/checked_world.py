@@ -29,6 +29,13 @@ def with_patterns(make):
     return build
 
 
+def columns(count=1, **more):
+    """The columns that every manifest has, of `count` frames of one sequence, and `more`."""
+    names = [f"{i}.png" for i in range(count)]
+    usual = {"path": names, "sensor": ["digit"] * count, "sequence": ["s"] * count, "frame_index": list(range(count))}
+    return usual | {"split": ["train"] * count} | more
+
+
 def plain_rows(count=6, **extra):
     """`count` rows of one dataset, in sequences of three frames."""
     return [{"sequence": f"s{i // 3}", "frame_index": i % 3, "dataset": "d", **extra} for i in range(count)]

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import used_parameters as usage
 from used_parameters import used_parameters
 
@@ -15,41 +16,32 @@ def used(loss, **params):
     return {name for name, value in result.items() if value}
 
 
-def test_dead_code_and_metrics_do_not_count():
-    def loss(p):
-        dead = jnp.sum(p["dead"]) * 2  # noqa: F841
-        return jnp.sum(p["read"]), {"metric": jnp.sum(p["shown"]), "both": p["read"]}
-
-    assert used(loss, read=X, dead=X, shown=X, idle=X) == {"read"}
+def metrics(p):
+    dead = jnp.sum(p["dead"]) * 2  # noqa: F841
+    return jnp.sum(p["read"]), {"metric": jnp.sum(p["shown"]), "both": p["read"]}
 
 
-def test_what_torch_gives_no_gradient_counts_as_unused():
-    def loss(p):
-        picked = p["picked"][jnp.argmax(p["index"])]
-        held = jax.lax.stop_gradient(p["held"])
-        return picked * jnp.sum(held) * jnp.sum(p["gate"] > 0)
-
-    assert used(loss, picked=X, index=X, held=X, gate=X) == {"picked"}
+def no_gradient(p):
+    return p["picked"][jnp.argmax(p["index"])] * jnp.sum(jax.lax.stop_gradient(p["held"])) * jnp.sum(p["gate"] > 0)
 
 
-def test_a_branch_on_data_uses_both_sides():
-    def loss(p):
-        chosen = jnp.where(p["a"] > 0, p["a"], p["b"])
-        return jnp.sum(jax.lax.cond(X[0] > 0, lambda c, d: c * 2, lambda c, d: jnp.sin(c), p["c"], p["d"]) + chosen)
-
-    assert used(loss, a=X, b=X, c=X, d=X) == {"a", "b", "c"}
+def branches(p):
+    chosen = jnp.where(p["a"] > 0, p["a"], p["b"])
+    return jnp.sum(jax.lax.cond(X[0] > 0, lambda c, d: c * 2, lambda c, d: jnp.sin(c), p["c"], p["d"]) + chosen)
 
 
-def test_the_arguments_that_a_call_ignores_are_unused():
-    @jax.jit
-    def inner(a, b, c):
-        return a * 2, c
+def calls(p):
+    out, other = jax.jit(lambda a, b, c: (a * 2, c))(p["a"], p["b"], p["c"])
+    return jnp.sum(jax.checkpoint(lambda x, y: jnp.sin(x))(out, p["d"])), other
 
-    def loss(p):
-        out, other = inner(p["a"], p["b"], p["c"])
-        return jnp.sum(jax.checkpoint(lambda x, y: jnp.sin(x))(out, p["d"])), other
 
-    assert used(loss, a=X, b=X, c=X, d=X) == {"a"}
+@pytest.mark.parametrize(
+    ("loss", "names", "expected"),
+    [(metrics, "read dead shown idle", "read"), (no_gradient, "picked index held gate", "picked"),
+     (branches, "a b c d", "a b c"), (calls, "a b c d", "a")],
+)  # fmt: skip
+def test_what_no_gradient_reaches_is_unused(loss, names, expected):
+    assert used(loss, **dict.fromkeys(names.split(), X)) == {*expected.split()}
 
 
 def test_a_scan_passes_on_what_its_carry_needs_rounds_later():
@@ -89,9 +81,8 @@ def test_custom_derivatives_are_entered():
 
 def test_a_scan_is_read_in_the_words_of_either_jax():
     """jax 0.11 has the lengths of a scan's operands in a tree; what is unused must be the same."""
-    jaxpr = jax.make_jaxpr(lambda x, used, unused: jax.lax.scan(lambda c, _: (c * used, unused), x, None, length=3)[0])(
-        1.0, 2.0, 3.0
-    )
+    scanned = lambda x, used, unused: jax.lax.scan(lambda c, _: (c * used, unused), x, None, length=3)[0]  # noqa: E731
+    jaxpr = jax.make_jaxpr(scanned)(1.0, 2.0, 3.0)
     (scan,) = (eqn for eqn in jaxpr.jaxpr.eqns if eqn.primitive.name == "scan")
     outputs = [True] + [False] * (len(scan.outvars) - 1)
     expected = usage._live_operands(scan, outputs)

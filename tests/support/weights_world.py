@@ -99,10 +99,8 @@ def openclip_of(params, model: ModelConfig) -> dict[str, np.ndarray]:
             weights[f"{block}attn.in_proj_weight"] = np.concatenate([dense["kernel"][layer].T for dense in qkv])
             weights[f"{block}attn.in_proj_bias"] = np.concatenate([dense["bias"][layer] for dense in qkv])
             dense = {
-                "attn.out_proj": attention["out"],
-                "mlp.c_fc": rows["mlp"]["up"],
-                "mlp.c_proj": rows["mlp"]["down"],
-            }
+                "attn.out_proj": attention["out"], "mlp.c_fc": rows["mlp"]["up"], "mlp.c_proj": rows["mlp"]["down"],
+            }  # fmt: skip
             for key, leaf in dense.items():
                 weights |= {f"{block}{key}.weight": leaf["kernel"][layer].T, f"{block}{key}.bias": leaf["bias"][layer]}
             for key, name in {"ln_1": "norm1", "ln_2": "norm2"}.items():

@@ -1,5 +1,6 @@
 import json
 import signal
+from functools import partial
 
 import jax
 import numpy as np
@@ -71,12 +72,10 @@ def test_one_process_raises_its_errors():
 @pytest.mark.parametrize(
     ("error", "status"),
     [
-        (UserError("batch_size 3"), 2),
-        (KeyboardInterrupt(), 130),
-        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), 1),
-        (ValueError("odd"), 1),
+        (UserError("batch_size 3"), 2), (KeyboardInterrupt(), 130),
+        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), 1), (ValueError("odd"), 1),
     ],
-)
+)  # fmt: skip
 def test_a_process_that_fails_exits_at_once(error, status, initialized, capfd):
     with pytest.raises(SystemExit) as exit_, joined(BY_HAND):
         raise error
@@ -130,9 +129,8 @@ def undisturbed(tmp_path_factory):
 
 def same(result, run_dir, undisturbed):
     """The parameters and every loss of a run are those of the undisturbed one."""
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), result.params, undisturbed[1].params
-    )
+    close = partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
+    jax.tree.map(close, result.params, undisturbed[1].params)
     np.testing.assert_allclose(column(run_dir), column(undisturbed[0]), rtol=1e-5)
 
 

@@ -25,10 +25,8 @@ from anytouch_jax.weights.tree import flatten
 
 DATA = Path(__file__).parent / "data"
 METADATA = {
-    "sensors": ["digit", "universal"],
-    "preprocessing": {"mean": [0.5], "size": 112},
-    "source": {"init": "a test"},
-}
+    "sensors": ["digit", "universal"], "preprocessing": {"mean": [0.5], "size": 112}, "source": {"init": "a test"},
+}  # fmt: skip
 
 
 class State(NamedTuple):
@@ -359,11 +357,9 @@ CHILD = """
 @pytest.mark.parametrize(("where", "last"), [("arrays written", 2), ("renamed", 3), ("removing", 3), ("writing", 2)])
 def test_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, where, last):
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(CHILD), str(tmp_path), where],
-        capture_output=True,
-        text=True,
+        [sys.executable, "-c", textwrap.dedent(CHILD), str(tmp_path), where], capture_output=True, text=True,
         timeout=120,
-    )
+    )  # fmt: skip
     assert done.returncode == -9, done.stderr
     present = steps(tmp_path)
     assert present[-1] == last or (where == "writing" and present[-1] == 3)

@@ -93,14 +93,12 @@ def test_every_wrong_key_is_listed_at_once():
 @pytest.mark.parametrize(
     ("file", "wanted", "setting"),
     [
-        (DECODER_TOKENS, STAGE1, "decoder_sensor_tokens"),
-        (STAGE2, NO_LORA, "lora_rank"),
-        (NO_LORA, STAGE2, "lora_rank"),
-        (STAGE2, MLP, "match_head"),
+        (DECODER_TOKENS, STAGE1, "decoder_sensor_tokens"), (STAGE2, NO_LORA, "lora_rank"),
+        (NO_LORA, STAGE2, "lora_rank"), (STAGE2, MLP, "match_head"),
         (STAGE1, replace(STAGE1, touch=Stack(16, 3, 4, 24)), "depths"),
         (STAGE1, replace(STAGE1, embed=13), "other shapes"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_model_names_the_setting(file, wanted, setting):
     with pytest.raises(UserError, match=setting):
         to_params(weights_of(file), wanted)

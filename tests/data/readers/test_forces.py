@@ -18,10 +18,8 @@ def write_batch(folder, sensor, *, split_forces=True):
         (folder / f"dataset_{sensor}_{part:02d}.pkl").write_bytes(pickle.dumps(own))
     (folder / f"org_dataset_{sensor}_00.pkl").write_bytes(b"never read")
     slide = {
-        "indexes": np.arange(2, 6),
-        "forces": np.arange(12.0).reshape(4, 3),
-        "slip_label": np.array([0, 0, 1, 1.0]),
-    }
+        "indexes": np.arange(2, 6), "forces": np.arange(12.0).reshape(4, 3), "slip_label": np.array([0, 0, 1, 1.0]),
+    }  # fmt: skip
     content = {"in_contact": np.array([1, 0, 1, 1, 1, 1, 0, 0]), "trajectories": {0: slide}}
     (folder / "dataset_slip_forces.pkl").write_bytes(pickle.dumps(content, protocol=2))
 

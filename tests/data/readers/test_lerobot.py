@@ -138,12 +138,10 @@ def test_a_data_set_is_embedded_and_the_features_are_a_column(root, tmp_path, ca
     ("cameras", "names"),
     [
         (["observation.left.tactile", "observation.right.tactile"], ["left", "right"]),
-        ([GEL, FILM], ["gel", "tactile_film"]),
-        (["a.left.gel", "a.left.gel.back"], ["a.left.gel", "a.left.gel.back"]),
-        (["gel_left", "gel_right"], ["gel_left", "gel_right"]),
-        ([GEL], [GEL]),
+        ([GEL, FILM], ["gel", "tactile_film"]), (["a.left.gel", "a.left.gel.back"], ["a.left.gel", "a.left.gel.back"]),
+        (["gel_left", "gel_right"], ["gel_left", "gel_right"]), ([GEL], [GEL]),
     ],
-)
+)  # fmt: skip
 def test_the_columns_of_cameras_are_called_by_what_distinguishes_them(cameras, names):
     assert lerobot.camera_names(cameras) == names
 

@@ -142,13 +142,9 @@ def test_packed_slots_reach_their_rows():
         np.testing.assert_allclose(z.text[row], text[slot], atol=1e-5)
     assert not np.asarray(z.image)[[1, 3]].any() and not np.asarray(z.text)[1].any()
     (_, metrics), _ = terms2()
-    wanted = {
-        "touch_to_vision": loop(z.touch, z.image, [0, 2]),
-        "vision_to_text": loop(z.image, z.text, [0, 2]),
-        "text_to_touch": loop(z.text, z.touch, [0, 2, 3]),
-    }
-    for name, value in wanted.items():
-        np.testing.assert_allclose(metrics[name], value, rtol=1e-4)
+    np.testing.assert_allclose(metrics["touch_to_vision"], loop(z.touch, z.image, [0, 2]), rtol=1e-4)
+    np.testing.assert_allclose(metrics["vision_to_text"], loop(z.image, z.text, [0, 2]), rtol=1e-4)
+    np.testing.assert_allclose(metrics["text_to_touch"], loop(z.text, z.touch, [0, 2, 3]), rtol=1e-4)
     assert [int(metrics[f"{p}_pairs"]) for p in ("touch_vision", "touch_text", "vision_text")] == [2, 3, 2]
 
 
@@ -321,11 +317,7 @@ def test_at_the_start_no_universal_token_is_touched():
 
 def real_config(stage):
     config = tiny_config(stage)
-    return replace(
-        config,
-        optim=replace(config.optim, learning_rate=6e-3 if stage == 1 else 2e-3, warmup=1),
-        run=replace(config.run, steps=100),
-    )
+    return config.with_settings({"optim.learning_rate": (6e-3, 2e-3)[stage - 1], "optim.warmup": 1, "run.steps": 100})
 
 
 def real_batch(stage):
@@ -350,10 +342,8 @@ def real_step(stage, devices=1):
     loss = objectives.stage1_loss if stage == 1 else objectives.stage2_loss
     mesh = make_mesh(devices=jax.devices()[:devices])
     state = jax.device_put(init_state(compiled(config.model).params, config), replicated(mesh))
-    step = jax.jit(
-        make_step(partial(loss, net=net, config=config), optimizer(config), total_steps=config.run.steps),
-        out_shardings=replicated(mesh),
-    )
+    plain = make_step(partial(loss, net=net, config=config), optimizer(config), total_steps=config.run.steps)
+    step = jax.jit(plain, out_shardings=replicated(mesh))
     key = jax.device_put(jax.random.key(0), replicated(mesh))
     return step, state, lambda batch: put_batch(batch, batch_sharding(mesh)), key
 

@@ -28,9 +28,8 @@ def floats(*shape):
 
 
 def changed(config, model=None, **objective):
-    return replace(
-        config, model=replace(config.model, **(model or {})), objective=replace(config.objective, **objective)
-    )
+    model, objective = replace(config.model, **(model or {})), replace(config.objective, **objective)
+    return replace(config, model=model, objective=objective)
 
 
 @pytest.mark.parametrize("head", ["mlp", "cosine"])
@@ -65,11 +64,9 @@ def test_objectives_take_lists_under_strict_types():
     text = np.ones((1, 8), np.int32), np.ones((1, 8), bool), np.asarray([1], np.int32)
     align = AlignBatch(pixels(2, 3), SENSOR[:2], pixels(2), np.asarray([0, 2], np.int32), *text)
     match = MatchBatch(pixels(2, 1), SENSOR[:2], pixels(2, 1), SENSOR[:2], pixels(2, 1), SENSOR[:2])
-    stages = (
-        (objectives.stage1_loss, TouchBatch(pixels(2, 4), SENSOR[:2])),
-        (objectives.stage2_loss, Stage2Batch(align, match)),
-    )
-    for stage, (loss, batch) in enumerate(stages, 1):
+    batches = TouchBatch(pixels(2, 4), SENSOR[:2]), Stage2Batch(align, match)
+    for stage, batch in enumerate(batches, 1):
+        loss = objectives.stage1_loss if stage == 1 else objectives.stage2_loss
         config = tiny_config(stage)
         net = build(config.model)
         for given, progress in ((batch, jnp.float32(0.5)), (lists(batch), 0.5)):
@@ -82,11 +79,8 @@ def test_objectives_take_lists_under_strict_types():
 
 @pytest.mark.parametrize("stage", [1, 2])
 def test_an_empty_batch_has_a_loss_of_0(stage):
-    fields = FieldBatch(
-        pixels(0, 1),
-        SENSOR[:0],
-        *(np.zeros((0, *one), "f4") for one in ((), (14, 14), (14, 14, 2), (14, 14), (3,), (), ())),
-    )
+    shapes = ((), (14, 14), (14, 14, 2), (14, 14), (3,), (), ())
+    fields = FieldBatch(pixels(0, 1), SENSOR[:0], *(np.zeros((0, *one), "f4") for one in shapes))
     text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), SENSOR[:0]
     align = AlignBatch(pixels(0, 3), SENSOR[:0], pixels(0), SENSOR[:0], *text)
     match = MatchBatch(*(pixels(0, 1), SENSOR[:0]) * 3)

@@ -66,9 +66,8 @@ def test_the_result_is_a_run_that_embeds(fitted, run, tmp_path):
     save(adapted, run, tmp_path / "out")
     encoder = load_encoder(tmp_path / "out")
     stills = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
-    np.testing.assert_array_equal(
-        encoder.params["touch"]["sensor_tokens"][2], adapted.params["touch"]["sensor_tokens"][2]
-    )
+    tokens = [one.params["touch"]["sensor_tokens"][2] for one in (encoder, adapted)]
+    np.testing.assert_array_equal(*tokens)
     assert np.abs(encoder.encode_touch(stills, "gelslim") - encoder.encode_touch(stills, "universal")).max() > 1e-4
     before = load_encoder(run)
     for sensor in ("digit", "universal", "duragel"):
@@ -101,9 +100,8 @@ def test_frames_come_from_as_many_recordings_as_there_are(table):
     assert len(set(sequence)) == 12 and all(name.endswith("gelslim") for name in sequence)
     rows = choose_frames(table, "gelslim", "train", 15, seed=1)
     assert len(set(rows.tolist())) == 15 and len({table.value(row, "sequence") for row in rows}) == 12
-    assert not np.array_equal(
-        choose_frames(table, "gelslim", "train", 5), choose_frames(table, "gelslim", "train", 5, seed=1)
-    )
+    few = [choose_frames(table, "gelslim", "train", 5, seed=seed) for seed in (0, 1)]
+    assert not np.array_equal(*few)
     with pytest.raises(UserError, match="'train' has 24 usable frames of gelslim, not 30"):
         choose_frames(table, "gelslim", "train", 30)
 

@@ -145,11 +145,8 @@ def test_rows_that_cannot_be_probed_are_refused(probe: Any) -> None:
     for part in ("train", "test"):
         refused(repr(part), probe=probe, split=lambda parts, _, part=part: np.where(parts == part, "unused", parts))
     for bad in (np.nan, np.inf):
-        refused(
-            "rows 4, 17 ",
-            probe=probe,
-            features=lambda x, _, bad=bad: x * np.where(np.isin(np.arange(300), (4, 17)), bad, 1)[:, None],
-        )
+        some = np.where(np.isin(np.arange(300), (4, 17)), bad, 1)[:, None]
+        refused("rows 4, 17 ", probe=probe, features=lambda x, _, some=some: x * some)
         refused("9 and 290 more", probe=probe, features=lambda x, _, bad=bad: x * bad)
     refused("299", probe=probe, labels=np.zeros(299))
     refused("'lucky'", probe=probe, options={"protocol": "lucky"})

@@ -12,15 +12,9 @@ SENSORS = ("digit", "gelsight", "gelslim")
 
 
 def make_touches(
-    folder: Path,
-    *,
-    touches: dict[str, int],
-    sensors: tuple[str, ...] = SENSORS,
-    frames: int = 1,
-    size: int = 32,
-    each: int = 5,
-    seed: int = 0,
-) -> Path:
+    folder: Path, *, touches: dict[str, int], sensors: tuple[str, ...] = SENSORS, frames: int = 1, size: int = 32,
+    each: int = 5, seed: int = 0,
+) -> Path:  # fmt: skip
     """A manifest of `touches` {split: number}, `each` of an object, half of them fine and half coarse.
 
     A frame shows the texture of its touch within a disc at (x, y), as deep as its force, over its sensor's tint.

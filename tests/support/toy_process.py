@@ -52,16 +52,9 @@ def start(run_dir: Path, count: int = 2, *, devices: int = 1, hit: int = -1, at:
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "true", "JAX_NUM_CPU_DEVICES": str(devices),
         "JAX_COORDINATOR_ADDRESS": f"localhost:{port}", "JAX_NUM_PROCESSES": str(count),
     }  # fmt: skip
-    return [
-        subprocess.Popen(
-            [sys.executable, __file__, settings],
-            env=common | {"JAX_PROCESS_ID": str(index)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for index in range(count)
-    ]
+    command, pipes = [sys.executable, __file__, settings], {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    places = [common | {"JAX_PROCESS_ID": str(index)} for index in range(count)]
+    return [subprocess.Popen(command, env=place, text=True, **pipes) for place in places]
 
 
 def finish(processes, timeout: float = 600):

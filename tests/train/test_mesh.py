@@ -4,14 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from adam_moments import moments
 from jax.sharding import AxisType, PartitionSpec
-from train_toy import toy_batch, toy_config, toy_loss, toy_params
 
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.train import mesh as meshes
-from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.step import init_state, make_step
 
 
 def test_the_mesh_takes_all_devices_and_leaves_placement_to_jit():
@@ -45,33 +41,6 @@ def test_a_batch_is_shared_out_by_rows_and_an_empty_axis_is_fine():
     assert placed["none"].shape == (0, 5)
     with pytest.raises(ConfigError, match="6 rows cannot be divided among 4 devices"):
         meshes.put_batch({"clip": np.zeros((6, 2))}, sharding)
-
-
-def train(mesh):
-    config = toy_config(optim={"warmup": 0})
-    state = jax.jit(init_state, static_argnums=1)(toy_params(), config)
-    places = meshes.state_sharding(state, mesh, small=0)
-    state = jax.device_put(state, places)
-    train_step = make_step(toy_loss, optimizer(config), total_steps=8)
-    step = jax.jit(train_step, out_shardings=(places, meshes.replicated(mesh)))
-    key = jax.device_put(jax.random.key(1), meshes.replicated(mesh))
-    losses = []
-    for index in (1, 3, 5):
-        state, metrics = step(state, meshes.put_batch(toy_batch(index), meshes.batch_sharding(mesh)), key)
-        losses.append(float(metrics["loss"]))
-    return state, losses
-
-
-def test_one_two_and_four_devices_agree():
-    one, losses = train(meshes.make_mesh(1, 1))
-    for data, fsdp in ((2, 1), (2, 2)):
-        other, other_losses = train(meshes.make_mesh(data, fsdp))
-        np.testing.assert_allclose(other_losses, losses, rtol=1e-5)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), other, one)
-        kernel = other.trainable["trunk"]["kernel"]
-        assert kernel.sharding.spec == (PartitionSpec("fsdp") if fsdp > 1 else PartitionSpec())
-        held = moments(other.opt_state, other.trainable)["trunk"]["kernel"]
-        assert held.updates == 3 and np.abs(held.mu).max() > 0
 
 
 def test_sharded_parameters_are_gathered_once_and_their_gradients_come_back_cut():

@@ -38,13 +38,8 @@ class State(NamedTuple):
 
 def params(seed: int = 0, width: int = 6) -> dict[str, Any]:
     draw = np.random.default_rng(seed).standard_normal
-    return jax.device_put(
-        {
-            "touch": {"kernel": draw((5, width)).astype("f4"), "none": np.zeros((0, 3), "f4")},
-            "half": draw(7).astype(jnp.bfloat16),
-            "logit_scale": np.float32(draw()),
-        }
-    )
+    touch = {"kernel": draw((5, width)).astype("f4"), "none": np.zeros((0, 3), "f4")}
+    return jax.device_put({"touch": touch, "half": draw(7).astype(jnp.bfloat16), "logit_scale": np.float32(draw())})
 
 
 def state_of(seed: int = 0, width: int = 6) -> State:
@@ -90,9 +85,8 @@ def test_a_loss_of_few_steps_is_never_the_best(tmp_path):
 def test_every_type_comes_back_bit_equal(tmp_path):
     with_nan = state_of(3)
     odd = np.array([0x7FC00001, 0x80000000, 1], np.uint32).view(np.float32)  # a NaN with payload, -0, a denormal
-    with_nan = with_nan._replace(
-        frozen=with_nan.frozen | {"odd": jax.device_put(odd), "numpy": np.arange(3, dtype=np.int32)}
-    )
+    more = {"odd": jax.device_put(odd), "numpy": np.arange(3, dtype=np.int32)}
+    with_nan = with_nan._replace(frozen=with_nan.frozen | more)
     saver = opened(tmp_path)
     saver.save(12, with_nan, {"loss": 1.0})
     saver.close()
@@ -388,9 +382,8 @@ def test_a_checkpoint_of_the_first_format_loads_to_the_bit(tmp_path):
     assert loaded.trained_sensors == ("digit", "gelsight_mini")
     assert {"touch", "decoder", "image", "text"} <= loaded.params.keys()
     model = loaded.config.model
-    assert {name: list(shape) for name, shape in param_shapes(model).items()} == {
-        n: row[0] for n, row in stored.items()
-    }
+    shapes = {name: list(shape) for name, shape in param_shapes(model).items()}
+    assert shapes == {name: row[0] for name, row in stored.items()}
     tokens, universal = loaded.params["touch"]["sensor_tokens"], raw["touch"]["sensor_tokens"][model.universal_row]
     for row, name in enumerate(model.sensors):
         trained = name in loaded.trained_sensors

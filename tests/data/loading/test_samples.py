@@ -15,8 +15,7 @@ from anytouch_jax.errors import UserError
 
 def test_cached_frames_change_no_byte_and_are_read_once(make, settings, monkeypatch):
     rows = [{"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"} for i in range(8)]
-    manifest = make(rows)
-    noise = np.random.default_rng(0)
+    manifest, noise = make(rows), np.random.default_rng(0)
     for name in (*(f"f{i}" for i in range(8)), "gel0", "gel1"):
         path = Path(manifest.file(0)).with_name(f"{name}.png")
         assert cv2.imwrite(str(path), noise.integers(0, 255, (45, 60, 3), np.uint8))
@@ -53,9 +52,7 @@ def test_augmentation_does_not_depend_on_the_batch(make, settings):
         images_of[size] = {frame.tobytes() for step in range(6 // size) for frame in loader.batch(step).clip}
         assert len(images_of[size]) == 6
     assert images_of[2] == images_of[3] == images_of[6]  # epoch 0 is the same set of six images
-    assert not images_of[6] & {
-        frame.tobytes() for frame in Loader(manifest, settings(plain=False, batch_size=6)).batch(1).clip
-    }
+    assert not images_of[6] & {frame.tobytes() for frame in loader.batch(1).clip}
 
 
 def _truncate(path):
@@ -132,9 +129,8 @@ def test_only_bad_samples_end_in_an_error(make, settings):
     manifest = make([{}, {}])
     for i in range(2):
         manifest.file(i).unlink()
-    with pytest.raises(
-        SampleError, match=r"20 samples in a row .* step 0; the last one is row \d of .*there is no file"
-    ):
+    words = r"20 samples in a row .* step 0; the last one is row \d of .*there is no file"
+    with pytest.raises(SampleError, match=words):
         Loader(manifest, settings(on_bad_sample="skip")).batch(0)
 
 

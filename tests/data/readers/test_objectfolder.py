@@ -33,9 +33,8 @@ def test_objectfolder_has_two_sensors_and_published_splits(tmp_path, read):
 
 @pytest.mark.parametrize("layout", ["tactile/{}/tactile_data/{}/0/gelsight", "{}/tactile_data/{}/0/gelsight"])
 def test_objectfolder_real_in_both_layouts(tmp_path, read, layout):
-    fill(
-        tmp_path, [layout.format(obj, trial) + f"/{i}.png" for obj in (1, 10, 2) for trial in (0, 1) for i in range(11)]
-    )
+    folders = [layout.format(obj, trial) for obj in (1, 10, 2) for trial in (0, 1)]
+    fill(tmp_path, [f"{folder}/{i}.png" for folder in folders for i in range(11)])
     fill(tmp_path, [layout.format(1, 0).replace("gelsight", "camera") + "/0.png"])
     (tmp_path / "objectfolder_real_metadata.csv").write_text("Index,Name,Material\n1,Soup_Spoon,Ceramic\n")
     table = read("objectfolder_real")

@@ -148,7 +148,7 @@ def test_pins_cover_the_declared_dependencies() -> None:
 NOT_RUN = {
     "setup": "CI begins with it, in a fresh clone", "test": "it is running", "test-all": "it is running",
     "demo": "it trains for minutes, and the tests above read its commands",
-    "bench": "it measures for minutes, and tests/experiments/benchmarks runs its parts",
+    "bench": "it measures for minutes, and tests/experiments/test_benchmarks.py runs its parts",
     "compare": "it measures encoders of full size, and test_compare.py runs a small one",
     "docs": "it installs packages from the network",
     "train-stage2": "the tests above read its command, which is that of train-stage1",

@@ -1,7 +1,5 @@
 """The strict ground all tests stand on: four CPU devices, no silent broadcasting, warnings are errors (pyproject)."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

@@ -4,8 +4,6 @@ It builds the wheel and the source archive, reads their metadata, installs the w
 the README's Python there. All of it stays in build/release.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,12 +1,10 @@
-"""Touches less the untouched gel (`data.background` subtract): in training, in probes, and in what users embed."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from checked_world import columns
+from faulty_camera import Film
 from tiny_models import tiny_config
 from touch_world import make_touches
 
@@ -40,9 +38,8 @@ def touches(tmp_path_factory):
 def settings(touches, background="subtract", **data):
     config = preset("tiny")
     data = {"batch_size": 4, "flip": 0.0, "jitter": (0.0,) * 4, "clip_share": 0.0, "background": background} | data
-    return replace(
-        config, model=replace(config.model, image_size=28), data=DataConfig(manifests=(str(touches),), **data)
-    )
+    data = DataConfig(manifests=(str(touches),), **data)
+    return replace(config, model=replace(config.model, image_size=28), data=data)
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +73,7 @@ def test_training_and_probes_read_the_same_differences(touches, stored, used):
     config = settings(touches)
     assert sum(f"untouched gel: {used}" in note for note in Loader(table, config).notes) == 1
     seen = {tuple(one.reshape(-1)[:60]) for step in range(6) for one in Loader(table, config).batch(step).clip[:, 0]}
-    (_, everything), *_ = evaluation(
-        table, table.rows_of("train"), replace(config, data=replace(config.data, batch_size=48))
-    )
+    (_, everything), *_ = evaluation(table, table.rows_of("train"), settings(touches, batch_size=48))
     assert seen <= {tuple(one.reshape(-1)[:60]) for one in everything.clip[:, 0]} and len(seen) > 12
     plain = Loader(table, settings(touches, "keep")).batch(0).clip
     assert np.abs(plain.astype(int) - Loader(table, config).batch(0).clip).max() > 20
@@ -88,11 +83,10 @@ def test_training_and_probes_read_the_same_differences(touches, stored, used):
 def test_another_light_or_place_leaves_the_untouched_gel_grey(touches, change):
     """A touch is changed before the gel is taken off: after it a change of brightness would outshine the contact."""
     table = manifests.read(touches)
-    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
-    columns["path"] = columns["background_path"]  # nobody touches
-    bare = manifests.from_columns(columns, touches.parent / "bare.parquet")
-    config = settings(touches)
-    config = replace(config, data=replace(config.data, **change))
+    cells = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    cells["path"] = cells["background_path"]  # nobody touches
+    bare = manifests.from_columns(cells, touches.parent / "bare.parquet")
+    config = settings(touches, **change)
     assert all((Loader(bare, config).batch(step).clip == 128).all() for step in range(3))
     seen = [Loader(table, config).batch(step).clip.astype(int) for step in range(3)]
     plain = [Loader(table, settings(touches)).batch(step).clip.astype(int) for step in range(3)]
@@ -101,10 +95,10 @@ def test_another_light_or_place_leaves_the_untouched_gel_grey(touches, change):
 
 def without_backgrounds(table, rows, file):
     """The same manifest, in which `rows` have no background_path."""
-    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    cells = {name: table.column(name).to_pylist() for name in table.table.column_names}
     for row in rows.tolist():
-        columns["background_path"][row] = None
-    return manifests.from_columns(columns, file)
+        cells["background_path"][row] = None
+    return manifests.from_columns(cells, file)
 
 
 def test_rows_without_a_picture_of_the_gel_get_the_median_of_their_unit(encoder, touches):
@@ -126,10 +120,10 @@ def test_rows_that_are_too_few_for_a_median_are_left_out_and_counted(encoder, to
     table = manifests.read(touches)
     few = table.rows_of("test")[:3]
     alone = without_backgrounds(manifests.select_rows(table, few), few[:0], touches.parent / "few.parquet")
-    columns = {name: alone.column(name).to_pylist() for name in alone.table.column_names}
-    columns["background_path"][1] = None
-    columns["dataset"], columns["unit"] = ["mine"] * 3, ["u", "v", "u"]
-    alone, said = manifests.from_columns(columns, touches.parent / "few.parquet"), list[str]()
+    cells = {name: alone.column(name).to_pylist() for name in alone.table.column_names}
+    cells["background_path"][1] = None
+    cells["dataset"], cells["unit"] = ["mine"] * 3, ["u", "v", "u"]
+    alone, said = manifests.from_columns(cells, touches.parent / "few.parquet"), list[str]()
     ids, _ = embed_rows(encoder, alone, np.arange(3), log=said.append)
     assert ids.tolist() == [0, 2] and "1 of 3 rows have no picture of the untouched gel, and are left out" in said
     with pytest.raises(UserError, match=r"too few frames to estimate it.*background_path"):
@@ -196,11 +190,11 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
 def test_training_leaves_out_the_rows_of_a_sensor_of_few_frames(touches):
     table = manifests.read(touches)
     rows = table.rows_of("train")
-    columns = {name: table.column(name).to_pylist() for name in table.table.column_names}
+    cells = {name: table.column(name).to_pylist() for name in table.table.column_names}
     for row in rows[:3].tolist():
-        columns["background_path"][row], columns["sensor"][row] = None, "taxim"
+        cells["background_path"][row], cells["sensor"][row] = None, "taxim"
     config = settings(touches)
-    holed = manifests.from_columns(columns, touches.parent / "holed.parquet")
+    holed = manifests.from_columns(cells, touches.parent / "holed.parquet")
     left_out = f"3 of {len(rows)} rows have no picture of the untouched gel, and are left out"
     assert left_out in Loader(holed, config).notes
     with pytest.raises(manifests.ManifestError, match=r"row 0 of .* and 2 other rows have no picture.*Record 5 frames"):
@@ -242,10 +236,8 @@ def test_either_subtracts_half_of_the_samples_and_every_known_background_in_eval
     rows = np.flatnonzero(table.column("split").to_numpy(zero_copy_only=False) == "train")
 
     def subtracted(epoch):
-        either = [readers["either"].touch(rows[i : i + 1], epoch) for i in range(len(rows))]
-        plain, less = (
-            [readers[m].touch(rows[i : i + 1], epoch) for i in range(len(rows))] for m in ("keep", "subtract")
-        )
+        several = ([one.touch(rows[i : i + 1], epoch) for i in range(len(rows))] for one in readers.values())
+        plain, less, either = several
         assert all(np.array_equal(e, p) or np.array_equal(e, s) for e, p, s in zip(either, plain, less, strict=True))
         return np.array([np.array_equal(e, s) for e, s in zip(either, less, strict=True)])
 
@@ -267,33 +259,13 @@ def test_an_encoder_of_either_kind_works_with_and_without_a_background(encoder):
     assert (camera(gel) == 90).all() and (camera(gel) == 90).all()
 
 
-class Source:
-    """A camera or a film in memory, as stream reads it."""
-
-    def __init__(self, frames):
-        self.frames, self.at = frames, -1
-
-    def grab(self):
-        self.at += 1
-        return self.at < len(self.frames)
-
-    def retrieve(self):
-        return True, self.frames[self.at][..., ::-1]
-
-    def get(self, _):
-        return 0.0
-
-    def release(self):
-        pass
-
-
 def test_a_stream_is_marked_until_its_untouched_gel_is_settled_or_captured(encoder):
     frames = [GEL] * (SETTLED + 2)
     frames[0] = np.clip(GEL.astype(int) + 60, 0, 255).astype(np.uint8)  # it begins with a press
     for background, marked in ((None, SETTLED - 1), (GEL, 0)):
         preprocess = Preprocess(encoder, background)
         gate = ContactGate(preprocess, "digit")
-        arrived = list(stream(encoder, Source(frames), preprocess, live=False, sensor=0, contact=gate))
+        arrived = list(stream(encoder, Film(np.flip(frames, -1)), preprocess, live=False, sensor=0, contact=gate))
         assert [one.estimated for one in arrived] == [True] * marked + [False] * (len(frames) - marked)
         np.testing.assert_array_equal(preprocess.background, GEL)
         assert not any(one.contact for one in arrived[4:])
@@ -306,8 +278,7 @@ def test_a_stream_is_marked_until_its_untouched_gel_is_settled_or_captured(encod
 def test_a_background_of_other_proportions_is_refused_everywhere(tmp_path, encoder, size, fits):
     for name, shape in (("frame", (24, 48)), ("gel", size)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), RNG.integers(0, 255, (*shape, 3), np.uint8))
-    columns = {"path": ["frame.png"], "sensor": ["digit"], "sequence": ["a"], "frame_index": [0], "split": ["train"]}
-    table = manifests.from_columns(columns | {"background_path": ["gel.png"]}, tmp_path / "m.csv")
+    table = manifests.from_columns(columns(path=["frame.png"], background_path=["gel.png"]), tmp_path / "m.csv")
     manifests.write(table, tmp_path / "m.csv")
     frame, gel = decode(tmp_path / "frame.png"), decode(tmp_path / "gel.png")
     tries = {

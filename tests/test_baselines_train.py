@@ -1,7 +1,3 @@
-"""Every baseline runs: a step of each kind, a checkpoint, an encoder of a sensor it knows and of one it does not."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

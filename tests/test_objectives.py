@@ -1,5 +1,3 @@
-"""The two sums: what they see, what they weigh, what they cost, and that the real step makes them fall."""
-
 from dataclasses import replace
 from functools import cache, partial
 
@@ -49,9 +47,6 @@ def flops(function, *args):
 
 def changed(config, **objective):
     return replace(config, objective=replace(config.objective, **objective))
-
-
-# Stage 1 ------------------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -111,9 +106,6 @@ def test_bfloat16_stays_near_float32():
     assert norm(jax.tree.map(np.subtract, grads, wanted)) < 0.03 * norm(wanted)
 
 
-# Stage 2 ------------------------------------------------------------------------------------------------------------
-
-
 def align_batch():
     """Four touches; images of rows 2 and 0, texts of rows 3, 2 and 1... and one slot of each that is not used."""
     text = set_at(RNG.integers(1, 40, (4, 8)).astype(np.int32), (slice(None), slice(5, None)), 49)
@@ -150,13 +142,9 @@ def test_packed_slots_reach_their_rows():
         np.testing.assert_allclose(z.text[row], text[slot], atol=1e-5)
     assert not np.asarray(z.image)[[1, 3]].any() and not np.asarray(z.text)[1].any()
     (_, metrics), _ = terms2()
-    wanted = {
-        "touch_to_vision": loop(z.touch, z.image, [0, 2]),
-        "vision_to_text": loop(z.image, z.text, [0, 2]),
-        "text_to_touch": loop(z.text, z.touch, [0, 2, 3]),
-    }
-    for name, value in wanted.items():
-        np.testing.assert_allclose(metrics[name], value, rtol=1e-4)
+    np.testing.assert_allclose(metrics["touch_to_vision"], loop(z.touch, z.image, [0, 2]), rtol=1e-4)
+    np.testing.assert_allclose(metrics["vision_to_text"], loop(z.image, z.text, [0, 2]), rtol=1e-4)
+    np.testing.assert_allclose(metrics["text_to_touch"], loop(z.text, z.touch, [0, 2, 3]), rtol=1e-4)
     assert [int(metrics[f"{p}_pairs"]) for p in ("touch_vision", "touch_text", "vision_text")] == [2, 3, 2]
 
 
@@ -168,20 +156,15 @@ def loop(a, b, rows):
 
 
 def test_garbage_in_unused_slots_changes_nothing():
-    spoilt = ALIGN._replace(
-        image=set_at(ALIGN.image, 2, np.nan),
-        text=set_at(ALIGN.text, 2, 1_000_000),
-        text_mask=set_at(ALIGN.text_mask, 2, False),
-    )
+    text, mask = set_at(ALIGN.text, 2, 1_000_000), set_at(ALIGN.text_mask, 2, False)
+    spoilt = ALIGN._replace(image=set_at(ALIGN.image, 2, np.nan), text=text, text_mask=mask)
     jax.tree.map(np.testing.assert_array_equal, terms2(spoilt), terms2())
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(terms2(spoilt)))
 
 
 def test_towers_that_nothing_is_shown_to_cost_nothing_and_need_not_exist():
-    none = ALIGN._replace(
-        image=ALIGN.image[:0], image_row=ALIGN.image_row[:0],
-        text=ALIGN.text[:0], text_mask=ALIGN.text_mask[:0], text_row=ALIGN.text_row[:0],
-    )  # fmt: skip
+    slots = ("image", "image_row", "text", "text_mask", "text_row")
+    none = ALIGN._replace(**{name: getattr(ALIGN, name)[:0] for name in slots})
     terms = lambda p, b: objectives.stage2_terms(p, Stage2Batch(b, None), None, net=NET2, config=CONFIG2)  # noqa: E731
     touch = {name: PARAMS2[name] for name in ("touch", "logit_scale")}  # no towers, no decoder, no matching head
     encode = flops(lambda p: NET2.encode_touch(p, ALIGN.clip, SENSOR), touch)
@@ -199,11 +182,8 @@ def test_the_weights_of_the_sum(recipe):
     align = ALIGN._replace(clip=CLIP4)
     total, m = terms(net.params, Stage2Batch(align, MATCH), NOISE)
     text = {"paper": 0.5, "release": 1.0}[recipe]  # the release does not halve the touch-text pair (golden Q9)
-    by_hand = (
-        0.5 * (m["touch_to_vision"] + m["vision_to_touch"])
-        + text * (m["touch_to_text"] + m["text_to_touch"])
-        + 0.1 * (m["vision_to_text"] + m["text_to_vision"])
-    )
+    weights = (("touch", "vision", 0.5), ("touch", "text", text), ("vision", "text", 0.1))
+    by_hand = sum(weight * (m[f"{a}_to_{b}"] + m[f"{b}_to_{a}"]) for a, b, weight in weights)
     np.testing.assert_allclose(m["align"], by_hand, rtol=1e-6)
     pixel_loss = m["reconstruction"] + m["next_frame"] if recipe == "release" else 0.0
     assert ("reconstruction" in m) == (recipe == "release")
@@ -296,9 +276,6 @@ def test_a_batch_without_matching_or_without_alignment_costs_nothing_for_it():
     assert both == pytest.approx(align + match, rel=0.01) and match > 0.2 * both
 
 
-# Universal tokens ---------------------------------------------------------------------------------------------------
-
-
 def drawn(monkeypatch, config, progress, rows=64):
     """The sensor rows that stage 2 ends up with: (align, anchor, positive, negative), each (rows,)."""
     received = []
@@ -338,16 +315,9 @@ def test_at_the_start_no_universal_token_is_touched():
         assert np.flatnonzero(rows).tolist() == used and metrics["p_u"] == np.float32(0.75 * min(progress, 1))
 
 
-# The real step ------------------------------------------------------------------------------------------------------
-
-
 def real_config(stage):
     config = tiny_config(stage)
-    return replace(
-        config,
-        optim=replace(config.optim, learning_rate=6e-3 if stage == 1 else 2e-3, warmup=1),
-        run=replace(config.run, steps=100),
-    )
+    return config.with_settings({"optim.learning_rate": (6e-3, 2e-3)[stage - 1], "optim.warmup": 1, "run.steps": 100})
 
 
 def real_batch(stage):
@@ -372,10 +342,8 @@ def real_step(stage, devices=1):
     loss = objectives.stage1_loss if stage == 1 else objectives.stage2_loss
     mesh = make_mesh(devices=jax.devices()[:devices])
     state = jax.device_put(init_state(compiled(config.model).params, config), replicated(mesh))
-    step = jax.jit(
-        make_step(partial(loss, net=net, config=config), optimizer(config), total_steps=config.run.steps),
-        out_shardings=replicated(mesh),
-    )
+    plain = make_step(partial(loss, net=net, config=config), optimizer(config), total_steps=config.run.steps)
+    step = jax.jit(plain, out_shardings=replicated(mesh))
     key = jax.device_put(jax.random.key(0), replicated(mesh))
     return step, state, lambda batch: put_batch(batch, batch_sharding(mesh)), key
 

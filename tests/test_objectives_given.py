@@ -1,5 +1,3 @@
-"""What the sums are given and what they give at the edges: pixels, groups, verdicts, keep ratios, accumulation."""
-
 from dataclasses import replace
 from functools import partial
 
@@ -30,12 +28,8 @@ def floats(*shape):
 
 
 def changed(config, model=None, **objective):
-    return replace(
-        config, model=replace(config.model, **(model or {})), objective=replace(config.objective, **objective)
-    )
-
-
-# Pixels -------------------------------------------------------------------------------------------------------------
+    model, objective = replace(config.model, **(model or {})), replace(config.objective, **objective)
+    return replace(config, model=model, objective=objective)
 
 
 @pytest.mark.parametrize("head", ["mlp", "cosine"])
@@ -70,11 +64,9 @@ def test_objectives_take_lists_under_strict_types():
     text = np.ones((1, 8), np.int32), np.ones((1, 8), bool), np.asarray([1], np.int32)
     align = AlignBatch(pixels(2, 3), SENSOR[:2], pixels(2), np.asarray([0, 2], np.int32), *text)
     match = MatchBatch(pixels(2, 1), SENSOR[:2], pixels(2, 1), SENSOR[:2], pixels(2, 1), SENSOR[:2])
-    stages = (
-        (objectives.stage1_loss, TouchBatch(pixels(2, 4), SENSOR[:2])),
-        (objectives.stage2_loss, Stage2Batch(align, match)),
-    )
-    for stage, (loss, batch) in enumerate(stages, 1):
+    batches = TouchBatch(pixels(2, 4), SENSOR[:2]), Stage2Batch(align, match)
+    for stage, batch in enumerate(batches, 1):
+        loss = objectives.stage1_loss if stage == 1 else objectives.stage2_loss
         config = tiny_config(stage)
         net = build(config.model)
         for given, progress in ((batch, jnp.float32(0.5)), (lists(batch), 0.5)):
@@ -87,11 +79,8 @@ def test_objectives_take_lists_under_strict_types():
 
 @pytest.mark.parametrize("stage", [1, 2])
 def test_an_empty_batch_has_a_loss_of_0(stage):
-    fields = FieldBatch(
-        pixels(0, 1),
-        SENSOR[:0],
-        *(np.zeros((0, *one), "f4") for one in ((), (14, 14), (14, 14, 2), (14, 14), (3,), (), ())),
-    )
+    shapes = ((), (14, 14), (14, 14, 2), (14, 14), (3,), (), ())
+    fields = FieldBatch(pixels(0, 1), SENSOR[:0], *(np.zeros((0, *one), "f4") for one in shapes))
     text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), SENSOR[:0]
     align = AlignBatch(pixels(0, 3), SENSOR[:0], pixels(0), SENSOR[:0], *text)
     match = MatchBatch(*(pixels(0, 1), SENSOR[:0]) * 3)
@@ -102,9 +91,6 @@ def test_an_empty_batch_has_a_loss_of_0(stage):
     run = lambda p: loss(p, batch, jax.random.key(0), 0.5, net=net, config=config)[0]  # noqa: E731
     value, slopes = jax.jit(jax.value_and_grad(run))(net.init(jax.random.key(0)))
     assert float(value) == 0 and all(np.isfinite(one).all() for one in jax.tree.leaves(slopes))
-
-
-# Stage 2 ------------------------------------------------------------------------------------------------------------
 
 
 def half(batch, i):
@@ -157,9 +143,6 @@ def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
     _, metrics = terms(params, Stage2Batch(None, match))
     right = np.count_nonzero(same > 0) + np.count_nonzero(other < 0)
     np.testing.assert_allclose(metrics["match_accuracy"], right / 10, rtol=1e-6)
-
-
-# Stage 1 ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frames", [1, 4], ids=["still", "clip"])

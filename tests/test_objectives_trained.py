@@ -1,7 +1,3 @@
-"""The table of trained parameters against the programs of both losses: every kind of batch, recipe, head, baseline."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,5 +1,3 @@
-"""Whole runs on a small world on disk: stage 1, then stage 2 from it, resumed and refused."""
-
 import fcntl
 import os
 import shutil
@@ -68,9 +66,6 @@ def assert_equal_arrays(wanted, arrays):
         np.testing.assert_array_equal(arrays[name], array, err_msg=name)
 
 
-# Stage 1 ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_run_folder(straight, world):
     run, result = straight
     assert (result.step, result.traces) == (4, 2)  # stills and clips
@@ -137,9 +132,6 @@ def test_another_preset_in_the_same_folder_is_refused(straight, world):
     assert "model.embed was 12 and is now 16" in message and str(run) in message
     assert "stage" in refused(run_config(world, 2), run)
     assert ((run / "config.json").read_bytes(), saved_steps(run)) == before
-
-
-# Stage 2 ------------------------------------------------------------------------------------------------------------
 
 
 def parts(params, *names):
@@ -219,9 +211,6 @@ def test_pretrained_towers_keep_the_text_tower_and_adapt_the_image_tower_by_lora
     assert all(line["align"] > 0 for line in read_metrics(tmp_path / "r"))
     assert train(config, tmp_path / "r").resumed == 3  # without CLIP's weights
     assert "model.bin" in refused(config, tmp_path / "s", init=straight[0], clip=tmp_path / "clip" / "model.bin")
-
-
-# Mistakes -----------------------------------------------------------------------------------------------------------
 
 
 def test_wrong_starts_are_one_sentence(straight, world, tmp_path):

@@ -1,5 +1,3 @@
-"""Training on simulated touches: batches by seed and step alone, mixed with real recordings, resumed to the bit."""
-
 import time
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The command line as a user meets it: an exit status, standard output and standard error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,3 @@
-"""The command line as a whole: help, exit statuses, old names, and errors that every command shares."""
-
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -21,6 +17,7 @@ from anytouch_jax.cli.train import Sections
 from anytouch_jax.config import preset
 from anytouch_jax.config.parsing import Range
 from anytouch_jax.errors import UserError
+from anytouch_jax.view import server
 
 HELP = """
 import contextlib, io, json, sys
@@ -240,3 +237,25 @@ def test_compiled_programs_are_cached_on_disk(tmp_path, world, tiny_run, anytouc
     }
     anytouch(*command.split(), "--model", tiny_run, *words[command])
     assert enabled == [command] or command == "embed"
+
+
+def test_mistakes(mistake, tmp_path):
+    assert "--camera-fps has no effect" in mistake("view", tmp_path, "--camera-fps", 30)
+    assert "no.csv" in mistake("view", tmp_path / "no.csv")
+    (tmp_path / "a.mp4").write_bytes(b"no film")
+    assert "no film" in mistake("view", tmp_path / "a.mp4")
+    assert "--head" in mistake("view", tmp_path, "--head", "h.npz")
+    assert "One camera" in mistake("view", "0", "1")
+    np.savez(tmp_path / "a.npz", x=np.zeros(3))
+    assert "features" in mistake("view", tmp_path / "a.npz")
+    assert "no pictures" in mistake("view", tmp_path)
+
+
+def test_it_serves_what_it_is_given(anytouch, pressed, monkeypatch):
+    served = []
+    monkeypatch.setattr(server, "serve", lambda sources, host, port, show: served.append((sources, host, port)))
+    assert anytouch("view", pressed, "--port", 9000).status == 0
+    ((sources, host, port),) = served
+    assert [source.kind for source in sources] == ["table"] and (host, port) == ("127.0.0.1", 9000)
+    assert anytouch("view").status == 0
+    assert [source.kind for source in served[1][0]] == ["start", "table"]  # cameras, and the examples

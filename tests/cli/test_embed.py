@@ -1,7 +1,3 @@
-"""`anytouch embed`: manifests, folders and videos, and the head that names what is touched."""
-
-from __future__ import annotations
-
 import json
 import shutil
 import zlib
@@ -12,7 +8,10 @@ import pytest
 from films import write_film
 from runs import run_config, train
 
+import anytouch_jax as at
+from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.encoder.linear_head import load_head
+from anytouch_jax.weights import registry
 
 
 @pytest.fixture
@@ -20,8 +19,9 @@ def embed(anytouch, tiny_run, tmp_path):
     """embed(data, *words): the arrays of the features file, which must be written."""
 
     def run(data, *words):
-        out = tmp_path / "features.npz"
-        done = anytouch("embed", "--model", tiny_run, "--data", data, "--out", out, "--batch", 4, *words)
+        out, data = tmp_path / "features.npz", data if isinstance(data, list) else [data]
+        batch = [] if "--batch" in words else ["--batch", 4]
+        done = anytouch("embed", "--model", tiny_run, "--data", *data, "--out", out, *batch, *words)
         assert done.status == 0, done.err
         with np.load(out) as file:
             return dict(file) | {"done": done}
@@ -54,23 +54,14 @@ def test_a_manifest_and_a_folder_of_its_frames_have_the_same_features(embed, tmp
     assert str(half["about/dtype"]) == "bfloat16" and 1e-5 < error < 0.05
 
 
-def test_several_manifests_are_read_together(anytouch, tiny_run, world, tmp_path):
+def test_clips_of_a_manifest_and_of_a_video(embed, tmp_path, world):
     shutil.copytree(world.parent, tmp_path / "other")
-    words = ("--model", tiny_run, "--data", world, tmp_path / "other" / world.name, "--out", tmp_path / "f.npz")
-    assert anytouch("embed", *words).status == 0
-    with np.load(tmp_path / "f.npz") as file:
-        np.testing.assert_allclose(file["features"][:12], file["features"][12:], atol=1e-6)
-
-
-def test_clips_of_a_manifest_and_of_a_video(embed, mistake, tmp_path, world, tiny_run):
-    of_manifest = embed(world, "--frames", 3)
-    assert of_manifest["rows"].tolist() == [2, 3, 6, 7] and "8 of 12" in of_manifest["done"].err
+    of_manifest = embed([world, tmp_path / "other" / world.name], "--frames", 3)  # several are read together
+    assert of_manifest["rows"].tolist() == [2, 3, 6, 7, 14, 15, 18, 19] and "16 of 24" in of_manifest["done"].err
+    np.testing.assert_allclose(of_manifest["features"][:4], of_manifest["features"][4:], atol=1e-6)
     video = write_film(tmp_path / "touch.avi", [np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(5)])
-    of_video = embed(video, "--frames", 3)
+    of_video = embed(video, "--frames", 3, "--batch", 10**7)  # a large batch costs nothing
     assert of_video["features"].shape == (3, 12) and of_video["key/frame_index"].tolist() == [2, 3, 4]
-    words = ("embed", "--model", tiny_run, "--data", video, "--out", tmp_path / "f.npz")
-    assert "frames" in mistake(*words, "--frames", 6)
-    assert not (tmp_path / "f.npz").exists()
 
 
 def test_a_bad_picture_of_a_folder_is_named_or_left_out(embed, mistake, tmp_path, world, tiny_run):
@@ -110,48 +101,31 @@ def test_a_bad_row_of_a_manifest_is_named_however_the_run_was_trained(anytouch, 
     assert done.status == 2 and "line 12 of" in done.err
 
 
-@pytest.mark.parametrize(
-    ("names", "ends"),
-    [
-        ([f"{finger}_{number}" for finger in ("left", "right") for number in range(3)], ["left_2", "right_2"]),
-        ([f"{number}_D2{serial}" for number in range(3) for serial in (1, 2)], ["2_D21", "2_D22"]),
-        ([f"img{number:03d}" for number in (0, 1, 2, 5, 6, 7, 8)], ["img002", "img007", "img008"]),
-    ],
-    ids=["fingers", "serials", "gap"],
-)  # fmt: skip
-def test_no_clip_spans_two_fingers_or_a_missing_number(embed, tmp_path, world, names, ends):
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    for name in names:
-        shutil.copy(world.parent / "a0.png", folder / f"{name}.png")
-    paths = embed(folder, "--sensor", "digit", "--frames", 3)["key/path"].tolist()
-    assert paths == [f"{end}.png" for end in ends]
+def test_no_clip_spans_two_fingers_or_a_missing_number(embed, tmp_path, world):
+    fingers = [f"{finger}_{number}" for finger in ("left", "right") for number in range(3)]
+    gap = [f"img{number:03d}" for number in (0, 1, 2, 5, 6, 7, 8)]
+    for names, ends in ((fingers, ["left_2", "right_2"]), (gap, ["img002", "img007", "img008"])):
+        folder = tmp_path / names[0]
+        folder.mkdir()
+        for name in names:
+            shutil.copy(world.parent / "a0.png", folder / f"{name}.png")
+        paths = embed(folder, "--sensor", "digit", "--frames", 3)["key/path"].tolist()
+        assert paths == [f"{end}.png" for end in ends]
 
 
-def test_a_batch_larger_than_the_folder_costs_nothing(embed, tmp_path, world):
-    (tmp_path / "frames").mkdir()
-    for name in ("a0", "a1"):
-        shutil.copy(world.parent / f"{name}.png", tmp_path / "frames")
-    assert len(embed(tmp_path / "frames", "--sensor", "digit", "--batch", 10**7)["features"]) == 2
-
-
-def test_a_missing_sensor_is_noted_once_and_a_misspelled_one_refused(embed, mistake, tmp_path, world, tiny_run):
+def test_a_folder_names_what_it_lacks(embed, tmp_path, world, tiny_run, mistake):
+    """A missing sensor is noted once, a misspelled one refused, and so is a folder without pictures."""
     assert embed(world.parent)["done"].err.count("--sensor") == 1
     assert "--sensor" not in embed(world.parent, "--sensor", "universal")["done"].err
-    words = ("embed", "--model", tiny_run, "--data", world.parent, "--out", tmp_path / "f.npz")
-    assert "digit" in mistake(*words, "--sensor", "DIGIT")
-
-
-def test_a_folder_without_pictures_names_what_to_give_instead(tmp_path, world, tiny_run, mistake):
-    folder = tmp_path / "mine"
+    folder, words = tmp_path / "mine", ("embed", "--model", tiny_run, "--out", tmp_path / "f.npz", "--data")
+    assert "digit" in mistake(*words, world.parent, "--sensor", "DIGIT")
     (folder / "mug").mkdir(parents=True)
-    words = ("embed", "--model", tiny_run, "--data", folder, "--out", tmp_path / "features.npz")
-    assert str(folder) in mistake(*words)
+    assert str(folder) in mistake(*words, folder)
     shutil.copy(world.parent / "a0.png", folder / "mug" / "0.png")
-    assert "anytouch data index recordings" in mistake(*words)
+    assert "anytouch data index recordings" in mistake(*words, folder)
     (folder / "labels.csv").write_text("object,material\nmug,clay\n")
     (folder / "mine.csv").write_text("path,sensor,sequence,frame_index,split\nmug/0.png,digit,mug,0,train\n")
-    assert str(folder / "mine.csv") in mistake(*words)
+    assert str(folder / "mine.csv") in mistake(*words, folder)
 
 
 @pytest.mark.parametrize(
@@ -176,9 +150,6 @@ def test_mistakes_are_named_before_the_encoder_is_loaded(mistake, tmp_path, monk
     out = [] if "--out" in words else ["--out", "f.npz"]
     sentence = mistake("embed", "--model", "nowhere", "--data", *words, *out)
     assert all(name in sentence for name in named), sentence
-
-
-# A head that names what is touched ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -234,11 +205,59 @@ def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
 
 def test_a_head_of_other_features_is_refused(mistake, tmp_path, world, tiny_run, head):
     words = ("embed", "--data", world, "--out", tmp_path / "f.npz", "--head")
-    other = ("--model", tiny_run, "--pooling", "mean")
-    assert "--pooling both" in mistake(*words, head, *other)
-    assert "--pooling both --frames 1" in mistake(*words, head, *other, "--frames", 3)
     train(run_config(world, seed=5, steps=1), tmp_path / "other")
-    assert str(tmp_path / "other") in mistake(*words, head, "--model", tmp_path / "other")
     (tmp_path / "odd.npz").write_bytes(b"odd")
-    assert "odd.npz" in mistake(*words, tmp_path / "odd.npz", "--model", tiny_run)
-    assert "gone.npz" in mistake(*words, tmp_path / "gone.npz", "--model", tiny_run)
+    for file, model, more, named in (
+        (head, tiny_run, ["--pooling", "mean"], "--pooling both"), (head, tmp_path / "other", [], "other"),
+        (head, tiny_run, ["--pooling", "mean", "--frames", 3], "--pooling both --frames 1"),
+        (tmp_path / "odd.npz", tiny_run, [], "odd.npz"), (tmp_path / "gone.npz", tiny_run, [], "gone.npz"),
+    ):  # fmt: skip
+        assert named in mistake(*words, file, "--model", model, *more)
+
+
+@pytest.fixture
+def packaged(anytouch, tiny_run, tmp_path, monkeypatch):
+    """A package whose only encoder is that of `tiny_run`, exported with a card."""
+    notes = tmp_path / "notes.md"
+    notes.write_text("## Limits\n\nIt is for a test.\n")
+    folder = tmp_path / "package" / DEFAULT
+    done = anytouch("export", "--card", folder, "--model", tiny_run, "--notes", notes)
+    assert done.status == 0 and str(folder) in done.out, done.err
+    assert "It is for a test." in (folder / "README.md").read_text()
+    monkeypatch.setattr(registry, "FOLDER", folder.parent)
+    registry._packaged.cache_clear()
+    yield folder
+    registry._packaged.cache_clear()
+
+
+def test_embed_uses_it_and_reports_it(packaged, anytouch, tiny_run, tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(frames / f"{i}.png"), np.full((30, 40, 3), 60 * i, np.uint8))
+    outs = {}
+    for name, words in (("named", ("--model", tiny_run)), ("default", ())):
+        outs[name] = tmp_path / f"{name}.npz"
+        done = anytouch("embed", *words, "--data", frames, "--sensor", "digit", "--out", outs[name])
+        assert done.status == 0 and (f"encoder: {DEFAULT}" in done.err) == (name == "default"), done.err
+    named, default = (np.load(out)["features"] for out in outs.values())
+    np.testing.assert_allclose(default, named, atol=2e-2 * np.abs(named).max())  # float16 in the package
+
+
+def test_the_named_encoder_is_used_listed_and_described(packaged, anytouch, world):
+    done = anytouch("probe", "label", "--data", world, "--label", "object", "--no-controls", "--seeds", "0")
+    assert f"encoder: {DEFAULT}" in done.err and f"{DEFAULT}: linear" in done.out
+    listed = anytouch("info", "encoders")
+    assert listed.status == 0 and listed.out.startswith(f"{DEFAULT}: ") and "28 pixels" in listed.out
+    assert "touch encoder: width 16" in anytouch("info", DEFAULT).out
+    assert at.list_encoders() == [DEFAULT]
+
+
+def test_a_folder_with_files_is_not_overwritten(anytouch, tiny_run, tmp_path):
+    (tmp_path / "mine").write_text("precious")
+    for folder in (tmp_path, tmp_path / "mine"):
+        done = anytouch("export", "--card", folder, "--model", tiny_run)
+        assert done.status == 2 and "not an empty folder" in done.err
+    done = anytouch("export", "--card", tmp_path / "new", "--model", tiny_run, "--out", "x.bin")
+    assert done.status == 2 and "--out has no effect with --card" in done.err
+    assert anytouch("export", "--model", tiny_run).status == 2

@@ -1,7 +1,3 @@
-"""`anytouch export`: an encoder for jax alone, weights by both kinds of names, and weights between two runs."""
-
-from __future__ import annotations
-
 import stat
 from dataclasses import replace
 
@@ -34,13 +30,18 @@ def weights(anytouch):
     return run
 
 
+def write_rows(path, count):
+    rows = "".join(f"{number}.png,digit,s,{number},train\n" for number in range(count))
+    path.write_text(f"path,sensor,sequence,frame_index,split\n{rows}")
+
+
 def write(path, model, params, **metadata):
     arrays = {name: np.asarray(array) for name, array in flatten(params).items()}
     safetensors.write_safetensors(path, arrays, {safetensors.MODEL_KEY: to_json(model)} | metadata)
     return path
 
 
-def test_the_file_for_jax_gives_the_features_of_the_live_model(anytouch, tmp_path, tiny_run):
+def test_the_file_for_jax_gives_the_features_of_the_live_model(anytouch, tmp_path, tiny_run, monkeypatch):
     out = tmp_path / "made" / "model.bin"
     done = anytouch("export", "--model", tiny_run, "--out", out, "--frames", 1, "--platforms", "cpu", "cuda")
     assert done.status == 0, done
@@ -51,49 +52,42 @@ def test_the_file_for_jax_gives_the_features_of_the_live_model(anytouch, tmp_pat
     assert anytouch("export", "--model", tiny_run, "--out", out, "--dtype", "bfloat16").status == 0
     assert 1e-5 < np.abs(export.load(out)(frames, "digit") - live).max() / np.abs(live).max() < 0.05
 
-
-def test_a_file_for_engines_embeds_and_streams_like_the_run(anytouch, tmp_path, tiny_run):
-    pytest.importorskip("onnxruntime")
-    rng, out, plain = np.random.default_rng(0), tmp_path / "model.onnx", tmp_path / "plain.npz"
-    for number in range(200):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), rng.integers(0, 256, (28, 28, 3), np.uint8))
-    rows = "".join(f"{number}.png,digit,s,{number},train\n" for number in range(200))
-    table = tmp_path / "table.csv"
-    table.write_text(f"path,sensor,sequence,frame_index,split\n{rows}")
-    done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", out)
-    assert done.status == 0 and f"{out}.json" in done.out, done
-    assert anytouch("embed", "--model", tiny_run, "--data", table, "--out", plain).status == 0
-    with np.load(plain) as file:
-        live = file["features"]
-    small = tmp_path / "int8.onnx"
-    done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", small, "--int8", "--data", table)
-    assert done.status == 0 and "in int8" in done.out and "on 200 touches" in done.out, done
-    for model, tolerance in ((out, 1e-5), (small, 0.1)):
-        made = tmp_path / f"{model.stem}.npz"
-        assert anytouch("embed", "--model", model, "--data", table, "--out", made).status == 0
-        with np.load(made) as file:
-            assert np.abs(file["features"] - live).max() < tolerance * np.abs(live).max()
-            assert str(file["about/weights"]) == load_encoder(tiny_run).fingerprint
-    film = tmp_path / "film.avi"
-    write_film(film, (cv2.imread(str(tmp_path / f"{number}.png")) for number in range(3)))
-    found = []
-    for words in (("--model", tiny_run), ("--model", tiny_run, "--engine", "onnxruntime"), ("--model", out)):
-        made = tmp_path / f"stream{len(found)}.npz"
-        assert anytouch("stream", *words, "--data", film, "--sensor", "digit", "--out", made).status == 0
-        with np.load(made) as file:
-            found.append(file["features"])
-    np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-5)
-    done = anytouch("stream", "--model", out, "--engine", "xla", "--data", film, "--out", tmp_path / "no.npz")
-    assert done.status == 2 and "not on xla" in done.err and not (tmp_path / "no.npz").exists()
-
-
-def test_a_difference_from_the_live_model_is_a_failed_check(anytouch, tmp_path, tiny_run, monkeypatch):
     def differs(*_, **__):
         raise CheckError("the artefact differs")
 
     monkeypatch.setattr(export, "export", differs)
     done = anytouch("export", "--model", tiny_run, "--out", tmp_path / "m.bin")
     assert done.status == 1 and "differs" in done.err
+
+
+def test_a_file_for_engines_embeds_and_streams_like_the_run(anytouch, tmp_path, tiny_run):
+    pytest.importorskip("onnxruntime")
+    rng, out, small, table = np.random.default_rng(0), *(tmp_path / f"{n}" for n in ("m.onnx", "int8.onnx", "t.csv"))
+    for number in range(200):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), rng.integers(0, 256, (28, 28, 3), np.uint8))
+    write_rows(table, 200)
+
+    def features(command, data, *words):
+        made = tmp_path / f"{len(list(tmp_path.iterdir()))}.npz"
+        done = anytouch(command, *words, "--data", data, "--out", made)
+        assert done.status == 0, done
+        with np.load(made) as file:
+            return file["features"], str(file["about/weights"])
+
+    done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", out)
+    assert done.status == 0 and f"{out}.json" in done.out, done
+    done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", small, "--int8", "--data", table)
+    assert done.status == 0 and "in int8" in done.out and "on 200 touches" in done.out, done
+    live, fingerprint = features("embed", table, "--model", tiny_run)
+    for model, tolerance in ((out, 1e-5), (small, 0.1)):
+        found, weights = features("embed", table, "--model", model)
+        assert np.abs(found - live).max() < tolerance * np.abs(live).max() and weights == fingerprint
+    film = write_film(tmp_path / "film.avi", [cv2.imread(str(tmp_path / f"{number}.png")) for number in range(3)])
+    engines = (["--model", tiny_run], ["--model", tiny_run, "--engine", "onnxruntime"], ["--model", out])
+    found = [features("stream", film, *words, "--sensor", "digit")[0] for words in engines]
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-5)
+    done = anytouch("stream", "--model", out, "--engine", "xla", "--data", film, "--out", tmp_path / "no.npz")
+    assert done.status == 2 and "not on xla" in done.err and not (tmp_path / "no.npz").exists()
 
 
 def test_weights_go_to_the_authors_names_and_back(tmp_path, tiny_run, weights):
@@ -148,39 +142,34 @@ def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--out", "m.bin", "--frames", 2], "3 frames"),
-        (["--out", "m.bin", "--model", "gone"], "gone"),
-        (["--out", "m.bin", "--join", "sum"], "--join"),
-        (["--out", "m.bin", "--share", 0.3], "--share"),
-        (["--out", "afile/m.bin"], "--out"),
-        (["--out", "m.onnx", "--int8"], "--int8 has no effect with --to jax"),
-        (["--out", "m.onnx", "--to", "onnx", "--int8"], "--int8 and --data"),
-        (["--out", "m.onnx", "--to", "onnx", "--data", "few.csv"], "--int8 and --data"),
-        (["--out", "m.onnx", "--to", "onnx", "--int8", "--data", "few.csv"], "needs 200 touches and --data has 3"),
-        (["--out", "m.onnx", "--to", "onnx", "--dtype", "bfloat16"], "--dtype"),
-        (["--out", "m.bin", "--to", "onnx"], ".onnx"),
-        (["--out", "w.bin", "--to", "release"], ".safetensors"),
-        (["--out", "w.safetensors", "--to", "release"], "--to safetensors"),  # it lacks a decoder
-        (["--out", "w.safetensors", "--to", "release", "--model", "gone.pth"], "gone.pth"),
-        (["--out", "b.safetensors", "--to", "safetensors"], "--out"),
-        (["--out", "a.safetensors", "--to", "safetensors", "--between", "a.safetensors"], "--out"),
-        (["--out", "w.safetensors", "--to", "safetensors", "--frames", 3], "--frames"),
-        (["--out", "w.safetensors", "--to", "safetensors", "--share", 0.25], "--share"),
-        (["--out", "w.safetensors", "--to", "safetensors", "--between", "a.safetensors", "--share", 1.5], "--share"),
-        (["--out", "w.safetensors", "--to", "safetensors", "--between", "gone.safetensors"], "gone"),
-        (["--out", "w.safetensors", "--to", "safetensors", "--between", "eps.safetensors"], "norm_eps"),
-        (["--out", "w.safetensors", "--to", "safetensors", "--between", "gel.safetensors"], "background"),
+        ("--out m.bin --frames 2", "3 frames"), ("--out m.bin --model gone", "gone"),
+        ("--out m.bin --join sum", "--join"), ("--out m.bin --share 0.3", "--share"), ("--out afile/m.bin", "--out"),
+        ("--out m.onnx --int8", "--int8 has no effect with --to jax"),
+        ("--out m.onnx --to onnx --int8", "--int8 and --data"),
+        ("--out m.onnx --to onnx --data few.csv", "--int8 and --data"),
+        ("--out m.onnx --to onnx --int8 --data few.csv", "needs 200 touches and --data has 3"),
+        ("--out m.onnx --to onnx --dtype bfloat16", "--dtype"), ("--out m.bin --to onnx", ".onnx"),
+        ("--out w.bin --to release", ".safetensors"),
+        ("--out w.safetensors --to release", "--to safetensors"),  # it lacks a decoder
+        ("--out w.safetensors --to release --model gone.pth", "gone.pth"),
+        ("--out b.safetensors --to safetensors", "--out"),
+        ("--out a.safetensors --to safetensors --between a.safetensors", "--out"),
+        ("--out w.safetensors --to safetensors --frames 3", "--frames"),
+        ("--out w.safetensors --to safetensors --share 0.25", "--share"),
+        ("--out w.safetensors --to safetensors --between a.safetensors --share 1.5", "--share"),
+        ("--out w.safetensors --to safetensors --between gone.safetensors", "gone"),
+        ("--out w.safetensors --to safetensors --between eps.safetensors", "norm_eps"),
+        ("--out w.safetensors --to safetensors --between gel.safetensors", "background"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_write_nothing(two, tmp_path, mistake, monkeypatch, words, named):
     monkeypatch.chdir(tmp_path)
     params = two[1][0]
     write(tmp_path / "eps.safetensors", replace(touch_model(), norm_eps=1e-3), params)
     write(tmp_path / "gel.safetensors", touch_model(), params, **{safetensors.BACKGROUND_KEY: "subtract"})
     (tmp_path / "afile").write_text("")
-    rows = "".join(f"{number}.png,digit,s,{number},train\n" for number in range(3))
-    (tmp_path / "few.csv").write_text(f"path,sensor,sequence,frame_index,split\n{rows}")
+    write_rows(tmp_path / "few.csv", 3)
     before = sorted(tmp_path.iterdir())
     model = [] if "--model" in words else ["--model", "b.safetensors"]
-    assert named in mistake("export", *model, *words)
+    assert named in mistake("export", *model, *words.split())
     assert sorted(tmp_path.iterdir()) == before

@@ -1,7 +1,3 @@
-"""Encoders of other families through every command: embed, stream, probe, retrieve, export, and a start of training."""
-
-from __future__ import annotations
-
 import json
 import shutil
 
@@ -14,6 +10,7 @@ from safetensors.numpy import save_file
 from touch_world import make_touches
 
 from anytouch_jax import load_encoder
+from anytouch_jax.encoder import export
 from tests.weights import test_families as forms
 from tests.weights.test_start import mae
 
@@ -61,7 +58,7 @@ FAMILIES = ("vit_mae", "anytouch2", *(pytest.param(name, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_probes_and_retrieval_of_a_family(anytouch, family, files, touches, tmp_path):
+def test_probes_retrieval_and_regression_of_a_family(anytouch, family, files, touches, tmp_path):
     words = ("--model", files[family], "--data", touches)
     out = tmp_path / "probe.json"
     done = anytouch("probe", "label", *words, "--label", "hardness", "--no-controls", "--seeds", 1, "--out", out)
@@ -72,13 +69,8 @@ def test_probes_and_retrieval_of_a_family(anytouch, family, files, touches, tmp_
     assert done.status == 0, done.err
     names = {one["name"] for one in json.loads(out.read_text())["results"]}
     assert {str(files[family]), "random encoder"} <= names
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_the_regression_tasks_of_a_family(anytouch, family, files, touches):
     frames = 1 if family == "sparsh" else 4  # its pairs are 5 frames apart, more than these recordings have
-    words = ("--model", files[family], "--data", touches, "--tasks", "force", "--frames", frames)
-    done = anytouch("probe", "tasks", *words)
+    done = anytouch("probe", "tasks", *words, "--tasks", "force", "--frames", frames)
     assert done.status == 0 and "force" in done.out, done.err
 
 
@@ -98,14 +90,16 @@ def test_a_streamed_film_gives_the_features_of_embed(anytouch, family, files, tm
         np.testing.assert_allclose(a["features"], b["features"], atol=2e-5 * np.abs(b["features"]).max())
 
 
-def test_a_family_without_sensors_ignores_the_sensor_and_says_so_once(files):
+def test_a_run_starts_from_a_family_whose_form_and_export_are_known(files, anytouch, touches, tmp_path):
     encoder, logged = load_encoder(files["vit_mae"]), list[str]()
     assert [encoder.sensor_row("digit", logged.append) for _ in range(3)] == [0, 0, 0]
     (sentence,) = logged
     assert "the sensor 'digit' is ignored" in sentence
-
-
-def test_a_run_starts_from_a_family(anytouch, files, touches, tmp_path):
+    exported, frames = tmp_path / "encoder.bin", np.zeros((2, 1, 28, 28, 3), np.float32)
+    done = anytouch("export", "--model", files["vit_mae"], "--out", exported, "--platforms", "cpu")
+    assert done.status == 0, done.err
+    np.testing.assert_allclose(export.load(exported)(frames), encoder.encode_touch(frames), atol=1e-5)
+    assert "non-commercial" in anytouch("info", files["vit_mae"]).out
     size = "--model.image-size 28 --model.patch 7 --model.touch.width 16 --model.touch.depth 2 --model.touch.heads 2"
     size += " --model.touch.mlp 32 --model.norm-eps 1e-12 --model.decoder.width 8 --model.decoder.depth 1"
     words = ["--run", tmp_path / "run", "--init", files["vit_mae"], "--batch", 4, "--steps", 2, "--stop-after", 1]

@@ -1,7 +1,3 @@
-"""`anytouch info`: what a file or folder is, from its content."""
-
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
@@ -72,7 +68,7 @@ def test_weights_report_whose_names_they_have(anytouch, tmp_path):
     assert "not finite" in anytouch("info", ours).out
 
 
-def test_an_unknown_file_is_a_mistake(mistake, tmp_path):
+def test_a_folder_is_the_run_in_it_else_its_manifest(mistake, tmp_path, anytouch, tiny_run, world):
     (tmp_path / "notes.txt").write_text("x")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     assert "gone" in mistake("info", tmp_path / "gone")
@@ -80,9 +76,6 @@ def test_an_unknown_file_is_a_mistake(mistake, tmp_path):
     assert "weights" in mistake("info", tmp_path / "other.npz")
     assert str(tmp_path) in mistake("info", tmp_path)
     assert mistake("info")
-
-
-def test_a_folder_is_the_run_in_it_else_its_manifest(anytouch, tiny_run, world, tmp_path):
     shutil.copytree(tiny_run, tmp_path / "run")
     shutil.copy(world, tmp_path / "run" / "manifest.csv")
     assert "a run of stage 1" in anytouch("info", tmp_path / "run").out

@@ -1,7 +1,3 @@
-"""`anytouch measure` of films, folders, pictures and manifests: maps, lines, films and surfaces."""
-
-from __future__ import annotations
-
 import csv
 
 import cv2

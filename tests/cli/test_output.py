@@ -1,7 +1,3 @@
-"""Where a command writes is checked before its long work begins, and nothing is written over."""
-
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,3 @@
-"""`anytouch probe`: results on the test split, and mistakes that are named before the work."""
-
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,5 +1,3 @@
-"""`anytouch stream`: features of a video or a camera, saved also after Ctrl-C."""
-
 import json
 import signal
 import threading
@@ -65,13 +63,13 @@ def test_fields_are_those_of_measure(anytouch, mistake, tmp_path, video, tiny_ru
 
 
 def test_what_cannot_be_streamed(mistake, tmp_path, video, tiny_run):
-    args = ("stream", "--model", tiny_run, "--out", tmp_path / "f.npz")
-    assert "stride 4" in mistake(*args, "--data", video, "--frames", 3, "--stride", 4)
-    assert "3 frames" in mistake(*args, "--data", video, "--frames", 2)
-    assert "--stride" in mistake(*args, "--data", video, "--stride", 4)
-    assert ".npz" in mistake(*args, "--data", video, "--out", tmp_path / "f.csv")
-    assert "0 or more, not -1" in mistake(*args, "--data", video, "--reuse", -1)
-    assert "gone.avi" in mistake(*args, "--data", tmp_path / "gone.avi")
+    for words, named in (
+        (["--frames", 3, "--stride", 4], "stride 4"), (["--frames", 2], "3 frames"), (["--stride", 4], "--stride"),
+        (["--reuse", -1], "0 or more, not -1"), (["--out", tmp_path / "f.csv"], ".npz"),
+        (["--data", tmp_path / "gone.avi"], "gone.avi"),
+    ):  # fmt: skip
+        given = {"--data": video, "--out": tmp_path / "f.npz"} | dict(zip(words[::2], words[1::2], strict=True))
+        assert named in mistake("stream", "--model", tiny_run, *(word for pair in given.items() for word in pair))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -136,11 +134,11 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
 
 
 @pytest.mark.parametrize("out", ["f.npz", "-"])
-def test_a_camera_that_is_lost_keeps_the_features_and_fails(anytouch, tmp_path, tiny_run, monkeypatch, out):
-    monkeypatch.setattr(streams, "open_source", lambda *_: (FaultyCamera("grab", frames=30), True))
+def test_a_camera_that_is_lost_keeps_the_features_and_fails(anytouch, mistake, tmp_path, tiny_run, monkeypatch, out):
+    cameras = [FaultyCamera(frames=0), FaultyCamera("grab", frames=30)]
+    monkeypatch.setattr(streams, "open_source", lambda *_: (cameras.pop(), True))
     monkeypatch.setattr(streams, "RETRY", 0.05)
-    before = time.time()
-    target = out if out == "-" else tmp_path / out
+    before, target = time.time(), out if out == "-" else tmp_path / out
     done = anytouch("stream", "--model", tiny_run, "--data", 0, "--out", target)
     assert done.status == 2 and "after 29 frames" in done.err.splitlines()[-1] and "Traceback" not in done.err
     assert "1 missed reads" in done.err
@@ -152,13 +150,8 @@ def test_a_camera_that_is_lost_keeps_the_features_and_fails(anytouch, tmp_path, 
         assert file["key/frame_index"][-1] == 28 and str(file["about/missed"]) == "1"
         clock = float(str(file["about/started"])) + file["key/time"]
     assert (before <= clock).all() and (clock <= time.time()).all()
-
-
-def test_a_camera_that_never_shows_a_frame_is_one_sentence(mistake, tmp_path, tiny_run, monkeypatch):
-    monkeypatch.setattr(streams, "open_source", lambda *_: (FaultyCamera(frames=0), True))
-    monkeypatch.setattr(streams, "RETRY", 0.0)
-    done = mistake("stream", "--model", tiny_run, "--data", 0, "--sensor", "digit", "--out", tmp_path / "f.npz")
-    assert "camera" in done and not (tmp_path / "f.npz").exists()
+    words = ("stream", "--model", tiny_run, "--data", 0, "--sensor", "digit", "--out", tmp_path / "g.npz")
+    assert "camera" in mistake(*words) and not (tmp_path / "g.npz").exists()  # one that never shows a frame
 
 
 @pytest.mark.parametrize("command", ["stream", "embed"])

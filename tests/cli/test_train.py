@@ -1,7 +1,3 @@
-"""`anytouch train`: its configuration, its mistakes, continued runs, and several processes."""
-
-from __future__ import annotations
-
 import json
 import os
 import pkgutil
@@ -37,9 +33,6 @@ TINY_RUN = options_of(
 
 def parse(*words: object) -> command.TrainRequest:
     return command.parse(command.TrainOptions, "train", ["--data", "m.csv", "--run", "r", *map(str, words)])
-
-
-# Options --------------------------------------------------------------------------------------------------------------
 
 
 def test_sections_come_after_the_preset_the_recipe_and_the_short_options():
@@ -82,9 +75,6 @@ def test_a_wrong_value_is_named_and_starts_no_run(words, option, anytouch, tmp_p
     assert "Traceback" not in done.err and not (tmp_path / "r").exists()
 
 
-# Data that cannot be trained on ---------------------------------------------------------------------------------------
-
-
 def changed(world: Path, folder: Path, change) -> Path:
     """The world's manifest with its rows (dicts) changed, its pictures in the same folder."""
     rows = read_rows(world)
@@ -123,9 +113,6 @@ def test_a_run_folder_that_is_taken_is_one_sentence(mistake, tiny_run, world, tm
     assert "--run" in mistake("train", "--stage", 2, "--data", world, "--run", tiny_run)
 
 
-# Runs -----------------------------------------------------------------------------------------------------------------
-
-
 def test_a_run_continues_and_refuses_other_settings(anytouch, mistake, tmp_path, world, tiny_run):
     shutil.copytree(tiny_run, tmp_path / "r")
     words = [
@@ -158,7 +145,6 @@ def test_a_termination_before_the_first_step_is_polite(anytouch, tmp_path, world
     assert anytouch(*words, "--stop-after", 0).status == 0
 
 
-# Several processes ----------------------------------------------------------------------------------------------------
 # The run is the same as that of one process, on whatever number of devices it continues.
 
 PROCESS = """

@@ -1,7 +1,5 @@
 """Small worlds on disk: every touch image is of one colour that tells its row, so that a batch can be read back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

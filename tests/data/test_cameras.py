@@ -1,7 +1,3 @@
-"""Cameras: what is connected, what a user may call one, and what it really gives. The system and drivers are played."""
-
-from __future__ import annotations
-
 import fcntl
 import http.server
 import os

@@ -1,7 +1,3 @@
-"""The rule for the untouched gel: its order, its units, running estimates, and pictures that travel with a head."""
-
-from __future__ import annotations
-
 import pickle
 import threading
 import time

@@ -1,7 +1,3 @@
-"""Pictures that are made to take minutes, or to print millions of lines, are refused before they are decoded."""
-
-from __future__ import annotations
-
 import contextlib
 import io
 import sys
@@ -49,18 +45,15 @@ def _many_chunks(chunk: bytes, count: int, at: int = 33) -> bytes:
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (_many_scans(20_000), "more than 16384 scans"),
-        (_padded(b"\xff" * 100_000), "bytes of padding"),
-        (_padded(b"\0" * 100_000), "bytes of padding"),
-        (_padded(b"\xff\xd0" * 50_000), "bytes of padding"),
-        (_padded(b"\xff\xfe\0\2" * 5000), "4096 segments"),
-        (_padded(b"\xff\xe1\0\0" * 5000), "4096 segments"),
+        (_many_scans(20_000), "more than 16384 scans"), (_padded(b"\xff" * 100_000), "bytes of padding"),
+        (_padded(b"\0" * 100_000), "bytes of padding"), (_padded(b"\xff\xd0" * 50_000), "bytes of padding"),
+        (_padded(b"\xff\xfe\0\2" * 5000), "4096 segments"), (_padded(b"\xff\xe1\0\0" * 5000), "4096 segments"),
         (_many_chunks(_chunk(b"gAMA", b"\0\0\0\1"), 9000), "more than 4096 chunks"),
         (_many_chunks(_chunk(b"IDAT"), 9000), "more than 4096 chunks"),
         (_many_chunks(_chunk(b"tEXt", b"a\0b"), 9000, -12), "more than 4096 chunks"),
     ],
     ids=["scans", "fill", "zeros", "restarts", "comments", "exif", "gamma", "data", "text"],
-)
+)  # fmt: skip
 def test_a_picture_that_would_take_minutes_is_refused(data, words, monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     with pytest.raises(ImageError, match=f"hostile cannot be read: .*{words}"):

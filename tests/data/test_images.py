@@ -56,9 +56,8 @@ def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
         ("b", big), ("f", floats.astype(np.float64)), ("u", RGB), ("g", grey), ("d", RGB.astype(np.uint16) * 257),
     ):  # fmt: skip
         np.save(tmp_path / f"{name}.npy", array)
-        np.testing.assert_array_equal(
-            images.decode(tmp_path / f"{name}.npy"), RGB if name != "g" else np.stack([grey] * 3, -1)
-        )
+        wanted = RGB if name != "g" else np.stack([grey] * 3, -1)
+        np.testing.assert_array_equal(images.decode(tmp_path / f"{name}.npy"), wanted)
 
 
 def _nan():
@@ -218,9 +217,8 @@ def test_a_video_is_turned_as_its_tag_says(tmp_path):
     writer.release()
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 44  # its matrix: by 90 degrees clockwise
-    data[at : at + 36] = b"".join(
-        (number % 2**32).to_bytes(4) for number in (0, 1 << 16, 0, -(1 << 16), 0, 0, 48 << 16, 0, 1 << 30)
-    )
+    matrix = (0, 1 << 16, 0, -(1 << 16), 0, 0, 48 << 16, 0, 1 << 30)
+    data[at : at + 36] = b"".join((number % 2**32).to_bytes(4) for number in matrix)
     path.write_bytes(data)
     frame = next(images.frames_from_video(path))
     assert frame.shape == (64, 48, 3) and frame[5, 40].min() > 200 and frame[5, 5].max() < 50
@@ -246,12 +244,7 @@ def test_strips_and_tiffs_that_opencv_would_read_wrong_are_refused(tmp_path):
     plain.save(tmp_path / "several.tif", save_all=True, append_images=[plain, plain])
     clear.save(tmp_path / "clear.tif")
     Image.fromarray(np.zeros((1, 2000, 3), np.uint8)).save(tmp_path / "strip.tif")
-    sentences = {
-        "several": "holds several pictures",
-        "clear": "colours would be multiplied",
-        "strip": "that is a strip",
-    }
-    for name, sentence in sentences.items():
+    for name, sentence in (("several", "several pictures"), ("clear", "would be multiplied"), ("strip", "is a strip")):
         with pytest.raises(images.ImageError, match=rf"{name}\.tif .*{sentence}"):
             images.decode(tmp_path / f"{name}.tif")
 
@@ -394,12 +387,8 @@ def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(tmp_path
     assert [round(time, 2) for time, _ in frames] == pytest.approx([i / 10 for i in range(6)], abs=0.01)
     np.testing.assert_allclose([frame.mean() for _, frame in frames], greys, atol=3)
     video = images.open_video(film)
-    assert (
-        video.isOpened()
-        and video.set(cv2.CAP_PROP_POS_FRAMES, 4)
-        and video.read()[1].mean() == pytest.approx(140, abs=3)
-    )
-    assert video.set(cv2.CAP_PROP_POS_FRAMES, 1) and video.read()[1].mean() == pytest.approx(80, abs=3)
+    for frame, grey in ((4, 140), (1, 80)):
+        assert video.set(cv2.CAP_PROP_POS_FRAMES, frame) and video.read()[1].mean() == pytest.approx(grey, abs=3)
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(images.ImageError, match=r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'"):
         images.open_video(film)

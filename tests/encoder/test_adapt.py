@@ -1,7 +1,3 @@
-"""`anytouch adapt`: one row of tokens is fitted, nothing else moves, and the sensor is served better."""
-
-from __future__ import annotations
-
 import json
 
 import jax
@@ -9,9 +5,10 @@ import numpy as np
 import pytest
 from runs import run_config
 from touch_world import make_touches
+from weights_world import save_run
 
 from anytouch_jax.cli import app
-from anytouch_jax.config import from_json, to_json
+from anytouch_jax.config import from_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.adapt import adapt, choose_frames, save
 from anytouch_jax.encoder.encoder import load_encoder
@@ -34,24 +31,13 @@ def table(data):
     return manifests.read(data)
 
 
-def column(table, name):
-    return np.array(table.column(name).to_pylist())
-
-
-def stored(folder, config, params, **metadata):
-    saver = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=to_json(config), metadata=metadata)
-    saver.save(3, {"trainable": params}, {"loss": 1.0})
-    saver.close()
-    return folder
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, data):
     """A stage-1 run whose tokens matter: larger than at the start of training."""
     config = run_config(data)
     params = build(config.model).init(jax.random.key(0))
     params["touch"]["sensor_tokens"] = params["touch"]["sensor_tokens"] * 20
-    return stored(tmp_path_factory.mktemp("runs") / "stage1", config, params, seen=["gelsight", "digit"])
+    return save_run(tmp_path_factory.mktemp("runs") / "stage1", config, params, seen=["gelsight", "digit"])
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +46,7 @@ def fitted(run, table):
     return adapt(run, table, "gelslim", frames=8, labels="hardness", steps=40, log=said.append), said
 
 
-def test_only_the_row_of_the_new_sensor_changes(fitted, run):
+def test_only_the_row_of_the_new_sensor_changes_and_the_loss_falls_on_other_frames(fitted, run):
     adapted, said = fitted
     before, after = flatten(checkpoint.load_params(run)[0]), flatten(adapted.params)
     assert said == [] and before.keys() == after.keys()
@@ -71,10 +57,6 @@ def test_only_the_row_of_the_new_sensor_changes(fitted, run):
     changed = np.flatnonzero(np.any(tokens != old, axis=(1, 2)))
     assert changed.tolist() == [2]  # gelslim: a row of the table, but never seen
     assert np.abs(tokens[2] - old[9]).max() > 0.01  # it left the universal tokens
-
-
-def test_the_loss_falls_on_frames_that_were_not_fitted(fitted):
-    adapted, _ = fitted
     assert adapted.measured == "val" and adapted.after < adapted.before
     assert len(adapted.losses) == 40 and np.isfinite(adapted.losses).all()
 
@@ -84,9 +66,8 @@ def test_the_result_is_a_run_that_embeds(fitted, run, tmp_path):
     save(adapted, run, tmp_path / "out")
     encoder = load_encoder(tmp_path / "out")
     stills = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
-    np.testing.assert_array_equal(
-        encoder.params["touch"]["sensor_tokens"][2], adapted.params["touch"]["sensor_tokens"][2]
-    )
+    tokens = [one.params["touch"]["sensor_tokens"][2] for one in (encoder, adapted)]
+    np.testing.assert_array_equal(*tokens)
     assert np.abs(encoder.encode_touch(stills, "gelslim") - encoder.encode_touch(stills, "universal")).max() > 1e-4
     before = load_encoder(run)
     for sensor in ("digit", "universal", "duragel"):
@@ -119,14 +100,10 @@ def test_frames_come_from_as_many_recordings_as_there_are(table):
     assert len(set(sequence)) == 12 and all(name.endswith("gelslim") for name in sequence)
     rows = choose_frames(table, "gelslim", "train", 15, seed=1)
     assert len(set(rows.tolist())) == 15 and len({table.value(row, "sequence") for row in rows}) == 12
-    assert not np.array_equal(
-        choose_frames(table, "gelslim", "train", 5), choose_frames(table, "gelslim", "train", 5, seed=1)
-    )
+    few = [choose_frames(table, "gelslim", "train", 5, seed=seed) for seed in (0, 1)]
+    assert not np.array_equal(*few)
     with pytest.raises(UserError, match="'train' has 24 usable frames of gelslim, not 30"):
         choose_frames(table, "gelslim", "train", 30)
-
-
-# With labels ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -163,16 +140,14 @@ def test_an_adapted_run_is_written_whole_or_not_at_all(run, table, tmp_path, mon
 
 
 def test_the_command(run, data, tmp_path, capsys):
-    args = ["adapt", "--model", run, "--data", data, "--sensor", "gelslim", "--labels", "hardness", "--frames", 8]
-    args += ["--steps", 40, "--out"]
-    assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 0
-    assert "tokens of gelslim fitted to 8 frames. The loss on frames of split val" in capsys.readouterr().out
-    assert app.main([str(arg) for arg in [*args, tmp_path / "o"]]) == 2
-    assert "is not empty" in capsys.readouterr().err
-    args[args.index("--frames") + 1] = 0
-    for name in ("--steps", "--labels"):
-        del args[args.index(name) : args.index(name) + 2]
-    assert app.main([str(arg) for arg in [*args, tmp_path / "none"]]) == 0
+    words = f"adapt --model {run} --data {data} --sensor gelslim --out {tmp_path / 'o'} --frames"
+    fit = "8 --labels hardness --steps 40"
+    for more, status, said in (
+        (fit, 0, "tokens of gelslim fitted to 8 frames. The loss on frames of split val"), (fit, 2, "is not empty"),
+    ):  # fmt: skip
+        assert app.main(f"{words} {more}".split()) == status
+        assert said in "".join(capsys.readouterr())
+    assert app.main(f"{words.replace('/o ', '/none ')} 0".split()) == 0
     assert "gelslim has the universal tokens" in capsys.readouterr().out
 
 

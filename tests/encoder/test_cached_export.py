@@ -1,10 +1,10 @@
-"""Encoders on the fastest exact engine: equal features, exports that are made once and never serve other weights."""
-
 import importlib.util
 import json
 import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -132,19 +132,13 @@ def test_xla_computes_what_an_export_cannot(tmp_path, monkeypatch):
     assert np.isfinite(jax.tree.leaves(gradient(auto.params))[0]).all()
     assert auto.encode_touch(CLIPS[:0, :1]).shape == (0, 12)
     assert stored(tmp_path) == []
-    for name, value in (("LARGEST", 10), ("jax", replace_backend("gpu"))):
+    gpu = SimpleNamespace(default_backend=lambda: "gpu", tree=jax.tree, tree_util=jax.tree_util)
+    for name, value in (("LARGEST", 10), ("jax", gpu)):
         with monkeypatch.context() as patch:
             patch.setattr(cached_export, name, value)
             assert load_encoder(path).exported(1) is None
-    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert load_encoder(path).exported(1) is None
-
-
-def replace_backend(name):
-    """jax as `cached_export` reads it, on another kind of device."""
-    from types import SimpleNamespace
-
-    return SimpleNamespace(default_backend=lambda: name, tree=jax.tree, tree_util=jax.tree_util)
 
 
 def test_fields_and_features_of_one_pass_are_those_of_xla(tmp_path):
@@ -178,9 +172,5 @@ def test_an_engine_that_cannot_compute_says_so(tmp_path):
     ):
         with pytest.raises(UserError, match=words):
             call()
-    assert json.loads(describes(_made(path)).read_text())["form"] == "onnx"
-
-
-def _made(path):
     load_encoder(path).encode_touch(CLIPS[:, 0])
-    return stored(path.parent)[0]
+    assert json.loads(describes(stored(tmp_path)[0]).read_text())["form"] == "onnx"

@@ -1,5 +1,3 @@
-"""Encoders and the features they give: of arrays, of a manifest, from a run, from weights, at random."""
-
 import zipfile
 from dataclasses import replace
 
@@ -22,11 +20,6 @@ RNG = np.random.default_rng(0)
 CLIPS = RNG.integers(0, 256, (2, 7, 28, 28, 3), np.uint8)
 
 
-@pytest.fixture(scope="module")
-def encoder(tiny_run):
-    return load_encoder(tiny_run)
-
-
 def test_shapes_of_what_is_embedded(encoder):
     still = CLIPS[:, 0]
     z = encoder.encode_touch(still, "digit")
@@ -44,13 +37,10 @@ def test_what_cannot_be_embedded_is_one_sentence(encoder):
     for clips, word in (
         (CLIPS.astype(np.float32), r"float32.*np\.asarray\(frames, np\.uint8\)"),
         (CLIPS[:, 0].tolist(), r"int64.*np\.asarray\(frames, np\.uint8\)"),
-        ([CLIPS[0, 0], CLIPS[0, 0, :5]], "differ in size"),
-        (CLIPS[:, :, :27], "28 x 28"),
-        (CLIPS[..., :1], r"preprocess"),
-        (CLIPS[:, :0], "a clip needs 3 frames"),
-        (CLIPS[:, :2], "a clip needs 3 frames"),
-        (CLIPS[0, 0, 0], "28 x 28"),
-    ):
+        ([CLIPS[0, 0], CLIPS[0, 0, :5]], "differ in size"), (CLIPS[:, :, :27], "28 x 28"),
+        (CLIPS[..., :1], r"preprocess"), (CLIPS[:, :0], "a clip needs 3 frames"),
+        (CLIPS[:, :2], "a clip needs 3 frames"), (CLIPS[0, 0, 0], "28 x 28"),
+    ):  # fmt: skip
         with pytest.raises(UserError, match=word):
             encoder.encode_touch(clips, "digit")
     for ids, word in (([0, 10], "0 to 9"), ([-1, 0], "0 to 9"), ([0], "2 touches")):
@@ -76,9 +66,6 @@ def test_a_sensor_of_the_table_that_training_never_used_is_reported(encoder, tmp
     assert load_encoder(tmp_path / "w.safetensors").trained_sensors == ("digit",)
 
 
-# Where encoders come from -------------------------------------------------------------------------------------------
-
-
 def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
     params, _, _ = checkpoint.load_params(tiny_run)
     assert set(encoder.params) == {"touch"} and encoder.source == str(tiny_run)
@@ -89,9 +76,6 @@ def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
     assert "array" not in repr(encoder) and "kernel" not in repr(encoder) and len(repr(encoder)) < 400
     wanted = load_encoder(tiny_run / "checkpoints", step=2).encode_touch(CLIPS[:, 0], "digit")
     np.testing.assert_array_equal(wanted, encoder.encode_touch(CLIPS[:, 0], "digit"))
-
-
-# Manifests ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_manifest_gives_what_its_pictures_give(encoder, world):
@@ -115,9 +99,6 @@ def test_clips_of_a_manifest_end_at_their_rows(encoder, world):
         embed_rows(encoder, manifest, np.asarray([1]), 3)
     with pytest.raises(UserError, match="no rows"):
         embed_rows(encoder, manifest, np.asarray([], np.int64))
-
-
-# Files --------------------------------------------------------------------------------------------------------------
 
 
 def test_features_are_written_whole_or_not_at_all(tmp_path, monkeypatch):

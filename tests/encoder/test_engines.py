@@ -1,6 +1,5 @@
-"""Encoders as ONNX: the live model's features in every form of the network, int8, and encoders on engines."""
-
 import json
+import sys
 from dataclasses import replace
 
 import jax
@@ -23,13 +22,9 @@ ROWS = np.asarray([1, 0, 9, 3, 1], np.int32)
 
 def perturbed(encoder, seed=0):
     """The encoder with biases and scales that are not 0 and 1, so that a forgotten one shows."""
-    import jax
-
     rng = np.random.default_rng(seed)
-    moved = jax.tree.map(
-        lambda x: np.asarray(x) + 0.1 * rng.standard_normal(x.shape).astype(np.float32), encoder.params
-    )
-    return replace(encoder, params=moved)
+    moved = lambda x: np.asarray(x) + 0.1 * rng.standard_normal(x.shape).astype(np.float32)  # noqa: E731
+    return replace(encoder, params=jax.tree.map(moved, encoder.params))
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +107,6 @@ def test_openvino_gives_the_same_features(exported, encoder):
             assert np.abs(run(CLIPS[:count, :3], ROWS[:count]) - live).max() < tolerance * np.abs(live).max()
 
 
-# What is refused ----------------------------------------------------------------------------------------------------
-
-
 def test_what_cannot_be_run_is_one_sentence(exported, encoder, calibration, tmp_path, monkeypatch):
     own = load_encoder(exported[0])
     clips = CLIPS[:, :3]
@@ -131,7 +123,7 @@ def test_what_cannot_be_run_is_one_sentence(exported, encoder, calibration, tmp_
     ):
         with pytest.raises(UserError, match=word):
             call()
-    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(UserError, match=r'onnxruntime is not installed: pip install "anytouch_jax\[engines\]"'):
         load(exported[0])
 

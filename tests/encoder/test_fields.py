@@ -1,7 +1,3 @@
-"""Fields in mm and N: scales, deviations, frames of every form, faults of pictures, surfaces."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

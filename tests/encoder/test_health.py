@@ -1,7 +1,3 @@
-"""Health of sensor units: no alarm on good ones, and an alarm of the right check on made faults."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,3 @@
-"""Calibration: coverage, temperature and false alarms on made touches, and what a head says about strange ones."""
-
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

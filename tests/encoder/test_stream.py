@@ -1,33 +1,17 @@
-"""Streams: every frame of a video, the newest of a camera, and where the time went."""
-
 import os
 import signal
 import threading
 from itertools import pairwise
 
-import cv2
 import jax
 import numpy as np
 import pytest
-from faulty_camera import KINDS, FaultyCamera, write_uneven_video
+from faulty_camera import KINDS, FaultyCamera, Film, write_uneven_video
+from films import write_film
 
 from anytouch_jax.data.images import frames_from_video
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder import stream as streams
-from anytouch_jax.encoder.encoder import load_encoder
-from anytouch_jax.encoder.stream import (
-    PARTS,
-    CameraError,
-    Clip,
-    Embedded,
-    Frame,
-    Mailbox,
-    Reuse,
-    budget,
-    collect,
-    open_source,
-    stream,
-)
 from anytouch_jax.errors import UserError
 
 DIGIT = 1
@@ -40,20 +24,10 @@ def impatient(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def encoder(tiny_run):
-    return load_encoder(tiny_run)
-
-
-@pytest.fixture(scope="module")
 def video(tmp_path_factory):
-    path = tmp_path_factory.mktemp("video") / "touch.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (40, 32))
-    rng = np.random.default_rng(0)
-    for frame in range(8):
-        blue_to_red = np.full((32, 40, 3), (20, 30 * frame, 200), np.uint8)
-        writer.write(blue_to_red + rng.integers(0, 30, blue_to_red.shape, np.uint8))
-    writer.release()
-    return path
+    noise = np.random.default_rng(0).integers(0, 30, (8, 32, 40, 3), np.uint8)
+    frames = [np.full((32, 40, 3), (20, 30 * number, 200), np.uint8) + one for number, one in enumerate(noise)]
+    return write_film(tmp_path_factory.mktemp("video") / "touch.avi", frames)
 
 
 class Camera:
@@ -103,9 +77,6 @@ def features_of(encoder, frames, numbers):
     return encoder.encode_touch(np.stack([small[list(one)] for one in numbers]), "digit")
 
 
-# Videos -------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("frames", "stride", "clips"),
     [
@@ -115,9 +86,9 @@ def features_of(encoder, frames, numbers):
     ],
 )
 def test_every_frame_of_a_video_in_order(encoder, video, frames, stride, clips):
-    source, live = open_source(video)
+    source, live = streams.open_source(video)
     assert not live
-    outcome = list(stream(encoder, source, live=live, sensor=DIGIT, frames=frames, stride=stride))
+    outcome = list(streams.stream(encoder, source, live=live, sensor=DIGIT, frames=frames, stride=stride))
     assert [one.number for one in outcome] == [clip[-1] for clip in clips]
     wanted = features_of(encoder, list(frames_from_video(video)), clips)
     np.testing.assert_allclose([one.values for one in outcome], wanted, atol=1e-5)
@@ -129,7 +100,7 @@ def test_every_frame_of_a_video_in_order(encoder, video, frames, stride, clips):
 
 def test_a_slow_reader_of_a_video_loses_nothing(encoder, video):
     """The mailbox has one slot: the reader waits with its next clip while nobody takes."""
-    source, _ = open_source(video)
+    source, _ = streams.open_source(video)
     received = []
     retrieve = source.retrieve
 
@@ -140,18 +111,15 @@ def test_a_slow_reader_of_a_video_loses_nothing(encoder, video):
             received.append(len(received))
             return retrieve()
 
-    embedded = stream(encoder, Counted(), live=False, sensor=DIGIT)
+    embedded = streams.stream(encoder, Counted(), live=False, sensor=DIGIT)
     first = next(embedded)
     assert len(received) <= 3  # one embedded, one in the slot, one that waits for the slot
     assert [first.number, *(one.number for one in embedded)] == list(range(8))
 
 
-# Cameras ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
     camera = Camera(ready=3)
-    embedded = stream(encoder, camera, live=True, sensor=DIGIT, frames=3, log=lambda sentence: None)
+    embedded = streams.stream(encoder, camera, live=True, sensor=DIGIT, frames=3, log=lambda sentence: None)
     outcome = [next(embedded)]
     assert outcome[0].number == 2
     camera.show(5)  # nobody takes meanwhile, and the camera is read all the same
@@ -164,7 +132,7 @@ def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
     wanted = features_of(encoder, frames, [(0, 1, 2), (5, 6, 7), (6, 7, 8)])  # consecutive, whatever was dropped
     np.testing.assert_allclose([one.values for one in outcome], wanted, atol=1e-5)
     camera.end()
-    with pytest.raises(CameraError, match="after 9 frames"):
+    with pytest.raises(streams.CameraError, match="after 9 frames"):
         next(embedded)
     assert camera.released
 
@@ -173,16 +141,16 @@ def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
 def test_a_camera_that_misses_a_read_goes_on_and_then_fails(encoder, kind):
     """The picture of another shape is a missed read. No clip spans it, and the end of a camera is never normal."""
     camera, logged = FaultyCamera(kind), []
-    result = collect(stream(encoder, camera, live=True, sensor=DIGIT, log=logged.append))
+    result = streams.collect(streams.stream(encoder, camera, live=True, sensor=DIGIT, log=logged.append))
     assert result.numbers[-1] == 10 and result.missed == 1, "frames after the miss"
-    assert isinstance(result.error, CameraError) and "after 11 frames" in str(result.error) and camera.released
+    assert isinstance(result.error, streams.CameraError) and "after 11 frames" in str(result.error) and camera.released
     assert len(logged) == 1 and "after 3 frames" in logged[0]
-    assert "1 missed reads" in budget(result)[-1]
+    assert "1 missed reads" in streams.budget(result)[-1]
 
 
 def test_no_clip_spans_a_missed_read(encoder):
-    mailbox, clips = Mailbox(replace=False), []
-    frames = [Frame(i, np.full((32, 40, 3), i, np.uint8), 0.0, 0.0, missed=int(i > 3)) for i in range(8)]
+    mailbox, clips = streams.Mailbox(replace=False), []
+    frames = [streams.Frame(i, np.full((32, 40, 3), i, np.uint8), 0.0, 0.0, missed=int(i > 3)) for i in range(8)]
     reader = threading.Thread(target=streams._read, args=(iter(frames), lambda pixels: pixels, 3, 1, mailbox))
     reader.start()
     while (clip := mailbox.take()) is not None:
@@ -192,11 +160,9 @@ def test_no_clip_spans_a_missed_read(encoder):
 
 @pytest.mark.parametrize("kind", ["frozen", "black", "ok"])
 def test_a_frozen_and_a_black_picture_are_reported_once(encoder, kind):
-    logged = []
-    outcome = []
-    result = collect(
-        stream(encoder, FaultyCamera(kind, frames=60), live=True, sensor=DIGIT, log=logged.append), outcome.append
-    )
+    logged, outcome = [], []
+    found = streams.stream(encoder, FaultyCamera(kind, frames=60), live=True, sensor=DIGIT, log=logged.append)
+    result = streams.collect(found, outcome.append)
     pictures = [one.picture for one in outcome]
     assert pictures[0] == "ok" and pictures[-1] == kind and result.missed == 0
     assert sum(f"is {kind} at frame" in line for line in logged) == (kind != "ok")
@@ -210,41 +176,18 @@ def test_a_camera_that_does_not_answer_is_not_waited_for(encoder, monkeypatch):
     monkeypatch.setattr(streams, "HANG", 0.05)
     monkeypatch.setattr(streams, "_PATIENCE", 0.01)
     camera = Camera(ready=1)
-    embedded = stream(encoder, camera, live=True, sensor=DIGIT)
+    embedded = streams.stream(encoder, camera, live=True, sensor=DIGIT)
     next(embedded)
-    with pytest.raises(CameraError, match="not answered"):
+    with pytest.raises(streams.CameraError, match="not answered"):
         next(embedded)
     camera.end()
 
 
 def test_times_of_a_video_are_those_of_its_frames(encoder, tmp_path):
     stamps = [0, 30, 60, 500, 510, 1500]
-    source, live = open_source(write_uneven_video(tmp_path / "uneven.mkv", stamps))
-    outcome = list(stream(encoder, source, live=live, sensor=DIGIT))
+    source, live = streams.open_source(write_uneven_video(tmp_path / "uneven.mkv", stamps))
+    outcome = list(streams.stream(encoder, source, live=live, sensor=DIGIT))
     np.testing.assert_allclose([one.time for one in outcome], np.array(stamps) / 1000, atol=1e-6)
-
-
-# Reuse --------------------------------------------------------------------------------------------------------------
-
-
-class Film:
-    """A video of given frames BGR u8 (n, h, w, 3), without the errors of a codec."""
-
-    def __init__(self, frames) -> None:
-        self.frames = iter(frames)
-
-    def grab(self) -> bool:
-        self.frame = next(self.frames, None)
-        return self.frame is not None
-
-    def retrieve(self):
-        return True, self.frame
-
-    def get(self, name) -> float:
-        return 0.0
-
-    def release(self) -> None:
-        pass
 
 
 @pytest.fixture
@@ -268,7 +211,7 @@ def test_reuse_of_equal_clips_changes_no_bit(encoder, embedded_clips, frames):
     dotted = picture.copy()
     dotted[5, 7, 1] ^= 1
     film = np.stack([picture] * 5 + [dotted] * 4 + [picture] * 4)
-    found = collect(stream(encoder, Film(film), live=False, sensor=DIGIT, frames=frames))
+    found = streams.collect(streams.stream(encoder, Film(film), live=False, sensor=DIGIT, frames=frames))
     small = touch_evaluation(list(film[..., ::-1]), 28)
     clips = np.stack([small[end - frames : end] for end in range(frames, len(film) + 1)])
     embed = streams.compile_for_one(encoder, DIGIT, frames)
@@ -276,7 +219,7 @@ def test_reuse_of_equal_clips_changes_no_bit(encoder, embedded_clips, frames):
     new = [True, *(not np.array_equal(a, b) for a, b in pairwise(clips))]
     assert found.reused.tolist() == [not one for one in new] and sum(new) == (3 if frames == 1 else 7)
     np.testing.assert_array_equal(embedded_clips[: sum(new)], clips[new])
-    assert budget(found)[-1].endswith(f"{len(clips) - sum(new)} reused")
+    assert streams.budget(found)[-1].endswith(f"{len(clips) - sum(new)} reused")
 
 
 def test_noise_is_reused_and_a_small_touch_is_not():
@@ -288,31 +231,21 @@ def test_noise_is_reused_and_a_small_touch_is_not():
         clip[:, :14, 14:28] += touch
         return clip.round().astype(np.uint8)
 
-    reuse = Reuse(1.5)
+    reuse = streams.Reuse(1.5)
     assert not any(reuse(noisy()) for _ in range(streams.LEARNED + 1)), "what is noise is not known yet"
     assert all(reuse(noisy()) for _ in range(50))
     assert not reuse(noisy(touch=8)) and reuse(noisy(touch=8)) and not reuse(noisy())
     drifted = [reuse(noisy(level)) for level in np.linspace(0, 20, 40)]
     assert 3 <= drifted.count(False) <= 20
-    exact = Reuse(0.0)
+    exact = streams.Reuse(0.0)
     assert not any(exact(noisy()) for _ in range(streams.LEARNED + 20))
     with pytest.raises(UserError, match="must be 0 or more, not -1"):
-        Reuse(-1.0)
-
-
-# The mailbox --------------------------------------------------------------------------------------------------------
-
-
-def clip(number: int) -> Clip:
-    return Clip(Frame(number, np.zeros(0), 0.0, 0.0), np.zeros(0), 0.0)
-
-
-# Results ------------------------------------------------------------------------------------------------------------
+        streams.Reuse(-1.0)
 
 
 def some(count: int):
     for i in range(count):
-        yield Embedded(i, 0.1 * i, np.full(3, i, np.float32), (0.001, 0.002, 0.003, 0.004), 0.02)
+        yield streams.Embedded(i, 0.1 * i, np.full(3, i, np.float32), (0.001, 0.002, 0.003, 0.004), 0.02)
 
 
 def test_an_interrupt_keeps_what_there_is():
@@ -325,18 +258,18 @@ def test_an_interrupt_keeps_what_there_is():
         finally:
             closed.append(True)
 
-    result = collect(interrupted())
+    result = streams.collect(interrupted())
     assert result.interrupted and closed == [True]
     assert result.values.tolist() == [[0, 0, 0], [1, 1, 1]] and result.numbers.tolist() == [0, 1]
-    assert result.seconds.shape == (2, len(PARTS)) and result.age.tolist() == [0.02, 0.02]
+    assert result.seconds.shape == (2, len(streams.PARTS)) and result.age.tolist() == [0.02, 0.02]
 
     def stop(one):
         if one.number == 3:
             raise KeyboardInterrupt
 
-    result = collect(some(9), stop)
+    result = streams.collect(some(9), stop)
     assert result.interrupted and result.numbers.tolist() == [0, 1, 2] and result.values.shape == (3, 0)
-    assert not collect(some(2)).interrupted
+    assert not streams.collect(some(2)).interrupted
 
 
 def test_sigterm_keeps_what_there_is_and_a_long_stream_only_its_last_times(monkeypatch):
@@ -345,10 +278,10 @@ def test_sigterm_keeps_what_there_is_and_a_long_stream_only_its_last_times(monke
         os.kill(os.getpid(), signal.SIGTERM)
         yield from some(1)
 
-    result = collect(terminated())
+    result = streams.collect(terminated())
     assert result.interrupted and len(result.values) >= 2
     monkeypatch.setattr("anytouch_jax.encoder.stream.KEPT", 3)
-    result = collect(some(9), lambda one: None)
+    result = streams.collect(some(9), lambda one: None)
     assert result.total == 9 and result.numbers.tolist() == [6, 7, 8]
-    assert budget(result)[-1].startswith("9 frames embedded; of the last 3: 0 dropped")
-    assert len(collect(some(9)).values) == 9, "features are all kept"
+    assert streams.budget(result)[-1].startswith("9 frames embedded; of the last 3: 0 dropped")
+    assert len(streams.collect(some(9)).values) == 9, "features are all kept"

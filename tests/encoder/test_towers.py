@@ -1,7 +1,3 @@
-"""Image and text towers of an encoder: equal to those of training, zero-shot similarity, mistakes."""
-
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import jax
@@ -10,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.special
 from runs import run_config
+from weights_world import save_run
 
 from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import to_json
@@ -20,7 +17,6 @@ from anytouch_jax.encoder.encoder import load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import align_embeddings, normalise_image
-from anytouch_jax.weights.checkpoint import Checkpoints
 
 RNG = np.random.default_rng(0)
 TEXTS = ["a soft sponge", "a hard metal edge", "cloth"]
@@ -34,9 +30,7 @@ def stored(tmp_path_factory):
     run = tmp_path_factory.mktemp("aligned") / "stage2"
     config = run_config(run / "manifest.csv", 2)
     params = build(config.model).init(jax.random.key(1))
-    checkpoints = Checkpoints(run / "checkpoints", keep=1, config_json=to_json(config), metadata={"seen": ["digit"]})
-    checkpoints.save(1, {"trainable": params}, {"loss": 1.0})
-    checkpoints.close()
+    save_run(run, config, params, seen=["digit"])
     (run / "config.json").write_text(to_json(config))
     train_tokenizer(TEXTS, 400).save(run)
     return SimpleNamespace(run=run, config=config, params=params)

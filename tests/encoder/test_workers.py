@@ -1,7 +1,3 @@
-"""Encoders in other processes and for any number of touches: pickle, fork, and how many programs are compiled."""
-
-from __future__ import annotations
-
 import multiprocessing
 import pickle
 import time

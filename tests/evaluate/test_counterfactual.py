@@ -1,17 +1,12 @@
-"""Does touch matter? Controls that remove one thing each, and what their paired differences say."""
-
-from __future__ import annotations
-
 import json
 
 import cv2
 import numpy as np
 import pytest
+from checked_world import columns
 from task_world import simulated
-from tiny_models import tiny_config
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.evaluate import counterfactual as cf
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore
 from anytouch_jax.evaluate.probing import probe_tasks
@@ -81,14 +76,11 @@ def test_touch_matters_where_only_touch_has_the_label():
     assert cf.verdicts(gains)[0].startswith("There is no sign that touch matters for material")
 
 
-def test_the_background_alone_is_the_same_for_all_frames_of_a_gel(tmp_path):
+def test_the_background_alone_is_the_same_for_all_frames_of_a_gel(tmp_path, encoder):
     for name, grey in (("a", 40), ("b", 90), ("gel", 120)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((20, 20, 3), grey, np.uint8))
-    rows = [{"path": f"{name}.png", "sensor": "digit", "sequence": name, "frame_index": 0, "split": "train",
-             "background_path": "gel.png"} for name in "ab"]  # fmt: skip
-    columns = {name: [row[name] for row in rows] for name in rows[0]}
-    world = manifests.from_columns(columns, tmp_path / "m.parquet")
-    encoder = random_encoder(tiny_config())
+    files = {"path": ["a.png", "b.png"], "background_path": ["gel.png"] * 2}
+    world = manifests.from_columns(columns(2, sequence=["a", "b"], **files), tmp_path / "m.parquet")
     sources = {source.name: source.store for source in cf.touch_sources(world, encoder, log=lambda _: None)}
     assert set(sources) == {cf.REAL, cf.SHUFFLED, cf.SHIFTED, cf.BACKGROUND, cf.MEAN}
     ids = np.arange(2)[:, None]

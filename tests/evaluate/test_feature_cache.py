@@ -1,7 +1,3 @@
-"""Feature caches: what is computed again, what is not; raw pixels; features files."""
-
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import replace
@@ -11,13 +7,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from task_world import painted, simulated
+from checked_world import columns
+from task_world import simulated
 from tiny_models import tiny_config
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.shards import pack
-from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache
@@ -45,14 +41,11 @@ def paint(file: Path, grey: int) -> None:
 def world(folder: Path, gel: int) -> Manifest:
     """Three touches over a gel of grey `gel`; pictures without compression, so that all are of one size."""
     folder.mkdir()
-    columns = {
-        "path": [f"{i}.bmp" for i in ROWS], "sensor": ["digit"] * 3, "sequence": ["a"] * 3,
-        "frame_index": ROWS.tolist(), "split": ["test"] * 3, "background_path": ["background.bmp"] * 3,
-    }  # fmt: skip
+    files = {"path": [f"{i}.bmp" for i in ROWS], "background_path": ["background.bmp"] * 3}
     for i in ROWS:
         paint(folder / f"{i}.bmp", 100 + 20 * i)
     paint(folder / "background.bmp", gel)
-    manifests.write(manifests.from_columns(columns, folder / "m.parquet"), folder / "m.parquet")
+    manifests.write(manifests.from_columns(columns(3, **files), folder / "m.parquet"), folder / "m.parquet")
     return manifests.read(folder / "m.parquet")
 
 
@@ -81,32 +74,7 @@ def test_another_picture_of_the_gel_is_seen_in_the_same_process(tmp_path, subtra
     np.testing.assert_array_equal(again, second)
 
 
-# ---- an untrained encoder on pictures ----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def pictures(tmp_path_factory) -> Manifest:
-    return painted(tmp_path_factory.mktemp("pictures"))
-
-
-@pytest.fixture(scope="module")
-def encoder() -> Encoder:
-    return random_encoder(tiny_config())
-
-
-def counted(monkeypatch) -> list[int]:
-    """Rows that are read, by every pass over a manifest."""
-    passes: list[int] = []
-
-    def counting(encoder, table, rows, *args, **options):
-        passes.append(len(rows))
-        return embed_rows(encoder, table, rows, *args, **options)
-
-    monkeypatch.setattr(feature_cache, "embed_rows", counting)
-    return passes
-
-
-def test_the_cache_goes_by_content(monkeypatch, encoder, pictures, tmp_path):
+def test_the_cache_goes_by_content(encoder, pictures, tmp_path):
     plain: dict[str, Any] = {"folder": tmp_path}
     store = encoder_features(encoder, pictures, **plain)
     files = {store.file(1), store.file(3)}
@@ -129,24 +97,23 @@ def test_the_cache_goes_by_content(monkeypatch, encoder, pictures, tmp_path):
     rewritten = encoder_features(encoder, moved, **plain).file(1)
     assert rewritten != store.file(1)
     (copied / pictures.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
-    assert encoder_features(encoder, moved, **plain).file(1) != rewritten  # an equal table of other pictures
     before = encoder_features(encoder, moved, **plain).file(1)
+    assert before != rewritten  # an equal table of other pictures
     cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))  # another photograph of the gel
     assert encoder_features(encoder, moved, **plain).file(1) != before
 
 
-def test_a_broken_cache_is_made_again(monkeypatch, encoder, pictures, tmp_path):
+def test_a_broken_cache_is_made_again(passes, encoder, pictures, tmp_path):
     rows = np.arange(4)
     whole = encoder_features(encoder, pictures, folder=tmp_path)
     values = whole.get(rows[:, None], 1)
     whole.file(1).write_bytes(whole.file(1).read_bytes()[:200])
-    passes = counted(monkeypatch)
     again = encoder_features(encoder, pictures, folder=tmp_path)
     np.testing.assert_array_equal(again.get(rows[:, None], 1), values)
-    assert passes == [4]
+    assert passes == [4, 4]
 
 
-def test_the_order_of_frames(monkeypatch, encoder, pictures):
+def test_the_order_of_frames(encoder, pictures):
     clips = np.arange(24).reshape(8, 3)
     rows = np.arange(8)
     np.testing.assert_array_equal(reorder_frames(clips, rows, "right"), clips)
@@ -166,8 +133,6 @@ def test_the_order_of_frames(monkeypatch, encoder, pictures):
     assert np.abs(values["right"] - values["shuffled"]).max() > 1e-4
     assert np.abs(values["right"] - values["repeated"]).max() > 1e-4
 
-
-# ---- raw pixels ---------------------------------------------------------------------------------------------
 
 HALF = 24 * 32 * 3
 
@@ -203,9 +168,6 @@ def test_components_are_those_of_train() -> None:
     wild = features.copy()
     wild[~train] *= 100
     np.testing.assert_allclose(principal_components(wild, train, 2)[train], kept[train], atol=1e-5)
-
-
-# ---- features files ----------------------------------------------------------------------------------------
 
 
 def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):

@@ -1,7 +1,3 @@
-"""Heads on frozen features: their optimum, their options, their steps; saved heads; logistic regression."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -46,9 +42,6 @@ def test_every_head_learns_a_number(name, least):
     assert 1 + max(scores(head, 0)) / np.var(data(0)[1][TEST]) > least
 
 
-# ---- linear heads ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["linear", "knn"])
 @pytest.mark.parametrize("classes", [2, 4])
 def test_a_row_that_counts_twice_is_a_row_given_twice(name, classes):
@@ -88,9 +81,6 @@ def test_ridge_equals_its_normal_equations():
     np.testing.assert_allclose(heads.fit_ridge(x, y, [0.3])(x)[0], scaled @ weights + y.mean(), atol=1e-4)
 
 
-# ---- nearest neighbours ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("k", [1, 5, 20])
 @pytest.mark.parametrize("columns", [3, 20, 700, 3001])
 def test_nearest_equals_sorting_everything(k, columns):
@@ -108,16 +98,11 @@ def test_votes():
     np.testing.assert_array_equal(heads.vote(labels, cosines, 3), [1, 0, 2, 0])
 
 
-# ---- the authors' gradient-trained head --------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("classes", [0, 2, 4])
 def test_the_gradient_head_takes_adamw_steps_of_its_loss(classes):
     """The first step of Adam is the sign of the gradient; decoupled decay shrinks weights and bias."""
     rng = np.random.default_rng(1)
-    x, params = (
-        rng.normal(size=(6, 3)).astype(np.float32), [rng.normal(size=(3, max(1, classes * (classes > 2))))],
-    )  # fmt: skip
+    x, params = (rng.normal(size=(6, 3)).astype(np.float32), [rng.normal(size=(3, max(1, classes * (classes > 2))))])
     params = (params[0].astype("f4"), rng.normal(size=params[0].shape[1]).astype("f4"))
     y = rng.integers(classes, size=6) if classes else rng.normal(size=6).astype(np.float32)
     target = y.astype(np.int32 if classes > 2 else np.float32)
@@ -171,9 +156,6 @@ def test_the_gradient_head_equals_a_run_of_optax():
     assert np.mean(predicted == expected) > 0.99
 
 
-# ---- saved heads -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("classes", [2, 3])
 def test_a_saved_head_gives_the_same_predictions(tmp_path, classes):
     x, y = blobs(classes=classes)
@@ -211,9 +193,6 @@ def test_heads_of_the_first_release_still_load(tmp_path):
         np.savez(tmp_path / "h.npz", **{"format": "anytouch_jax.head.1", **arrays, name: value})
         with pytest.raises(UserError, match=r"h\.npz is not the head of a probe"):
             linear_head.load_head(tmp_path / "h.npz")
-
-
-# Logistic regression --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("classes", [2, 3, 20])

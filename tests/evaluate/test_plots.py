@@ -1,7 +1,3 @@
-"""Charts: what is drawn where, read back from the picture, and files that are whole or not there."""
-
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

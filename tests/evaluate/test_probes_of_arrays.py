@@ -1,7 +1,3 @@
-"""Probes on data whose answer is known: separable, shuffled, leaking and measured labels; tables, JSON."""
-
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -9,11 +5,7 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import ProbeHead, linear_path
-from anytouch_jax.evaluate.probing import (
-    ProbeResult,
-    leave_groups_out,
-    probe_features,
-)
+from anytouch_jax.evaluate.probing import ProbeResult, leave_groups_out, probe_features
 from anytouch_jax.evaluate.verdict import verdict
 
 Array = np.ndarray[Any, Any]
@@ -39,10 +31,6 @@ def linear_probe(*arrays: Any, penalties: Any = None, scaling: Any = "column", *
 
 def knn_probe(*arrays: Any, **options: Any) -> ProbeResult:
     return probe_features(*arrays, ProbeHead("knn"), **options)
-
-
-def regression_probe(*arrays: Any, head: ProbeHead | None = None, **options: Any) -> ProbeResult:
-    return probe_features(*arrays, head, measured=True, **options)
 
 
 PROBES = [linear_probe, knn_probe]
@@ -139,29 +127,6 @@ def test_parts_of_the_test_rows() -> None:
     assert (none.n_test, none.low) == (0, None)
 
 
-# ---- regression --------------------------------------------------------------------------------------------
-
-
-def measured(noise: float, groups: int = 60) -> tuple[Array, Array, Array, Array]:
-    features, _, group, split = table(groups=groups, apart=0.0)
-    weights = np.arange(8) - 3.0
-    force = features @ weights + 5.0 + noise * np.random.default_rng(2).normal(size=len(features))
-    return features, force, group, split
-
-
-def test_regression_of_a_linear_quantity() -> None:
-    result = regression_probe(*measured(0.0))
-    assert result.r2 > 0.9999
-    assert result.mae < 0.02
-    noisy = regression_probe(*measured(6.0))
-    assert noisy.low < noisy.r2 < noisy.high < result.r2
-    assert noisy.mae_low < noisy.mae < noisy.mae_high
-    assert 0.3 < noisy.r2 < 0.85
-
-
-# ---- a user's mistakes -------------------------------------------------------------------------------------
-
-
 def refused(*words: str, probe: Any = linear_probe, options: Any = None, **changes: Any) -> None:
     """The probe of `table()` with these arguments raises one line that holds the words."""
     names = ("features", "labels", "groups", "split")
@@ -180,20 +145,14 @@ def test_rows_that_cannot_be_probed_are_refused(probe: Any) -> None:
     for part in ("train", "test"):
         refused(repr(part), probe=probe, split=lambda parts, _, part=part: np.where(parts == part, "unused", parts))
     for bad in (np.nan, np.inf):
-        refused("rows 4, 17 ", probe=probe, features=lambda x, _, bad=bad: x * np.where(wild(x), bad, 1)[:, None])
+        some = np.where(np.isin(np.arange(300), (4, 17)), bad, 1)[:, None]
+        refused("rows 4, 17 ", probe=probe, features=lambda x, _, some=some: x * some)
         refused("9 and 290 more", probe=probe, features=lambda x, _, bad=bad: x * bad)
     refused("299", probe=probe, labels=np.zeros(299))
     refused("'lucky'", probe=probe, options={"protocol": "lucky"})
     refused("3, 8", "group", probe=probe, groups=lambda g, _: np.where(np.isin(np.arange(300), (3, 8)), "", g))
     refused("one group", probe=probe, groups=lambda g, split: np.where(split == "test", 1, 0),
             split=lambda parts, _: np.where(parts == "val", "unused", parts))  # fmt: skip
-
-
-def wild(x: Array) -> Array:
-    return np.isin(np.arange(len(x)), (4, 17))
-
-
-# ---- tables and JSON ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

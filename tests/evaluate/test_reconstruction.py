@@ -1,5 +1,3 @@
-"""Pixels that stage 1 is not shown: its errors and those of guesses without a model, by hand."""
-
 from dataclasses import replace
 
 import jax
@@ -12,11 +10,7 @@ from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.evaluate import reconstruction
-from anytouch_jax.evaluate.reconstruction import (
-    pixel_scores,
-    plain_reconstruction,
-    reconstruction_panels,
-)
+from anytouch_jax.evaluate.reconstruction import pixel_scores, plain_reconstruction, reconstruction_panels
 from anytouch_jax.objectives import normalise_touch, stage1_terms
 from anytouch_jax.ops.losses import normalise_patches, reconstruction_loss
 from anytouch_jax.ops.tokens import patchify, random_mask

@@ -1,7 +1,3 @@
-"""Reports: what stands in them, that they are whole, and the demo's report from a manifest and two runs."""
-
-from __future__ import annotations
-
 import contextlib
 import json
 import re
@@ -20,15 +16,7 @@ from touch_world import make_touches
 from anytouch_jax.config import from_json, to_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.report import (
-    LABELS,
-    PIXELS,
-    RANDOM,
-    VECTOR,
-    Section,
-    demo_report,
-    write_report,
-)  # fmt: skip
+from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, Section, demo_report, write_report
 from anytouch_jax.evaluate.statistics import as_text, markdown_table
 from anytouch_jax.weights import checkpoint
 
@@ -57,17 +45,8 @@ def test_the_text_of_a_user_is_shown_as_text(text: str, tmp_path: Path) -> None:
     trusting = MarkdownIt("commonmark", {"html": True}).enable("table")  # as pages of the documentation are made
     assert trusting.render(f"1. {as_text(text)}") == f"<ol>\n<li>{escapeHtml(line)}</li>\n</ol>\n"
     table = trusting.render(markdown_table((text, "b"), [(text, 1)]))
-    assert set(re.findall(r"</?([a-z!]+)", table)) <= {
-        "table",
-        "thead",
-        "tbody",
-        "tr",
-        "th",
-        "td",
-        "em",
-        "strong",
-        "code",
-    }
+    allowed = {"table", "thead", "tbody", "tr", "th", "td", "em", "strong", "code"}
+    assert set(re.findall(r"</?([a-z!]+)", table)) <= allowed
     write_report(tmp_path, [Section(text, text, markdown_table((text,), [(text,)]), notes=f"- {text}")], title=text)
     page = (tmp_path / "report.html").read_text()
     assert not re.search(r"<(script|b>|img [^>]*onerror|a [^>]*script|!--)", page) and "of another" not in page

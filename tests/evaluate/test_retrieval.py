@@ -1,7 +1,3 @@
-"""Laws of cross-sensor retrieval: what must be found, what must not, and that a contact's size gives nothing away."""
-
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 from typing import Any
@@ -210,9 +206,6 @@ def test_a_paired_difference_is_narrower_than_two_intervals() -> None:
         difference(weak, other)
 
 
-# --- manifests ---------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def touched(tmp_path_factory: Any) -> manifests.Manifest:
     """Forty touches of eight objects by three sensors, three frames each."""
@@ -268,9 +261,6 @@ def test_a_manifest_is_scored_by_pairs_and_pooled(touched: manifests.Manifest) -
     assert told[6]["top1"] == 1.0 and "found" not in told[6]
 
 
-# Matching ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def triads(tmp_path_factory: Any) -> manifests.Manifest:
     return manifests.read(make_touches(tmp_path_factory.mktemp("triads"), touches={"test": 20}, each=2))
@@ -296,9 +286,6 @@ def test_the_best_rule_of_a_code() -> None:
     assert best_rule(one[:3], 2 * one[:3], anchor[:3]) == 0.5  # nobody to learn from
 
 
-# Triples ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("negatives", NEGATIVES)
 def test_triples_are_of_one_place_and_of_two(triads: Any, rows: np.ndarray, negatives: Any) -> None:
     anchor, positive, negative = draw_triples(triads, rows, negatives, draws=4, seed=1)
@@ -311,9 +298,6 @@ def test_triples_are_of_one_place_and_of_two(triads: Any, rows: np.ndarray, nega
     again = draw_triples(triads, rows, negatives, draws=4, seed=1)
     np.testing.assert_array_equal(again, (anchor, positive, negative))
     assert not np.array_equal(draw_triples(triads, rows, negatives, draws=4, seed=2)[2], negative)
-
-
-# Scores -------------------------------------------------------------------------------------------------------------
 
 
 def scored(table: Any, rows: np.ndarray, features: np.ndarray, logits: Any) -> list[MatchScore]:

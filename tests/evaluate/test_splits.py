@@ -1,7 +1,3 @@
-"""Splits keep whole groups on one side, whatever the manifest's split."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

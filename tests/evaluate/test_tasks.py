@@ -1,7 +1,3 @@
-"""Which rows a task takes, what their labels and groups are, and what flips do to directions."""
-
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -193,8 +189,6 @@ def test_flips_are_those_of_a_mirrored_sensor(number):
         turned = scene.directions(recording._replace(unit=unit))
         assert turned == {name: mirrored(name, plain[name], across, down) for name in plain}
 
-
-# ---- a label column as a task ------------------------------------------------------------------------------
 
 COUNT = 24
 

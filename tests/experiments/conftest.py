@@ -1,7 +1,5 @@
 """A script of `experiments/` as a user runs it: exit status, standard output and standard error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

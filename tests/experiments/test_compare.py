@@ -1,18 +1,25 @@
-"""The comparison of encoders: forms of the released sizes, operations, both protocols, and the page."""
-
-from __future__ import annotations
-
 import json
+from dataclasses import replace
 
+import jax
+import numpy as np
 import pytest
 from places import EXPERIMENTS, SHARED
+from runs import run_config
+from tiny_models import full_model
 from touch_world import make_touches
 
+from anytouch_jax.config import to_json
 from anytouch_jax.errors import UserError
+from anytouch_jax.nn.functional import build
+from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.weights import checkpoint, convert, safetensors
 from anytouch_jax.weights.convert import file_shapes
 from anytouch_jax.weights.families import entries_of
 from experiments.compare import families, run
+from experiments.image_tower import image_tower_encoder
 from experiments.records import read_records
+from tests.support.release_keys import release_names
 from tests.weights.test_start import mae
 
 LISTS = SHARED / "golden_others" / "manifest_full_size.json"
@@ -68,3 +75,50 @@ def test_files_are_probed_by_both_protocols_and_the_page_is_the_users_own(encode
 
 def test_the_committed_records_have_every_family():
     assert len(read_records(EXPERIMENTS / "results" / "compare.jsonl")) >= len(families.FORMS)
+
+
+RNG = np.random.default_rng(0)
+STILLS = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
+
+
+def stored(folder, config, params):
+    saver = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=to_json(config), metadata={})
+    saver.save(1, {"trainable": params}, {"loss": 1.0})
+    saver.close()
+    return folder
+
+
+@pytest.mark.parametrize("rank", [0, 2])
+@pytest.mark.slow
+def test_a_still_gives_the_towers_own_embedding(tmp_path, rank):
+    config = run_config(tmp_path, 2, towers="pretrained" if rank else "scratch")
+    net = build(config.model)
+    params = net.init(jax.random.key(3))
+    if rank:  # LoRA as if trained: it must be merged
+        params["lora"] = jax.tree.map(lambda x: np.asarray(RNG.standard_normal(x.shape), np.float32), params["lora"])
+    encoder = image_tower_encoder(stored(tmp_path, config, params))
+    wanted = net.encode_image(params, normalise_touch(STILLS))
+    np.testing.assert_allclose(encoder.encode_touch(STILLS, "digit"), wanted, atol=2e-5)
+    for sensor in ("universal", "gelsight"):  # it knows no sensors
+        np.testing.assert_array_equal(encoder.encode_touch(STILLS, sensor), encoder.encode_touch(STILLS, "digit"))
+    assert "image tower" in encoder.source
+
+
+def test_the_tower_of_clip_weights(tmp_path):
+    model = replace(full_model(), match_head="linear")
+    params = build(model).init(jax.random.key(9))
+    full = convert.to_release(params, model)
+    keys = release_names(model, "clip")
+    file = tmp_path / "clip.safetensors"
+    safetensors.write_safetensors(file, {key: full[key] for key in keys}, {safetensors.MODEL_KEY: to_json(model)})
+    wanted = build(model).encode_image(params, normalise_touch(STILLS))
+    np.testing.assert_allclose(image_tower_encoder(file).encode_touch(STILLS), wanted, atol=2e-5)
+
+
+def test_a_run_without_an_image_tower_is_one_sentence(tmp_path):
+    config = run_config(tmp_path)
+    run = stored(tmp_path / "r", config, build(config.model).init(jax.random.key(0)))
+    with pytest.raises(UserError, match="has no image tower; give a stage-2 run"):
+        image_tower_encoder(run)
+    with pytest.raises(UserError, match="no run folder or weights file"):
+        image_tower_encoder(tmp_path / "gone")

@@ -1,7 +1,3 @@
-"""The notebooks: they run, and the committed ones have outputs and pictures."""
-
-from __future__ import annotations
-
 import nbformat
 import pytest
 from markdown_it import MarkdownIt

@@ -1,7 +1,3 @@
-"""Studies at toy sizes: what they record, and that nothing is done twice (slow)."""
-
-from __future__ import annotations
-
 import json
 
 import pytest

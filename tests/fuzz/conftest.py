@@ -1,7 +1,5 @@
 """What hostile inputs are made from: a small world, a run, weights, features and a head that are whole."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

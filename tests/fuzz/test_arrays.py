@@ -1,7 +1,3 @@
-"""Hostile .npz files that users pass on: features, heads, weights and policies."""
-
-from __future__ import annotations
-
 import io
 import json
 import shutil
@@ -30,9 +26,6 @@ def packed(arrays: Arrays, *, compress: bool = False, twice: str | None = None) 
         if twice:
             archive.filelist.append(archive.getinfo(f"{twice}.npy"))
     return stream.getvalue()
-
-
-# Each changes whole arrays and returns (name, bytes, whether no command may accept them). ----------------------------
 
 
 def dropped(rng, arrays: Arrays, needed):
@@ -122,16 +115,14 @@ def make(rng, folder: Path, things) -> Case:
     embed = ("embed", "--model", things.run, "--data", things.frames, "--out", folder / "o.npz")
     commands = {
         "features": (
-            ("info", file),
-            ("probe", "label", "--features", file, "--data", things.manifest, "--no-controls"),
+            ("info", file), ("probe", "label", "--features", file, "--data", things.manifest, "--no-controls"),
         ),
         "head": (("info", file), ("info", file), ("info", file), (*embed, "--head", file)),
         "weights": (
-            ("info", file),
-            ("export", "--to", "safetensors", "--model", file, "--out", folder / "w.safetensors"),
+            ("info", file), ("export", "--to", "safetensors", "--model", file, "--out", folder / "w.safetensors"),
         ),
         "policy": (lambda: (load_policy(folder), 0)[1],),
-    }[kind]
+    }[kind]  # fmt: skip
     at = int(rng.integers(len(commands)))
     words = commands[at]
     if kind == "features" and at == 0:

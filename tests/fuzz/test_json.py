@@ -1,7 +1,3 @@
-"""Hostile JSON, in every file of JSON that a command reads."""
-
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

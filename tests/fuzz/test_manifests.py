@@ -1,7 +1,3 @@
-"""Hostile manifests: CSV tables and Parquet files as editors, spreadsheets and faulty disks leave them."""
-
-from __future__ import annotations
-
 import csv
 import io
 import shutil
@@ -120,9 +116,6 @@ LINE_ENDS = (("\n", "\r\n"), ("\r",), ("\r\n",), ("\n", "\n\n"), ("\n", "\r", "\
 CSV = (cell, cell, cell, text, text, text, columns, long)
 
 
-# Parquet -------------------------------------------------------------------------------------------------------------
-
-
 def table(rows) -> dict[str, pa.Array]:
     arrays = {name: pa.array([row[name] or None for row in rows]) for name in rows[0]}
     arrays["frame_index"] = pa.array([int(row["frame_index"]) for row in rows])
@@ -189,16 +182,13 @@ def make(rng, folder: Path, things) -> Case:
     for picture in things.manifest.parent.glob("*.png"):
         shutil.copyfile(picture, folder / picture.name)
     commands = {
-        "info": ("info", file),
-        "verify": ("data", "verify", "--no-decode", file),
-        "decode": ("data", "verify", file),
+        "info": ("info", file), "verify": ("data", "verify", "--no-decode", file), "decode": ("data", "verify", file),
         "embed": ("embed", "--model", things.run, "--data", file, "--out", folder / "f.npz"),
         "contact": ("data", "contact", file, "--out", folder / "c.csv"),
         "pack": ("data", "pack", file, "--out", folder / "packed" / "m.parquet"),
-        "two": ("info", file, things.manifest),
-        "repair": ("data", "verify", file, "--repair", folder / "r.csv"),
+        "two": ("info", file, things.manifest), "repair": ("data", "verify", file, "--repair", folder / "r.csv"),
         "probe": ("probe", "label", "--features", things.features, "--data", file, "--no-controls"),
-    }
+    }  # fmt: skip
     command = pick(
         rng, ("info",) * 5 + ("verify",) * 4 + ("decode",) * 3 + ("embed", "contact", "pack", "two", "repair", "probe")
     )

@@ -1,7 +1,3 @@
-"""Hostile pictures and films: cut, padded, of odd kinds, with sizes that nobody has, or no pictures at all."""
-
-from __future__ import annotations
-
 import io
 from pathlib import Path
 
@@ -82,14 +78,12 @@ def make(rng, folder: Path, things) -> Case:
         file.mkdir()
         name, fine = "a folder", False
     commands = {
-        "verify": ("data", "verify", manifest),
-        "manifest": (*embed, "--data", manifest),
-        "folder": (*embed, "--data", file.parent),
-        "picture": (*embed, "--data", file),
+        "verify": ("data", "verify", manifest), "manifest": (*embed, "--data", manifest),
+        "folder": (*embed, "--data", file.parent), "picture": (*embed, "--data", file),
         "contact": ("data", "contact", manifest, "--out", folder / "c.csv"),
         "background": ("data", "contact", manifest, "--out", folder / "c.csv", "--background", file),
         "pack": ("data", "pack", manifest, "--out", folder / "packed" / "m.csv"),
-    }
+    }  # fmt: skip
     command = pick(rng, ("verify",) * 8 + ("manifest", "folder", "picture", "contact", "background", "pack"))
 
     def check(_):

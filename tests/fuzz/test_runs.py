@@ -1,7 +1,3 @@
-"""Hostile run folders: damaged records, configurations, arrays and metrics of checkpoints."""
-
-from __future__ import annotations
-
 import json
 import shutil
 import zlib

@@ -1,7 +1,3 @@
-"""A caption server with odd answers: statuses, bodies, usage, waiting times, and connections that break."""
-
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path

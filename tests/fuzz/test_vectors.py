@@ -1,7 +1,3 @@
-"""Hostile vectors: of every length that float32 holds, zero, NaN or infinite, in functions of features."""
-
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -57,11 +53,8 @@ FUNCTIONS = {
     "normalise": (lambda x, _: np.asarray(normalise(x)), lambda x: unit(x, 1e-12)),
     "unit rows": (lambda x, _: unit_rows(x), unit),
     "similarity": (lambda x, things: load(things.run).similarity(x, x), lambda x: unit(x, 1e-12) @ unit(x, 1e-12).T),
-    "search": (searched, cosines),
-    "recall": (ranked, ranks),
-    "alignment": (
-        lambda x, _: alignment(x, x[::-1]), lambda x: np.square(unit(x) - unit(x)[::-1]).sum(1).mean(),
-    ),
+    "search": (searched, cosines), "recall": (ranked, ranks),
+    "alignment": (lambda x, _: alignment(x, x[::-1]), lambda x: np.square(unit(x) - unit(x)[::-1]).sum(1).mean()),
     "uniformity": (
         lambda x, _: uniformity(x),
         lambda x: np.log(np.mean(np.exp(2 * np.minimum(cosines(x)[np.triu_indices(len(x), 1)] - 1, 0) * 2))),

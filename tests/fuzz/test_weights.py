@@ -1,7 +1,3 @@
-"""Hostile weights: pickles that flood the machine of .pth files, safetensors with wrong headers, shards, and NaN."""
-
-from __future__ import annotations
-
 import io
 import json
 import pickle
@@ -34,9 +30,6 @@ def safetensors(
     text = edit(header)
     text = (text if isinstance(text, str) else json.dumps(header)).encode("utf-8", "surrogatepass")
     return struct.pack("<Q", len(text) if length is None else length) + text + body
-
-
-# Each returns (name, bytes, ending, refused by every command, refused where weights are used). ------------------------
 
 
 def header(rng, arrays, metadata):
@@ -182,9 +175,7 @@ def raw_pickle(rng, arrays, metadata):
     return f"pickle machine: {kind}", data, "pth", True, True
 
 
-KINDS = (
-    header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, raw_pickle,
-)  # fmt: skip
+KINDS = (header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, raw_pickle)
 
 
 def make(rng, folder: Path, things) -> Case:

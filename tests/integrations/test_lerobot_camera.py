@@ -1,7 +1,5 @@
 """The camera of LeRobot: found by LeRobot's rules, oriented and subtracted pictures, features."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 import tomllib

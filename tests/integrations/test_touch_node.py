@@ -1,7 +1,5 @@
 """The ROS 2 node, run against the documented interface of rclpy (docs.ros.org, rclpy.node.Node)."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from types import ModuleType, SimpleNamespace
@@ -107,12 +105,9 @@ def test_what_every_frame_publishes_until_ros_ends(monkeypatch, tmp_path, tiny_r
     (tmp_path / "7.avi").rename("7")  # a number, as camera:=0 is for ROS
     model = measuring_weights(tmp_path / "weights.safetensors") if measures else tiny_run
     given = {
-        "model": str(model),
-        "width_mm": 10.0,
-        "sensor": "tacto" if measures else "digit",
-        "camera": 7,
+        "model": str(model), "width_mm": 10.0, "sensor": "tacto" if measures else "digit", "camera": 7,
         "background": "gel.png" if background else "",
-    }
+    }  # fmt: skip
     ros = Ros(given, frames)
     for name, module in ros.modules().items():
         monkeypatch.setitem(sys.modules, name, module)

@@ -1,7 +1,3 @@
-"""The example of a controller without ROS: lines over a Unix socket, and the imports of the ROS node."""
-
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json

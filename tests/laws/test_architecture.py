@@ -1,7 +1,5 @@
 """Architecture: who imports whom, size of modules and rooms, names, start-up imports."""
 
-from __future__ import annotations
-
 import ast
 import json
 import subprocess
@@ -243,8 +241,6 @@ def test_a_public_name_stays_callable_when_its_module_is_imported() -> None:
     with pytest.raises(TypeError, match="missing"):
         at.pretrain()
 
-
-# The repository -------------------------------------------------------------------------------------------------------
 
 TOP = {
     ".ci", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md", "docs",

@@ -1,7 +1,3 @@
-"""The targets of the Makefile: the commands that they would run, and the help."""
-
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -152,16 +148,13 @@ def test_pins_cover_the_declared_dependencies() -> None:
 NOT_RUN = {
     "setup": "CI begins with it, in a fresh clone", "test": "it is running", "test-all": "it is running",
     "demo": "it trains for minutes, and the tests above read its commands",
-    "bench": "it measures for minutes, and tests/experiments/benchmarks runs its parts",
+    "bench": "it measures for minutes, and tests/experiments/test_benchmarks.py runs its parts",
     "compare": "it measures encoders of full size, and test_compare.py runs a small one",
     "docs": "it installs packages from the network",
     "train-stage2": "the tests above read its command, which is that of train-stage1",
 }  # fmt: skip
 SMALL = " ".join(f"--{name} {value}" for name, value in SIZES.items())
-RUN = {
-    "parity": [],
-    "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"],
-}  # fmt: skip
+RUN = {"parity": [], "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"]}
 
 
 def test_every_target_of_the_pages_is_run_or_has_a_reason() -> None:

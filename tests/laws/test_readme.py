@@ -1,7 +1,4 @@
-"""What the README and the pages in docs tell a user: commands that parse, targets that are there, Python that runs."""
-
-from __future__ import annotations
-
+import ast
 import re
 import shlex
 import shutil
@@ -11,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from checked_world import columns
 from PIL import Image
 from places import ROOT
 from tiny_models import tiny_config
@@ -26,13 +24,7 @@ from anytouch_jax.nn.functional import build
 
 MAKEFILE = (ROOT / "Makefile").read_text()
 FILES = ["README.md", *(file.relative_to(ROOT).as_posix() for file in sorted((ROOT / "docs").rglob("*.md")))]
-MADE = (
-    "docs/results/",
-    "docs/tutorials/",
-    "docs/reference/",
-    "docs/contributing.md",
-    "docs/changelog.md",
-)  # by docs/generate.py
+MADE = tuple(f"docs/{name}" for name in ("results/", "tutorials/", "reference/", "contributing.md", "changelog.md"))
 PAGES = {name: (ROOT / name).read_text() for name in FILES if not name.startswith(MADE)}
 TEXT = "\n".join(PAGES.values())
 BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\n+^```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
@@ -104,8 +96,7 @@ def test_the_python_of_a_page_runs_and_prints_what_it_shows(
         arrays = (np.array(["ball", "cube"]), np.ones((width, 1)), np.zeros(1), np.zeros(width), np.ones(width))
         save_head("head.npz", LinearHead(*arrays, "object", "class", 1, "f", known))
         Image.fromarray(np.full((60, 80, 3), 90, np.uint8)).save("a.png")
-        row = {"path": ["a.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"]}
-        names["manifest"] = from_columns(row, tmp_path / "m.parquet")
+        names["manifest"] = from_columns(columns(path=["a.png"]), tmp_path / "m.parquet")
     for code, shown in BLOCK.findall(PAGES[name]):
         capsys.readouterr()
         if "runs/" in code:  # test_pages_run.py trains that run
@@ -125,3 +116,19 @@ def test_links_lead_somewhere(name: str) -> None:
         assert result.is_file(), target
         titles = re.findall(r"^#+ (.*)$", result.read_text(), re.MULTILINE) if heading else []
         assert not heading or heading in [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
+
+
+STOP = re.compile(r"^\*\*(\d)\. `([\w/]+\.py)`\*\*(.*)$", re.MULTILINE)
+ELSEWHERE = {"Config", "fit", "stride", "TouchBatch"}  # named on the way, defined at another stop
+
+
+@pytest.mark.parametrize(("page", "count"), [("way_of_a_clip", 9), ("way_of_a_touch", 7)])
+def test_the_stops_exist_in_order_and_hold_what_the_page_names(page: str, count: int) -> None:
+    stops = STOP.findall((ROOT / "docs" / "how" / f"{page}.md").read_text())
+    assert [int(number) for number, _, _ in stops] == list(range(1, count + 1))
+    for _, name, text in stops:
+        tree = ast.parse((ROOT / "src" / "anytouch_jax" / name).read_text())
+        defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        named = {word.rpartition(".")[2] for word in re.findall(r"`(\w+\.?\w+)`", text)}
+        assert named - ELSEWHERE <= defined, (name, named - ELSEWHERE - defined)
+        assert named & defined, name

@@ -1,7 +1,5 @@
 """The wheel: everything of `src` is in it, and it works where no checkout is."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,5 +1,3 @@
-"""Attention mapped over groups of heads is attention: values, gradients, hard cases, in every width."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,3 @@
-"""CLIP's towers: causality, padding, the pooled token, LoRA."""
-
 from dataclasses import replace
 
 import jax

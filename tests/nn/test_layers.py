@@ -1,5 +1,3 @@
-"""Layers against plain formulas, and the scanned stack against the loop."""
-
 import math
 import re
 from dataclasses import replace
@@ -11,6 +9,7 @@ import pytest
 from flax import nnx
 from tiny_models import STACK, compiled, full_model, touch_model
 
+from anytouch_jax.nn.fields import windows
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.layers import gelu, read_blocks, run_blocks, stacked_blocks, stored
 
@@ -147,3 +146,25 @@ def test_rematerialised_stacks_give_the_same_gradient_from_work_done_again(metho
     assert many - few >= 2 * (2 if method == "reconstruct" else 1)  # of each stack, of encoder and decoder
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), remat, plain)
     assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(plain)) > 0.01
+
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(("side", "stride"), [(3, 1), (3, 2), (5, 2)])
+@pytest.mark.parametrize(("height", "width"), [(7, 7), (8, 5), (1, 2)])
+def test_a_product_with_windows_is_a_convolution(side, stride, height, width):
+    x = RNG.standard_normal((2, height, width, 3)).astype("f4")
+    kernel = RNG.standard_normal((side * side * 3, 4)).astype("f4")
+
+    @jax.jit
+    def run(x, kernel):
+        around = [(side // 2, side // 2)] * 2
+        wanted = jax.lax.conv_general_dilated(
+            x, kernel.reshape(side, side, 3, 4), (stride, stride), around, dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+        return windows(x, side, stride) @ kernel, wanted
+
+    result, wanted = run(x, kernel)
+    assert wanted.shape == (2, -(-height // stride), -(-width // stride), 4)
+    np.testing.assert_allclose(result, wanted, atol=1e-5)

@@ -1,5 +1,3 @@
-"""Products of 16 bits on a CPU: rounded operands, sums in float32, and the one form that XLA computes fast."""
-
 import functools
 import itertools
 

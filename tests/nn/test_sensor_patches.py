@@ -1,7 +1,3 @@
-"""Patch encoders of the sensors' own (T3): who learns from whom, and what a sensor never seen is served by."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -65,10 +61,7 @@ def test_a_row_outside_the_table_is_nan_not_the_last_sensor():
         assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
 
 
-@pytest.mark.parametrize(
-    "model",
-    [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)],
-)
+@pytest.mark.parametrize("model", [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)])
 def test_the_shapes_written_down_are_those_of_the_network(model):
     wanted = {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
     assert {name: tuple(shape) for name, shape in param_shapes(model).items()} == wanted
@@ -77,9 +70,6 @@ def test_the_shapes_written_down_are_those_of_the_network(model):
 def test_the_authors_files_have_no_place_for_several_patch_encoders():
     with pytest.raises(WeightsError, match="one patch projection for all sensors"):
         to_release(parameters(OWN), OWN)
-
-
-# Sensors that training never saw -------------------------------------------------------------------------------------
 
 
 def touch(model):

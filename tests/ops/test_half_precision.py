@@ -1,18 +1,9 @@
-"""The losses of bfloat16 inputs: computed in float32, so as near to float64 as float32 is, gradients included."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from anytouch_jax.ops.losses import (
-    alignment_loss,
-    centered,
-    matching_loss,
-    normalise,
-    normalise_patches,
-    reconstruction_loss,
-)
+from anytouch_jax.ops import losses
 
 RNG = np.random.default_rng(0)
 HIDDEN = np.array([[1, 0, 1, 1], [0, 1, 1, 1]], bool)
@@ -21,11 +12,11 @@ WEIGHTS = (0.5, 0.25, 0.1)
 
 
 def reconstruct(pred, target):
-    return reconstruction_loss(pred, target, HIDDEN, next_frame=True)[0]
+    return losses.reconstruction_loss(pred, target, HIDDEN, next_frame=True)[0]
 
 
 def align(has_image, has_text, center=False):
-    return lambda *z: alignment_loss(*z, has_image, has_text, jnp.float32(14.0), WEIGHTS, center=center)[0]
+    return lambda *z: losses.alignment_loss(*z, has_image, has_text, jnp.float32(14.0), WEIGHTS, center=center)[0]
 
 
 def draw(*shape):
@@ -49,13 +40,13 @@ def unit(*shape):
 
 CASES = {
     "reconstruction": (reconstruct, [draw(2, 4, 3, 12), draw(2, 4, 3, 12)]),
-    "normalised patches, one constant": (normalise_patches, [constant(draw(2, 3, 2, 12))]),
-    "normalised vectors, one zero": (normalise, [zero(draw(4, 6))]),
-    "matching": (matching_loss, [np.array([1e4, -1e4, 0.3]), np.array([-1e4, 1e4, 0.7])]),
+    "normalised patches, one constant": (losses.normalise_patches, [constant(draw(2, 3, 2, 12))]),
+    "normalised vectors, one zero": (losses.normalise, [zero(draw(4, 6))]),
+    "matching": (losses.matching_loss, [np.array([1e4, -1e4, 0.3]), np.array([-1e4, 1e4, 0.7])]),
     "alignment": (align(SOME, np.arange(8) < 6), [unit(8, 16) for _ in range(3)]),
     "alignment, centered": (align(SOME, np.arange(8) < 6, center=True), [unit(8, 16) for _ in range(3)]),
     "alignment of disjoint sets": (align(SOME, OTHERS), [unit(8, 16) for _ in range(3)]),
-    "centered": (lambda x: centered(x, SOME), [draw(8, 16)]),
+    "centered": (lambda x: losses.centered(x, SOME), [draw(8, 16)]),
 }
 
 

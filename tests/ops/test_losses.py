@@ -1,7 +1,3 @@
-"""The losses against loops, the hard cases they must survive, and centred alignment."""
-
-from __future__ import annotations
-
 from functools import partial
 
 import jax
@@ -181,9 +177,6 @@ def test_matching_loss_is_stable_at_huge_logits():
         np.testing.assert_allclose(right, 2 * np.log1p(np.exp(-size)), rtol=1e-5, atol=1e-12)
         np.testing.assert_allclose(wrong - right, 2 * size, rtol=1e-4)
         assert np.isfinite(grad).all()
-
-
-# Centred alignment ----------------------------------------------------------------------------------------------------
 
 
 B, E, WEIGHTS = 6, 5, (0.5, 0.25, 0.1)

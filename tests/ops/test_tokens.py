@@ -1,7 +1,3 @@
-"""Patches, positions, segments, and random masking: each sample by its own noise, and the way back."""
-
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest
@@ -48,9 +44,6 @@ def test_segments_cover_every_frame_and_end_with_the_last(total, starts):
     assert cut.shape == (1, len(starts), 3, 1)
     assert cut[0, :, 0, 0].tolist() == starts
     assert set(cut.ravel().tolist()) == set(range(total))
-
-
-# Masking --------------------------------------------------------------------------------------------------------------
 
 
 random_mask = jax.jit(tokens.random_mask, static_argnums=1)

@@ -4,8 +4,6 @@ One runner a kind of case, found by the letter its name starts with. Nothing is 
 come from `objectives`, gradients from `jax.grad` of them, optimiser steps from `train.step`, weights from `io.release`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -133,15 +131,10 @@ def _optimizer(case: Case) -> None:
     args, epochs = case.info["args"], case.info["epoch_fraction"]
     per_epoch = int(np.lcm.reduce([Fraction(t).limit_denominator(1000).denominator for t in epochs]))
     optim = replace(
-        config.optim,
-        learning_rate=args["lr"],
-        min_rate=args["min_lr"],
-        warmup=args["warmup_epochs"] * per_epoch,
-        beta1=case.info["optimizer"]["betas"][0],
-        beta2=case.info["optimizer"]["betas"][1],
-        eps=case.info["optimizer"]["eps"],
-        weight_decay=case.info["optimizer"]["weight_decay"],
-    )
+        config.optim, learning_rate=args["lr"], min_rate=args["min_lr"], warmup=args["warmup_epochs"] * per_epoch,
+        beta1=case.info["optimizer"]["betas"][0], beta2=case.info["optimizer"]["betas"][1],
+        eps=case.info["optimizer"]["eps"], weight_decay=case.info["optimizer"]["weight_decay"],
+    )  # fmt: skip
     config = replace(config, optim=optim, run=replace(config.run, steps=args["epochs"] * per_epoch))
 
     def loss(p: Params, batch: Any, key: Any, progress: Any) -> Any:
@@ -239,11 +232,9 @@ def _clip(case: Case) -> None:
     }
     ids = {name: np.asarray(case.inputs(f"input_ids_{name}")) for name in ("pad_eot", "pad_zero")}
     texts = {
-        "pad_eot": (ids["pad_eot"], masks["attention_mask"]),
-        "pad_zero": (ids["pad_zero"], masks["attention_mask"]),
-        "hole": (ids["pad_eot"], masks["attention_mask_with_hole"]),
-        "nomask": (ids["pad_eot"], None),
-    }
+        "pad_eot": (ids["pad_eot"], masks["attention_mask"]), "pad_zero": (ids["pad_zero"], masks["attention_mask"]),
+        "hole": (ids["pad_eot"], masks["attention_mask_with_hole"]), "nomask": (ids["pad_eot"], None),
+    }  # fmt: skip
     for sub, clip in case.info["subcases"].items():
         info = {**case.info, "clip_config": {**case.info["clip_config"], **clip}}
         config = golden_config(info, stage=2)

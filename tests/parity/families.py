@@ -1,7 +1,5 @@
 """Encoders of other families against outputs of their authors' code: from raw frames, through the public interface."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -136,15 +134,13 @@ def _outputs(encoder: FamilyEncoder, clips: np.ndarray, sensor: Any) -> dict[str
     last = 0 if form.grid is None else form.grid[1] * form.grid[2]
     return {
         **dict.fromkeys(("tokens", "latent", "last_hidden_state"), tokens),
-        **dict.fromkeys(("mean_patch", "feature_mean_patch", "mean_patch_normed"), mean),
-        "feature_contrastive": own,
+        **dict.fromkeys(("mean_patch", "feature_mean_patch", "mean_patch_normed"), mean), "feature_contrastive": own,
         "feature_cls": (lambda: network().normed[:, 0]) if encoder.family.name == "sitr" else own,
-        "registers": lambda: network().normed[:, form.class_token : start],
-        "encoder_tokens": lambda: network().encoded,
+        "registers": lambda: network().normed[:, form.class_token : start], "encoder_tokens": lambda: network().encoded,
         "projected_tokens": lambda: network().projected,
         "feature_global_pooling": lambda: network().hidden[:, start:].mean(axis=1),
         "feature_last": lambda: network().hidden[:, -last:].mean(axis=1),
-    }
+    }  # fmt: skip
 
 
 def preprocess(case: Case) -> None:

@@ -3,8 +3,6 @@
 A case is `<name>.json` and `<name>.npz`: arrays in/..., out/..., grad/..., final/... and what they mean.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 import zlib
@@ -134,40 +132,25 @@ def golden_config(info: dict[str, Any], *, stage: int, sensors: int = 10) -> Con
     text_stack = Stack(size["th"], size["tl"], size["theads"], size["tmlp"])
     end = clip["text_eos_token_id"]
     model = ModelConfig(
-        image_size=size["image"],
-        patch=size["patch"],
-        embed=size["proj"],
-        touch=tower,
-        decoder=Stack(size["dh"], size["dl"], size["dheads"], size["dmlp"]),
-        image=tower if stage == 2 else None,
+        image_size=size["image"], patch=size["patch"], embed=size["proj"], touch=tower,
+        decoder=Stack(size["dh"], size["dl"], size["dheads"], size["dmlp"]), image=tower if stage == 2 else None,
         text=TextTower(text_stack, size["vocab"], size["maxpos"], None if end == 2 else end) if stage == 2 else None,
-        sensors=_sensor_names(sensors),
-        activation=clip["hidden_act"],
-        norm_eps=clip["layer_norm_eps"],
+        sensors=_sensor_names(sensors), activation=clip["hidden_act"], norm_eps=clip["layer_norm_eps"],
         decoder_norm_eps=info.get("decoder_config", {}).get("layer_norm_eps", 1e-12),
         decoder_sensor_tokens=args.get("new_decoder_sensor_token", False),
         match_head="linear" if stage == 2 else "none",
         lora_rank=args.get("lora_r", size["lora_r"]) if stage == 2 else 0,
         lora_alpha=args.get("lora_alpha", size["lora_alpha"]),
-    )
+    )  # fmt: skip
     objective = LossConfig(
-        mask_ratio=args.get("mask_ratio", 0.75),
-        norm_pix_loss=args.get("norm_pix_loss", False),
-        alpha_tv=args.get("alpha_vt", 1.0),
-        alpha_tl=args.get("alpha_lt", 1.0),
-        alpha_vl=args.get("alpha_vl", 0.2),
+        mask_ratio=args.get("mask_ratio", 0.75), norm_pix_loss=args.get("norm_pix_loss", False),
+        alpha_tv=args.get("alpha_vt", 1.0), alpha_tl=args.get("alpha_lt", 1.0), alpha_vl=args.get("alpha_vl", 0.2),
         match_weight=args.get("cross_alpha", 0.1),
-    )
+    )  # fmt: skip
     return Config(
-        model,
-        stage=2 if stage == 2 else 1,
-        recipe="release",
-        towers="pretrained" if stage == 2 else "none",
-        objective=objective,
-        optim=OptimConfig(decay="cosine"),
-        data=DataConfig(),
-        run=RunConfig(),
-    )
+        model, stage=2 if stage == 2 else 1, recipe="release", towers="pretrained" if stage == 2 else "none",
+        objective=objective, optim=OptimConfig(decay="cosine"), data=DataConfig(), run=RunConfig(),
+    )  # fmt: skip
 
 
 def _sensor_names(rows: int) -> tuple[str, ...]:

@@ -1,7 +1,5 @@
 """Golden cases of the two losses: outputs, gradients and which parameters have none, through `objectives`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -69,14 +67,7 @@ def dead_keys(config: Config) -> set[str]:
 
 
 def _compare_gradients(
-    case: Case,
-    value: Value,
-    params: Params,
-    inputs: Any,
-    exact: Any,
-    net: Net,
-    config: Config,
-    prefix: str = "grad",
+    case: Case, value: Value, params: Params, inputs: Any, exact: Any, net: Net, config: Config, prefix: str = "grad"
 ) -> None:
     """Values, presence (golden Q7) and norms of all gradients."""
     grads = _gradients(value, params, inputs, exact, net, config)

@@ -1,7 +1,5 @@
 """`anytouch parity`: this implementation against golden vectors."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -71,9 +71,6 @@ def test_the_program_that_users_run_is_within_tolerance(tmp_path):
 
 def test_every_case_of_the_folder_is_run():
     assert set(CASES) == set(COMPARISONS)
-
-
-def test_where_all_cases_lie_the_list_of_them_is_not_empty():
     if ALL.is_dir():
         assert set(WHOLE) > set(COMPARISONS)
         assert {path.name.split("_")[0] for path in SAVED} == {"stage1", "stage2"}
@@ -122,19 +119,18 @@ def test_what_cannot_be_compared_is_reported(tmp_path, case, changes, lists, not
     assert note in bad(folder)[next(iter(changes))].note
 
 
-def test_unknown_and_broken_cases_are_failures_not_tracebacks(tmp_path):
-    (tmp_path / "Z_new.json").write_text("{}")
-    (tmp_path / "A_broken.json").write_text("{}")
-    rows = cases.run(tmp_path)
-    assert [row.case for row in rows if not row.good] == ["A_broken", "Z_new"]
-    assert all("understand" in row.note or "understood" in row.note for row in rows)
-
-
-def test_a_case_in_which_nothing_is_compared_has_failed(tmp_path):
-    (tmp_path / "I_pos.json").write_text("{}")
+def test_unknown_broken_and_empty_cases_are_failures_not_tracebacks(tmp_path):
+    with pytest.raises(UserError, match="no golden case"):
+        cases.run(tmp_path)
+    for name in ("Z_new", "A_broken", "I_pos"):
+        (tmp_path / f"{name}.json").write_text("{}")
     np.savez(tmp_path / "I_pos.npz", unknown=np.zeros(3))
-    (row,) = cases.run(tmp_path)
-    assert not row.good and row.note == "nothing was compared"
+    rows = [row for row in cases.run(tmp_path) if not row.good]
+    assert [row.case for row in rows] == ["A_broken", "I_pos", "Z_new"] and rows[1].note == "nothing was compared"
+    assert all("understand" in row.note or "understood" in row.note for row in rows[::2])
+    (tmp_path / "A_x.json").write_text("{")
+    with pytest.raises(UserError, match=r"A_x\.json is not JSON"):
+        cases.run(tmp_path)
 
 
 def test_a_broken_checkpoint_is_a_failed_case(tmp_path):
@@ -159,14 +155,6 @@ def test_checkpoints_that_do_not_fit_their_parameters_are_failed_cases(tmp_path,
     result = [row for row in cases.run(folder) if not row.good]
     assert {row.case for row in result} == {"stage1_params", "stage1_tiny.pth"}
     assert all("cannot read the golden arrays" in row.note for row in result)
-
-
-def test_a_folder_without_cases_is_one_sentence(tmp_path):
-    with pytest.raises(UserError, match="no golden case"):
-        cases.run(tmp_path)
-    (tmp_path / "A_x.json").write_text("{")
-    with pytest.raises(UserError, match=r"A_x\.json is not JSON"):
-        cases.run(tmp_path)
 
 
 def test_tolerances_are_the_larger_of_relative_and_five_times_the_noise():

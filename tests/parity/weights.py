@@ -1,7 +1,5 @@
 """Golden cases of weights: full-size keys, shapes and decay groups, what is loaded from where, stored parameters."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -21,11 +19,9 @@ STAGE1 = preset("large", recipe="release")
 STAGE2 = preset("large", stage=2, recipe="release", towers="pretrained")
 # entry of K_manifest -> the layout of that file and the preset that it is a file of
 _FULL_SIZE: dict[str, tuple[str, Config]] = {
-    "stage1": ("stage1", STAGE1),
-    "stage2": ("stage2", STAGE2),
-    "probe_material": ("probe", STAGE1),
+    "stage1": ("stage1", STAGE1), "stage2": ("stage2", STAGE2), "probe_material": ("probe", STAGE1),
     "hf_clip_vit_l_14": ("clip", STAGE2),
-}
+}  # fmt: skip
 _FRESH = "kept at its fresh initial value"
 
 

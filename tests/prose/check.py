@@ -5,8 +5,6 @@ words. Some phrases are not used anywhere. The README has at most 700 words. Cod
 are not prose.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re
@@ -17,13 +15,8 @@ from typing import NamedTuple
 
 WORDS, NUMBERS, CELL, README_WORDS = 30, 3, 25, 700
 PAGES = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "experiments/**/*.md")
-MADE = (
-    "docs/results/",
-    "docs/tutorials/",
-    "docs/reference/",
-    "docs/contributing.md",
-    "docs/changelog.md",
-)  # copies, and help texts
+# Copies, and help texts.
+MADE = tuple(f"docs/{name}" for name in ("results/", "tutorials/", "reference/", "contributing.md", "changelog.md"))
 CODE = ("src/**/*.py",)
 NOTEBOOKS = ("experiments/notebooks/*.ipynb",)
 PHRASES = (

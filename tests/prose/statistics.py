@@ -3,8 +3,6 @@
 A limit holds over all pages together. That on headings holds on each page. Tables, code and headings are not prose.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Mapping, Sequence

@@ -1,13 +1,13 @@
 """The prose rules find what they name, and pass what is fine."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from tests.prose import check
+from tests.prose.statistics import longest_without_heading, main, pages, statistics
 
 PAGE, README = Path("docs/page.md"), Path("README.md")
 LONG = " ".join(["word"] * 31) + "."
@@ -77,3 +77,28 @@ def test_the_exit_status_says_whether_there_are_faults(tmp_path, capsys):
     (tmp_path / "README.md").write_text("Not fine; here.\n")
     assert check.main([str(tmp_path)]) == 1
     assert capsys.readouterr().out.startswith("README.md:1: a semicolon")
+
+
+def values(text: str) -> list[float]:
+    return [one.value for one in statistics({"page.md": text})]
+
+
+def test_every_number_is_what_it_counts():
+    text = "# Nine words of a heading that is no prose\n\nYou see two words. We have 3 eggs.\n\n| 1 | 2 |\n"
+    assert values(text) == [4, 4, 100 / 8, 200 / 8, 8]
+    assert [one.holds for one in statistics({"page.md": text})] == [True, True, False, True, True]
+
+
+def test_words_are_counted_from_heading_to_heading():
+    assert longest_without_heading("a b c\n\n## d\n\ne f\n\n| x y z z z z |\n\ng\n") == 3
+    assert longest_without_heading("a b\n\n" * 70) == 140
+
+
+def test_long_sentences_and_missing_readers_break_the_limits():
+    text = " ".join(["word"] * 26) + ".\n"
+    assert [one.holds for one in statistics({"page.md": text})] == [False, False, True, False, True]
+
+
+def test_the_pages_keep_the_limits(capsys):
+    assert len(pages(ROOT)) > 15
+    assert main([str(ROOT)]) == 0, capsys.readouterr().out

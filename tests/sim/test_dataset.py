@@ -1,5 +1,3 @@
-"""A data set on disk: the same bytes for a seed, whole or not there, going on after an interruption."""
-
 import errno
 import fcntl
 import json

@@ -1,5 +1,3 @@
-"""Touches as a pure function of a key: the distributions of data sets, the program of data sets, held-out objects."""
-
 from dataclasses import replace
 from functools import partial
 
@@ -39,11 +37,7 @@ def gesture(rng):
 
 @pytest.mark.parametrize(
     ("draw", "most"),
-    [
-        (partial(draw_unit, SENSORS["gelsight_mini"]), 2048),
-        (gesture, 128),
-        (partial(draw_drift, 3), 128),
-    ],
+    [(partial(draw_unit, SENSORS["gelsight_mini"]), 2048), (gesture, 128), (partial(draw_drift, 3), 128)],
     ids=["unit", "gesture", "drift"],
 )
 def test_both_kinds_of_draws_have_one_distribution(draw, most):

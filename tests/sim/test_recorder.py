@@ -1,5 +1,3 @@
-"""A recording computed: the surface under the gel, its motion, labels that agree with physics, only what is asked."""
-
 from dataclasses import replace
 from functools import partial
 
@@ -30,17 +28,11 @@ BUMPY = sum(
 def clip(**change):
     unit = identity_unit(DIGIT)
     values = {
-        "relief": BUMPY * 0.1,
-        "place": np.zeros(2, np.float32),
-        "start": np.zeros(3, np.float32),
-        "motion": np.zeros((2, 3), np.float32),
-        "depth": np.full(2, 0.5, np.float32),
-        "tilt": np.zeros(2, np.float32),
-        "modulus": np.float32(1e5),
-        "friction": np.float32(0.6),
-        "unit": unit._replace(**change.pop("unit", {})),
+        "relief": BUMPY * 0.1, "place": np.zeros(2, np.float32), "start": np.zeros(3, np.float32),
+        "motion": np.zeros((2, 3), np.float32), "depth": np.full(2, 0.5, np.float32), "tilt": np.zeros(2, np.float32),
+        "modulus": np.float32(1e5), "friction": np.float32(0.6), "unit": unit._replace(**change.pop("unit", {})),
         "seed": np.uint32(1),
-    }
+    }  # fmt: skip
     values |= change
     return ClipInput(**values, drift=np.zeros((len(values["depth"]), 3, 3), np.float32))
 
@@ -180,11 +172,9 @@ def test_an_object_that_turns_about_itself_does_not_slide():
     motion[:, 2] = np.linspace(0, 0.2, 5)
     round_ = -(AXIS[:, None] ** 2 + AXIS[None, :] ** 2) / 16
     turning = clip(
-        relief=round_.astype(np.float32),
-        unit={"offset": np.array([0.6, 0.6], np.float32)},
-        motion=motion,
+        relief=round_.astype(np.float32), unit={"offset": np.array([0.6, 0.6], np.float32)}, motion=motion,
         depth=np.full(5, 0.6, np.float32),
-    )
+    )  # fmt: skip
     simulate = partial(record.simulate_clip, sensor=DIGIT, fidelity="fast", size=48, fields=("shear",))
     take = jax.jit(simulate)(turning)
     shear = np.asarray(take.field[-1])

@@ -1,5 +1,3 @@
-"""Drawn scenes: seeds, splits, grades and motions. Nothing is simulated here."""
-
 import math
 from dataclasses import replace
 
@@ -22,23 +20,18 @@ def recordings(scenes, number=0):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"sensors": ("digit", "nose")}, "no simulated sensor 'nose'"),
-        ({"sensors": ()}, "at least one"),
+        ({"sensors": ("digit", "nose")}, "no simulated sensor 'nose'"), ({"sensors": ()}, "at least one"),
         ({"sensors": ("digit", "digit")}, "once"),
         ({"depth": (-0.1, 0.5)}, "depth is a range of mm from 0 on, lowest first, not -0.1 to 0.5"),
-        ({"depth": (0.5, 0.1)}, "lowest first"),
-        ({"fields": ("heat",)}, "no simulated field 'heat'"),
-        ({"touches": 0}, "touches must be 1 or more"),
-        ({"vision": 1.5}, "vision must be"),
-        ({"grade": "rough"}, "grade must be"),
-        ({"units": "two"}, "units must be"),
+        ({"depth": (0.5, 0.1)}, "lowest first"), ({"fields": ("heat",)}, "no simulated field 'heat'"),
+        ({"touches": 0}, "touches must be 1 or more"), ({"vision": 1.5}, "vision must be"),
+        ({"grade": "rough"}, "grade must be"), ({"units": "two"}, "units must be"),
         ({"seed": -1}, "seed must be 0 or more, not -1"),
         ({"depth": (0.5, 3.0)}, "depth 3 mm may go through the gel of"),
-        ({"fields": ("shear", "shear")}, "each field once"),
-        ({"held_out": -0.3}, "held_out must be"),
+        ({"fields": ("shear", "shear")}, "each field once"), ({"held_out": -0.3}, "held_out must be"),
         ({"first": -1}, "first must be 0 or more, not -1"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_simulated_is_refused(change, sentence):
     with pytest.raises(UserError, match=sentence):
         replace(SCENES, **change)
@@ -109,16 +102,9 @@ def gesture(motion, slide=(0.0, 0.0), twist=0.0, shown=1.0, middle=0.5, lift=-1.
     """A gesture whose phases lift 10 %, press 20 %, pause 10 %, move 30 %, pause 10 %, release 10 % and lift 10 %."""
     phases = np.array([1, 2, 1, 3, 1, 1, 1]) / 10
     return Gesture(
-        0.8,
-        scene.MOTIONS.index(motion),
-        np.asarray(slide),
-        twist,
-        phases,
-        shown,
-        middle,
-        lift,
+        0.8, scene.MOTIONS.index(motion), np.asarray(slide), twist, phases, shown, middle, lift,
         np.array([1.0, 0.0, 0.1]),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("motion", ["hold", "slide", "twist"])

@@ -1,7 +1,5 @@
 """What Adam remembers of each parameter, out of the packed state of the optimiser."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax

@@ -1,7 +1,5 @@
 """Batches as flat lists of arrays, to compare them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recordings without physics, for tests of what is done with recordings."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anytouch_jax.sim.recorder import ClipOutput

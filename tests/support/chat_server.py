@@ -1,7 +1,5 @@
 """A chat endpoint on this machine: tests decide what it answers, and read what it was sent."""
 
-from __future__ import annotations
-
 import json
 import threading
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Small manifests for checks and repairs."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
@@ -29,6 +27,13 @@ def with_patterns(make):
         return manifest
 
     return build
+
+
+def columns(count=1, **more):
+    """The columns that every manifest has, of `count` frames of one sequence, and `more`."""
+    names = [f"{i}.png" for i in range(count)]
+    usual = {"path": names, "sensor": ["digit"] * count, "sequence": ["s"] * count, "frame_index": list(range(count))}
+    return usual | {"split": ["train"] * count} | more
 
 
 def plain_rows(count=6, **extra):

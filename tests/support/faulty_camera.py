@@ -1,8 +1,7 @@
 """A stand-in for cv2.VideoCapture that fails at one frame, as real tactile sensors do, and a video with odd times."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -45,6 +44,26 @@ class FaultyCamera:
 
     def release(self) -> None:
         self.released = True
+
+
+class Film:
+    """A video of given frames BGR u8 (n, h, w, 3), without the errors of a codec."""
+
+    def __init__(self, frames: Iterable[np.ndarray]) -> None:
+        self.frames = iter(frames)
+
+    def grab(self) -> bool:
+        self.frame = next(self.frames, None)
+        return self.frame is not None
+
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        return True, self.frame
+
+    def get(self, name: int) -> float:
+        return 0.0
+
+    def release(self) -> None:
+        pass
 
 
 def write_uneven_video(path: Path, milliseconds: list[int]) -> Path:

@@ -1,7 +1,5 @@
 """Films on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures of a gel, untouched or pressed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

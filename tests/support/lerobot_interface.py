@@ -3,8 +3,6 @@
 Source: github.com/huggingface/lerobot, `cameras/camera.py`, `cameras/configs.py`, `utils/import_utils.py`.
 """
 
-from __future__ import annotations
-
 import abc
 import sys
 from dataclasses import dataclass
@@ -104,12 +102,10 @@ class FilmCamera(Camera):
 def modules() -> dict[str, ModuleType]:
     """The modules of LeRobot that a camera plugin imports."""
     content = {
-        "lerobot": {},
-        "lerobot.cameras": {},
-        "lerobot.cameras.camera": {"Camera": Camera},
+        "lerobot": {}, "lerobot.cameras": {}, "lerobot.cameras.camera": {"Camera": Camera},
         "lerobot.cameras.configs": {"CameraConfig": CameraConfig},
         "lerobot.cameras.opencv": {"OpenCVCamera": FilmCamera, "OpenCVCameraConfig": OpenCVCameraConfig},
-    }
+    }  # fmt: skip
     made = {name: ModuleType(name) for name in content}
     for name, names in content.items():
         vars(made[name]).update(names)

@@ -1,7 +1,5 @@
 """Weights that measure: a tiny network with random parameters."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fine-aligned pairs on disk: a disc pressed at a place, as two cameras of other colours and a field sensor feel it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Films of a gel that is pressed for a share of the time, in three looks: lit in colours, darkening, and with dots."""
 
-from __future__ import annotations
-
 import numpy as np
 
 SHAPE = 120, 160

@@ -4,8 +4,6 @@ An operation of jax outside `jax.jit` is a program for each new shape, some 30 m
 with numpy, and call what it tests through one `jax.jit` with inputs of one shape.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 
 import jax

@@ -1,7 +1,5 @@
 """Datasets of tiny pictures, laid out like the originals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

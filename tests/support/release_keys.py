@@ -1,7 +1,5 @@
 """Keys of the authors' files and of CLIP's, as the key maps give them."""
 
-from __future__ import annotations
-
 from anytouch_jax.config import ModelConfig
 from anytouch_jax.weights.convert import KEYMAPS, detect_form, file_shapes, refuse_unknown
 from anytouch_jax.weights.keymaps import Heads, KeyMap, Shape, Weights, param_shapes

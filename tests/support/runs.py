@@ -1,7 +1,5 @@
 """A small world on disk (two sensors at the same places, one photograph, a few captions) and runs trained on it."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A script of `experiments/` run in this process, as a user runs it."""
 
-from __future__ import annotations
-
 import runpy
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Records of the matrix with made-up numbers: what the tables and pictures read."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Manifests without pictures for probing tasks, and features like those of a network."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +15,9 @@ SLIDES = ("none", "right", "down", "left", "up")
 
 
 def simulated(
-    *,
-    objects: int = 24,
-    each: int = 2,
-    sensors: tuple[str, ...] = ("digit", "duragel"),
-    frames: int = 5,
-    seed: int = 0,
-    shared: bool = False,
-) -> Manifest:
+    *, objects: int = 24, each: int = 2, sensors: tuple[str, ...] = ("digit", "duragel"), frames: int = 5,
+    seed: int = 0, shared: bool = False,
+) -> Manifest:  # fmt: skip
     """Recordings as the simulator's: deepest in frame 2, slipping most in frame 3; the last quarter of objects is test.
 
     `shared`: every object is in all splits instead.

@@ -1,7 +1,5 @@
 """The smallest models that have every part, for the tests of all rooms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """A world on disk where several sensors feel the same places: each touch has its texture, place and force."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +12,9 @@ SENSORS = ("digit", "gelsight", "gelslim")
 
 
 def make_touches(
-    folder: Path,
-    *,
-    touches: dict[str, int],
-    sensors: tuple[str, ...] = SENSORS,
-    frames: int = 1,
-    size: int = 32,
-    each: int = 5,
-    seed: int = 0,
-) -> Path:
+    folder: Path, *, touches: dict[str, int], sensors: tuple[str, ...] = SENSORS, frames: int = 1, size: int = 32,
+    each: int = 5, seed: int = 0,
+) -> Path:  # fmt: skip
     """A manifest of `touches` {split: number}, `each` of an object, half of them fine and half coarse.
 
     A frame shows the texture of its touch within a disc at (x, y), as deep as its force, over its sensor's tint.
@@ -68,13 +60,11 @@ def row(
 ) -> dict[str, Any]:
     name = f"{split} thing {thing}"
     return {
-        "path": path, "sensor": sensor, "sequence": f"{split}/{number}/{sensor}", "frame_index": frame,
-        "split": split, "unit": f"{split} unit", "touch": f"{split}/{number}", "object": name,
-        "image_path": "photo.png" if number % 2 else None,
-        "text": f"{name} | feels coarse" if number % 3 else None,
-        "background_path": f"{sensor}.png",
-        "grade": "fine" if number % 2 else "coarse",
+        "path": path, "sensor": sensor, "sequence": f"{split}/{number}/{sensor}", "frame_index": frame, "split": split,
+        "unit": f"{split} unit", "touch": f"{split}/{number}", "object": name,
+        "image_path": "photo.png" if number % 2 else None, "text": f"{name} | feels coarse" if number % 3 else None,
+        "background_path": f"{sensor}.png", "grade": "fine" if number % 2 else "coarse",
         "label.hardness": ("soft", "hard")[thing % 2], "label.indenter": ("ball", "cube", "ring")[thing % 3],
-        "label.force": force, "label.depth": force / 5, "label.area": 3.1 * force,
-        "label.x": place[0], "label.y": place[1],
+        "label.force": force, "label.depth": force / 5, "label.area": 3.1 * force, "label.x": place[0],
+        "label.y": place[1],
     }  # fmt: skip

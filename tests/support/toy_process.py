@@ -1,7 +1,5 @@
 """One of several processes that train the toy problem together: a script for the tests, and how they start it."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -51,21 +49,12 @@ def start(run_dir: Path, count: int = 2, *, devices: int = 1, hit: int = -1, at:
     settings = json.dumps({"run_dir": str(run_dir), "hit": hit, "at": at, "number": number, "run": run})
     common = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(SRC), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]),
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
-        "JAX_NUM_CPU_DEVICES": str(devices),
-        "JAX_COORDINATOR_ADDRESS": f"localhost:{port}",
-        "JAX_NUM_PROCESSES": str(count),
-    }
-    return [
-        subprocess.Popen(
-            [sys.executable, __file__, settings],
-            env=common | {"JAX_PROCESS_ID": str(index)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for index in range(count)
-    ]
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "true", "JAX_NUM_CPU_DEVICES": str(devices),
+        "JAX_COORDINATOR_ADDRESS": f"localhost:{port}", "JAX_NUM_PROCESSES": str(count),
+    }  # fmt: skip
+    command, pipes = [sys.executable, __file__, settings], {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    places = [common | {"JAX_PROCESS_ID": str(index)} for index in range(count)]
+    return [subprocess.Popen(command, env=place, text=True, **pipes) for place in places]
 
 
 def finish(processes, timeout: float = 600):
@@ -85,12 +74,10 @@ def main(run_dir: str, hit: int, at: int, number: int, run: dict) -> None:
     with joined() as place:
         index = place.index
         fit(
-            config_of(**run),
-            params=toy_params(WIDE),
-            loss_fn=toy_loss,
+            config_of(**run), params=toy_params(WIDE), loss_fn=toy_loss,
             batches=batches_of(index, jax.process_count(), at=at if index == hit else -1, number=number),
             run_dir=Path(run_dir),
-        )
+        )  # fmt: skip
 
 
 if __name__ == "__main__":

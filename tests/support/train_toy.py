@@ -1,7 +1,5 @@
 """A small loss with two heads, its batches and configs; run as a script it trains, for the tests that kill it."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import os
@@ -23,11 +21,9 @@ def toy_config(*, steps: int = 8, optim: dict | None = None, data: dict | None =
     tiny = preset("tiny")
     settings = {"save_every": 3, "figure_every": 0, "steps": steps, "max_skipped": 3} | run
     return dataclasses.replace(
-        tiny,
-        optim=OptimConfig(**({"learning_rate": 0.05, "warmup": 2} | (optim or {}))),
-        data=DataConfig(**({"batch_size": ROWS} | (data or {}))),
-        run=RunConfig(**settings),
-    )
+        tiny, optim=OptimConfig(**({"learning_rate": 0.05, "warmup": 2} | (optim or {}))),
+        data=DataConfig(**({"batch_size": ROWS} | (data or {}))), run=RunConfig(**settings),
+    )  # fmt: skip
 
 
 def toy_params(wide: int = WIDTH) -> dict:
@@ -40,12 +36,10 @@ def toy_params(wide: int = WIDTH) -> dict:
     return {
         "trunk": {"kernel": draw(PIXELS, wide), "bias": draw(wide)},
         "decoder": {
-            "position": draw(wide),
-            "still_head": {"kernel": draw(wide, 2)},
-            "clip_head": {"kernel": draw(wide, 3)},
+            "position": draw(wide), "still_head": {"kernel": draw(wide, 2)}, "clip_head": {"kernel": draw(wide, 3)},
         },
         "idle": {"kernel": draw(3, 3)},
-    }
+    }  # fmt: skip
 
 
 def toy_loss(params, batch, key, progress):

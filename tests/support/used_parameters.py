@@ -4,8 +4,6 @@ A parameter is used if a gradient can flow to it from the loss. PyTorch gives al
 integers and `stop_gradient` carry no gradient, and metrics do not count.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

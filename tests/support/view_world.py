@@ -1,7 +1,5 @@
 """Values of the touches that the tests of `view` show, and a camera that is pressed."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small models with their parameters and weights files, for the tests of weights."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +17,9 @@ from tests.support.release_keys import release_names, release_shapes
 
 STAGE1 = ModelConfig(28, 14, 12, Stack(16, 2, 4, 24), Stack(8, 3, 2, 20))
 STAGE2 = replace(
-    STAGE1,
-    image=Stack(16, 2, 4, 24),
-    text=TextTower(Stack(10, 2, 2, 14), vocab=30, length=7),
-    match_head="linear",
+    STAGE1, image=Stack(16, 2, 4, 24), text=TextTower(Stack(10, 2, 2, 14), vocab=30, length=7), match_head="linear",
     lora_rank=3,
-)
+)  # fmt: skip
 NO_LORA = replace(STAGE2, lora_rank=0)
 MLP = replace(STAGE2, match_head="mlp")
 DECODER_TOKENS = replace(STAGE1, decoder_sensor_tokens=True)
@@ -85,9 +80,7 @@ def openclip_of(params, model: ModelConfig) -> dict[str, np.ndarray]:
             "image", model.image, {"class_embedding": "class_token", "positional_embedding": "position"}, "visual.proj",
         ),
         "": (
-            "text",
-            model.text.stack,
-            {"token_embedding.weight": "token", "positional_embedding": "position"},
+            "text", model.text.stack, {"token_embedding.weight": "token", "positional_embedding": "position"},
             "text_projection",
         ),
     }  # fmt: skip
@@ -106,10 +99,8 @@ def openclip_of(params, model: ModelConfig) -> dict[str, np.ndarray]:
             weights[f"{block}attn.in_proj_weight"] = np.concatenate([dense["kernel"][layer].T for dense in qkv])
             weights[f"{block}attn.in_proj_bias"] = np.concatenate([dense["bias"][layer] for dense in qkv])
             dense = {
-                "attn.out_proj": attention["out"],
-                "mlp.c_fc": rows["mlp"]["up"],
-                "mlp.c_proj": rows["mlp"]["down"],
-            }
+                "attn.out_proj": attention["out"], "mlp.c_fc": rows["mlp"]["up"], "mlp.c_proj": rows["mlp"]["down"],
+            }  # fmt: skip
             for key, leaf in dense.items():
                 weights |= {f"{block}{key}.weight": leaf["kernel"][layer].T, f"{block}{key}.bias": leaf["bias"][layer]}
             for key, name in {"ln_1": "norm1", "ln_2": "norm2"}.items():

@@ -1,9 +1,6 @@
-"""Runs of several processes: joining, training as one, stopping as one, and the end when one is lost."""
-
-from __future__ import annotations
-
 import json
 import signal
+from functools import partial
 
 import jax
 import numpy as np
@@ -75,12 +72,10 @@ def test_one_process_raises_its_errors():
 @pytest.mark.parametrize(
     ("error", "status"),
     [
-        (UserError("batch_size 3"), 2),
-        (KeyboardInterrupt(), 130),
-        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), 1),
-        (ValueError("odd"), 1),
+        (UserError("batch_size 3"), 2), (KeyboardInterrupt(), 130),
+        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), 1), (ValueError("odd"), 1),
     ],
-)
+)  # fmt: skip
 def test_a_process_that_fails_exits_at_once(error, status, initialized, capfd):
     with pytest.raises(SystemExit) as exit_, joined(BY_HAND):
         raise error
@@ -114,21 +109,12 @@ def test_a_ballot_gives_the_largest_vote():
     assert [[int(one) for one in ballot.cast(number, 3)] for number in (0, 15)] == [[0, 3], [15, 3]]
 
 
-# Two processes ------------------------------------------------------------------------------------------------------
-
-
 def lock(run_dir, mesh=None, **more):
     """The same run in this process."""
     return fit(
-        config_of(**{"steps": 12} | more.pop("run", {})),
-        params=toy_params(WIDE),
-        loss_fn=toy_loss,
-        batches=batches_of(0, 1),
-        run_dir=run_dir,
-        mesh=mesh or make_mesh(1),
-        log=lambda sentence: None,
-        **more,
-    )
+        config_of(**{"steps": 12} | more.pop("run", {})), params=toy_params(WIDE), loss_fn=toy_loss,
+        batches=batches_of(0, 1), run_dir=run_dir, mesh=mesh or make_mesh(1), log=lambda sentence: None, **more,
+    )  # fmt: skip
 
 
 def column(run_dir, name="loss"):
@@ -143,9 +129,8 @@ def undisturbed(tmp_path_factory):
 
 def same(result, run_dir, undisturbed):
     """The parameters and every loss of a run are those of the undisturbed one."""
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), result.params, undisturbed[1].params
-    )
+    close = partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
+    jax.tree.map(close, result.params, undisturbed[1].params)
     np.testing.assert_allclose(column(run_dir), column(undisturbed[0]), rtol=1e-5)
 
 

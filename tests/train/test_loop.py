@@ -1,10 +1,10 @@
-from __future__ import annotations
-
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -20,10 +20,8 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.train import loop
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.train.progress import chart, progress, to_stderr
 from anytouch_jax.weights import checkpoint
-
-TOY = SUPPORT / "train_toy.py"
-SRC = ROOT / "src"
 
 
 def run(run_dir, config=None, *, said=None, **more):
@@ -77,12 +75,8 @@ def test_a_run_leaves_its_folder_and_a_line_a_step(undisturbed):
     assert wanted <= set(found[0])
     assert found[0]["learning_rate"] == 0 and found[4]["p_u"] == pytest.approx(0.375)
     assert (result.step, result.resumed, result.interrupted) == (8, 0, None)
-    assert result.state.step == 8 and result.metrics["step"] == 7
+    assert result.state.step == 8 and result.metrics["step"] == 7 and result.traces == 2  # one a kind of batch
     assert all(value is not None for row in found for value in row.values())
-
-
-def test_each_kind_of_batch_is_traced_once(undisturbed):
-    assert undisturbed[1].traces == 2
 
 
 @pytest.mark.parametrize("devices", [1, 4])
@@ -123,12 +117,8 @@ def test_another_number_of_devices_goes_on(tmp_path):
 
 
 def test_skipped_steps_are_counted_and_change_nothing(tmp_path):
-    config = toy_config(save_every=2)
-
-    def batches(start, stop):
-        return toy_batches(start, stop, bad=(2, 3, 5))
-
-    result = run(tmp_path, config, batches=batches, stop_after=6)
+    batches = partial(toy_batches, bad=(2, 3, 5))
+    result = run(tmp_path, toy_config(save_every=2), batches=batches, stop_after=6)
     found = rows(tmp_path)
     assert [row["skipped"] for row in found] == [0, 0, 1, 1, 0, 1]
     assert [row["skipped_batches"] for row in found] == [0, 0, 1, 2, 2, 3]
@@ -137,10 +127,7 @@ def test_skipped_steps_are_counted_and_change_nothing(tmp_path):
 
 
 def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
-    def batches(start, stop):
-        return toy_batches(start, stop, bad=range(2, 100))
-
-    config = toy_config(save_every=2, max_skipped=3)
+    batches, config = partial(toy_batches, bad=range(2, 100)), toy_config(save_every=2, max_skipped=3)
     with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* --optim.grad-clip"):
         run(tmp_path, config, batches=batches)
     assert [row["step"] for row in rows(tmp_path)] == list(range(6))
@@ -270,19 +257,15 @@ def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, mon
     monkeypatch.setattr(loop, "Checkpoints", Watched)
     run(tmp_path)
     losses = [row["loss"] for row in rows(tmp_path)]
-    assert saved == {
-        3: pytest.approx(np.mean(losses[:3])),
-        6: pytest.approx(np.mean(losses[3:6])),
-        8: pytest.approx(np.mean(losses[6:])),
-    }
+    assert list(saved) == [3, 6, 8]
+    assert list(saved.values()) == pytest.approx([np.mean(losses[a:b]) for a, b in ((0, 3), (3, 6), (6, 8))])
     assert partial == [False, False, True], "two steps against three: never the best"
 
 
 def test_a_saved_state_is_not_touched_by_the_steps_after_it(undisturbed, tmp_path):
     run(tmp_path, stop_after=6)  # saved at 3 while 4 to 6 ran on donated buffers
-    for step in ("00000006", "00000008"):
-        for entry in [e for e in (tmp_path / "checkpoints").iterdir() if e.name == step]:
-            entry.rename(tmp_path / step)
+    for entry in [e for e in (tmp_path / "checkpoints").iterdir() if e.name in ("00000006", "00000008")]:
+        entry.rename(tmp_path / entry.name)
     again = run(tmp_path)
     assert again.resumed == 3
     assert_same(again.state, undisturbed[1].state)
@@ -300,11 +283,7 @@ def test_batches_out_of_order_or_too_few_are_refused(tmp_path):
 def test_a_signal_finishes_the_step_saves_and_restores_the_handlers(undisturbed, tmp_path, number):
     before = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)]
     said = []
-
-    def batches(start, stop):
-        return stopping_batches(start, stop, at=4, number=number)
-
-    result = run(tmp_path, batches=batches, said=said)
+    result = run(tmp_path, batches=partial(stopping_batches, at=4, number=number), said=said)
     assert (result.interrupted, result.step) == (number, 5)
     assert [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)] == before
     assert any(f"stopped by {number.name} after step 5" in line for line in said)
@@ -333,8 +312,8 @@ def test_a_second_interrupt_is_not_held_back(tmp_path):
 
 
 def child(run_dir, at, number):
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(SRC), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, str(TOY), str(run_dir), str(at), str(int(number))]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, str(SUPPORT / "train_toy.py"), str(run_dir), str(at), str(int(number))]
     return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
 
 
@@ -395,3 +374,41 @@ def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monke
     assert not np.array_equal(seen[0]["trunk"]["kernel"], seen[-1]["trunk"]["kernel"])
     gone = [state.trainable["trunk"]["kernel"].is_deleted() for state in states]
     assert gone[0] == donates and (donates or not any(gone))  # jax 0.11 copies one that a NumPy view of it still holds
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def row(step, **more):
+    return {"step": step, "loss": 0.5, "samples_per_second": 30.4, "skipped_batches": 0} | more
+
+
+def test_a_terminal_shows_a_bar_and_sentences_above_it(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    screen = sys.stderr
+    with progress(0, 3, to_stderr) as advance:
+        to_stderr("saved at step 1")
+        for step in range(3):
+            advance(row(step))
+    shown = screen.getvalue()
+    assert "3/3" in shown and "loss 0.5000" in shown and "saved at step 1" in shown
+
+
+def test_the_curve_falls_with_the_loss():
+    lines = chart([8.0] * 50 + [1.0] * 50, width=10, height=4).splitlines()
+    assert [line[10:] for line in lines] == ["█████     "] * 3 + ["█████▁▁▁▁▁"]
+    assert lines[0].startswith("   8.0000 ") and lines[-1].startswith("   1.0000 ")
+    assert len(set(chart([2.0, 2.0]).splitlines()[-1][10:])) == 1  # no change, no division by zero
+
+
+def test_elsewhere_some_twenty_lines_are_said():
+    said = []
+    with progress(100, 1100, said.append) as advance:
+        for step in range(100, 1100):
+            advance(row(step))
+    assert len(said) == 21
+    assert said[0] == "step 101/1100  loss 0.5000  30 samples/s" and said[-1].startswith("step 1100/1100")

@@ -1,36 +1,21 @@
-from __future__ import annotations
-
 import os
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from adam_moments import moments
 from jax.sharding import AxisType, PartitionSpec
-from train_toy import toy_batch, toy_config, toy_loss, toy_params
 
 from anytouch_jax.errors import ConfigError
-from anytouch_jax.train.mesh import (
-    batch_sharding,
-    enable_compilation_cache,
-    gathering,
-    make_mesh,
-    put_batch,
-    put_state,
-    replicated,
-    state_sharding,
-)
-from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.step import init_state, make_step
+from anytouch_jax.train import mesh as meshes
 
 
 def test_the_mesh_takes_all_devices_and_leaves_placement_to_jit():
-    mesh = make_mesh()
+    mesh = meshes.make_mesh()
     assert dict(mesh.shape) == {"data": 4, "fsdp": 1}
     assert mesh.axis_types == (AxisType.Auto, AxisType.Auto)
-    assert dict(make_mesh(fsdp=2).shape) == {"data": 2, "fsdp": 2}
-    assert dict(make_mesh(1, 2).shape) == {"data": 1, "fsdp": 2}
+    assert dict(meshes.make_mesh(fsdp=2).shape) == {"data": 2, "fsdp": 2}
+    assert dict(meshes.make_mesh(1, 2).shape) == {"data": 1, "fsdp": 2}
 
 
 def test_parameters_are_cut_on_their_largest_divisible_axis():
@@ -39,71 +24,43 @@ def test_parameters_are_cut_on_their_largest_divisible_axis():
         "scalar": (),
     }  # fmt: skip
     abstract = {name: jax.ShapeDtypeStruct(shape, jnp.float32) for name, shape in shapes.items()}
-    places = {name: place.spec for name, place in state_sharding(abstract, make_mesh(fsdp=4)).items()}
+    places = {name: place.spec for name, place in meshes.state_sharding(abstract, meshes.make_mesh(fsdp=4)).items()}
     assert places == {
         "kernel": PartitionSpec(None, None, "fsdp"), "odd": PartitionSpec("fsdp"), "prime": PartitionSpec(),
         "small": PartitionSpec(), "packed": PartitionSpec(), "scalar": PartitionSpec(),
     }  # fmt: skip
-    assert {place.spec for place in state_sharding(abstract, make_mesh()).values()} == {PartitionSpec()}
+    assert {place.spec for place in meshes.state_sharding(abstract, meshes.make_mesh()).values()} == {PartitionSpec()}
 
 
 def test_a_batch_is_shared_out_by_rows_and_an_empty_axis_is_fine():
-    sharding = batch_sharding(make_mesh(fsdp=2))
+    sharding = meshes.batch_sharding(meshes.make_mesh(fsdp=2))
     batch = {"clip": np.arange(8 * 3).reshape(8, 3), "none": np.zeros((0, 5), np.int32)}
-    placed = put_batch(batch, sharding)
+    placed = meshes.put_batch(batch, sharding)
     assert [shard.data.shape for shard in placed["clip"].addressable_shards] == [(2, 3)] * 4
     np.testing.assert_array_equal(placed["clip"], batch["clip"])
     assert placed["none"].shape == (0, 5)
     with pytest.raises(ConfigError, match="6 rows cannot be divided among 4 devices"):
-        put_batch({"clip": np.zeros((6, 2))}, sharding)
-
-
-def train(mesh):
-    config = toy_config(optim={"warmup": 0})
-    state = jax.jit(init_state, static_argnums=1)(toy_params(), config)
-    places = state_sharding(state, mesh, small=0)
-    state = jax.device_put(state, places)
-    step = make_step(toy_loss, optimizer(config), total_steps=8)
-    step = jax.jit(step, out_shardings=(places, replicated(mesh)))
-    key = jax.device_put(jax.random.key(1), replicated(mesh))
-    losses = []
-    for index in (1, 3, 5):
-        state, metrics = step(state, put_batch(toy_batch(index), batch_sharding(mesh)), key)
-        losses.append(float(metrics["loss"]))
-    return state, losses
-
-
-def test_one_two_and_four_devices_agree():
-    one, losses = train(make_mesh(1, 1))
-    for data, fsdp in ((2, 1), (2, 2)):
-        other, other_losses = train(make_mesh(data, fsdp))
-        np.testing.assert_allclose(other_losses, losses, rtol=1e-5)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), other, one)
-        kernel = other.trainable["trunk"]["kernel"]
-        assert kernel.sharding.spec == (PartitionSpec("fsdp") if fsdp > 1 else PartitionSpec())
-        held = moments(other.opt_state, other.trainable)["trunk"]["kernel"]
-        assert held.updates == 3 and np.abs(held.mu).max() > 0
+        meshes.put_batch({"clip": np.zeros((6, 2))}, sharding)
 
 
 def test_sharded_parameters_are_gathered_once_and_their_gradients_come_back_cut():
-    mesh, shared = make_mesh(fsdp=4), make_mesh()
+    mesh, shared = meshes.make_mesh(fsdp=4), meshes.make_mesh()
     params = {"kernel": np.ones((8, 16), "f4"), "bias": np.ones(16, "f4")}
-    places = state_sharding(params, mesh, small=0)
+    places = meshes.state_sharding(params, mesh, small=0)
     assert places["kernel"].spec == PartitionSpec(None, "fsdp") and places["bias"].spec == PartitionSpec()
 
     def loss(params, x):
         return jnp.mean(jnp.tanh(x @ params["kernel"] + params["bias"][None])), {}
 
-    assert gathering(loss, shared) is loss  # nothing is added where nothing is cut
-    grads = jax.jit(jax.grad(gathering(loss, mesh), has_aux=True), out_shardings=(places, replicated(mesh)))
-    x = jax.device_put(np.arange(64, dtype=np.float32).reshape(8, 8) / 64, batch_sharding(mesh))
+    assert meshes.gathering(loss, shared) is loss  # nothing is added where nothing is cut
+    slope = jax.grad(meshes.gathering(loss, mesh), has_aux=True)
+    grads = jax.jit(slope, out_shardings=(places, meshes.replicated(mesh)))
+    x = jax.device_put(np.arange(64, dtype=np.float32).reshape(8, 8) / 64, meshes.batch_sharding(mesh))
     compiled = grads.lower(jax.device_put(params, places), x).compile()
     text = compiled.as_text()
     assert text.count(" all-gather(") == 1 and " all-to-all(" not in text and " collective-permute(" not in text
-    found, wanted = (
-        compiled(jax.device_put(params, places), x)[0],
-        jax.jit(jax.grad(loss, has_aux=True))(params, np.asarray(x))[0],
-    )
+    found = compiled(jax.device_put(params, places), x)[0]
+    wanted = jax.jit(jax.grad(loss, has_aux=True))(params, np.asarray(x))[0]
     assert {shard.data.shape for shard in found["kernel"].addressable_shards} == {(8, 4)}
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), found, wanted)
 
@@ -113,7 +70,7 @@ def test_sharded_parameters_are_gathered_once_and_their_gradients_come_back_cut(
 def test_a_step_that_overwrites_its_state_leaves_the_callers_arrays(kind, devices):
     array = jnp.array(np.ones((256, 256), np.float32))
     tree = {"kernel": array if kind == "device" else np.asarray(array)}  # aligned, so that a CPU may share it
-    placed = put_state(tree, state_sharding(tree, make_mesh(devices)))
+    placed = meshes.put_state(tree, meshes.state_sharding(tree, meshes.make_mesh(devices)))
     for _ in range(2):
         placed, before = jax.jit(lambda tree: jax.tree.map(lambda x: x - 3, tree), donate_argnums=0)(placed), placed
     assert before["kernel"].is_deleted()
@@ -125,7 +82,7 @@ def test_the_compilation_cache_has_a_default_place(tmp_path, monkeypatch):
     before = jax.config.jax_compilation_cache_dir
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     try:
-        assert enable_compilation_cache() == tmp_path / "cache" / "anytouch_jax"
+        assert meshes.enable_compilation_cache() == tmp_path / "cache" / "anytouch_jax"
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "anytouch_jax")
         (tmp_path / "file").write_text("")
         (tmp_path / "cache" / "anytouch_jax" / "z-cache").symlink_to("nowhere")  # what cannot be looked at stays
@@ -134,8 +91,8 @@ def test_the_compilation_cache_has_a_default_place(tmp_path, monkeypatch):
             file.write_bytes(b"a program")
         for file in (old, other):
             os.utime(file, (0, 0))
-        assert enable_compilation_cache() is not None
+        assert meshes.enable_compilation_cache() is not None
         assert kept.exists() and other.exists() and not old.exists()
-        assert enable_compilation_cache(tmp_path / "file" / "below") is None
+        assert meshes.enable_compilation_cache(tmp_path / "file" / "below") is None
     finally:
         jax.config.update("jax_compilation_cache_dir", before)

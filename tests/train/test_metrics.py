@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -26,13 +24,9 @@ def test_lines_are_json_and_what_is_not_finite_is_null(tmp_path):
     row = record.write(0, {"loss": np.float32(0.1), "grad_norm": float("nan"), "skipped": 0.0, "images": np.int64(3)})
     record.write(1, {"loss": np.float32("inf"), "skipped": 1.0})
     record.close()
-    assert lines(tmp_path) == [
-        {
-            "step": 0, "loss": float(np.float32(0.1)), "grad_norm": None, "skipped": 0.0, "images": 3,
-            "skipped_batches": 0,
-        },
-        {"step": 1, "loss": None, "skipped": 1.0, "skipped_batches": 1},
-    ]  # fmt: skip
+    first = {"step": 0, "loss": float(np.float32(0.1)), "grad_norm": None, "skipped": 0.0, "images": 3}
+    second = {"step": 1, "loss": None, "skipped": 1.0, "skipped_batches": 1}
+    assert lines(tmp_path) == [first | {"skipped_batches": 0}, second]
     assert row == lines(tmp_path)[0]
     assert (record.skipped, record.in_a_row) == (1, 1)
 
@@ -82,14 +76,9 @@ def test_the_config_is_written_once_and_read_back(tmp_path):
     assert from_json((tmp_path / "run" / "config.json").read_text()) == config
     begun(tmp_path / "run")
     open_run(tmp_path / "run", config)
-    harmless = dataclasses.replace(
-        config,
-        data=dataclasses.replace(config.data, threads=9, prefetch=9, on_bad_sample="skip"),
-        run=dataclasses.replace(
-            config.run, save_every=7, keep=9, figure_every=9, tensorboard=True, fsdp=2, max_skipped=9
-        ),
-    )
-    open_run(tmp_path / "run", harmless)
+    data = dataclasses.replace(config.data, threads=9, prefetch=9, on_bad_sample="skip")
+    run = dataclasses.replace(config.run, save_every=7, keep=9, figure_every=9, tensorboard=True, fsdp=2, max_skipped=9)
+    open_run(tmp_path / "run", dataclasses.replace(config, data=data, run=run))
     assert from_json((tmp_path / "run" / "config.json").read_text()) == config
 
 

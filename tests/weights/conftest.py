@@ -1,7 +1,5 @@
 """Files as torch.save writes them, made by hand: torch is not needed, and a wicked pickle is as easy as a good one."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zipfile
@@ -97,13 +95,8 @@ def _emit(value: Any, storages: list[np.ndarray], legacy: bool) -> bytes:
             length = len(value.data) if value.length is None else value.length
             pid = ("storage", Global("torch", f"{kind}Storage"), key, "cpu", length, *([None] if legacy else []))
             ordered = Call(Global("collections", "OrderedDict"), ())
-            return (
-                emit(Global("torch._utils", "_rebuild_tensor_v2"))
-                + b"("
-                + (emit(pid) + b"Q")
-                + emit(value.offset, value.shape, value.stride, False, ordered)
-                + b"tR"
-            )
+            rebuild, rest = Global("torch._utils", "_rebuild_tensor_v2"), (value.offset, value.shape, value.stride)
+            return emit(rebuild) + b"(" + emit(pid) + b"Q" + emit(*rest, False, ordered) + b"tR"
     raise TypeError(type(value))
 
 

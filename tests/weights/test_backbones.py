@@ -7,8 +7,6 @@ num_reg_tokens=4)` of timm, and from `DINOv3ViTModel` and `SiglipVisionModel`. M
 given to timm's own conversion, with a key bias that the mask takes out.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,31 +1,14 @@
-"""Weights in and out: every key accounted for, every value in its place, there and back bit for bit."""
-
-from __future__ import annotations
-
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
-from weights_world import (
-    DECODER_TOKENS,
-    MLP,
-    NO_LORA,
-    STAGE1,
-    STAGE2,
-    assert_same,
-    openclip_of,
-    params_of,
-    weights_of,
-)
+from weights_world import DECODER_TOKENS, MLP, NO_LORA, STAGE1, STAGE2, assert_same, openclip_of, params_of, weights_of
 
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights import keymaps
-from anytouch_jax.weights.convert import (
-    detect_layout,
-    to_params,
-    to_release,
-)
+from anytouch_jax.weights.convert import detect_layout, to_params, to_release
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten
@@ -46,68 +29,47 @@ def test_there_and_back_is_bit_equal(model):
     for key in release_names(model):
         np.testing.assert_array_equal(back[key], weights[key], err_msg=key)
     prefix = "touch_mae_model." if model.image else ""
-    inner = f"{prefix}touch_model.embeddings."
-    np.testing.assert_array_equal(
-        back[f"{prefix}video_position_embedding.weight"], weights[f"{inner}position_embedding.weight"]
-    )
-    mean = weights[f"{prefix}video_patch_embedding.weight"].mean(1)
+    inner, video = f"{prefix}touch_model.embeddings.", f"{prefix}video_"
+    position = weights[f"{inner}position_embedding.weight"]
+    np.testing.assert_array_equal(back[f"{video}position_embedding.weight"], position)
+    mean = weights[f"{video}patch_embedding.weight"].mean(1)
     np.testing.assert_allclose(back[f"{inner}patch_embedding.weight"], mean, atol=1e-6)
 
 
 def test_every_value_is_in_its_place():
+    """Every value of a file is drawn, so that an exchanged one shows."""
     weights = weights_of(STAGE2)
-    params = to_params(weights, STAGE2)
+    params, same = to_params(weights, STAGE2), np.testing.assert_array_equal
     kernel = weights["touch_mae_model.video_patch_embedding.weight"]  # (D, frame, colour, row, col), golden Q1
-    for d, frame, colour, row, col in [(0, 0, 0, 0, 0), (3, 2, 1, 5, 9), (15, 1, 2, 13, 0)]:
-        assert (
-            params["touch"]["patch"]["kernel"][frame, (row * 14 + col) * 3 + colour, d]
-            == kernel[d, frame, colour, row, col]
-        )
-        still = weights["vision_model.embeddings.patch_embedding.weight"][d, colour, row, col]
-        assert params["image"]["patch"]["kernel"][(row * 14 + col) * 3 + colour, d] == still
-    layers = "vision_model.encoder.base_model.model.layers.1."
-    attention = params["image"]["blocks"]["attention"]
+    still = weights["vision_model.embeddings.patch_embedding.weight"]
+    same(params["touch"]["patch"]["kernel"], kernel.transpose(1, 3, 4, 2, 0).reshape(3, -1, 16))
+    same(params["image"]["patch"]["kernel"], still.transpose(2, 3, 1, 0).reshape(-1, 16))
+    layers, attention = "vision_model.encoder.base_model.model.layers.1.", params["image"]["blocks"]["attention"]
     for theirs, ours in {"q_proj": "query", "k_proj": "key", "v_proj": "value", "out_proj": "out"}.items():
         base = f"{layers}self_attn.{theirs}"
-        np.testing.assert_array_equal(attention[ours]["kernel"][1], weights[f"{base}.base_layer.weight"].T)
-        np.testing.assert_array_equal(attention[ours]["bias"][1], weights[f"{base}.base_layer.bias"])
-        np.testing.assert_array_equal(params["lora"][ours]["a"][1], weights[f"{base}.lora_A.default.weight"].T)
-        np.testing.assert_array_equal(params["lora"][ours]["b"][1], weights[f"{base}.lora_B.default.weight"].T)
-    rest = {
-        "layer_norm1": "norm1/scale",
-        "layer_norm2": "norm2/scale",
-        "mlp.fc1": "mlp/up/kernel",
-        "mlp.fc2": "mlp/down/kernel",
-    }
-    for prefix, part in {
-        layers: "image",
-        f"touch_mae_model.{LAYER}": "touch",
-        "text_model.encoder.layers.1.": "text",
-    }.items():
+        same(attention[ours]["kernel"][1], weights[f"{base}.base_layer.weight"].T)
+        same(attention[ours]["bias"][1], weights[f"{base}.base_layer.bias"])
+        for part in "ab":
+            same(params["lora"][ours][part][1], weights[f"{base}.lora_{part.upper()}.default.weight"].T)
+    rest = {"layer_norm1": "norm1", "layer_norm2": "norm2", "mlp.fc1": "mlp/up", "mlp.fc2": "mlp/down"}
+    parts = {layers: "image", f"touch_mae_model.{LAYER}": "touch", "text_model.encoder.layers.1.": "text"}
+    for (prefix, part), (theirs, ours) in product(parts.items(), rest.items()):
         blocks = flatten(params[part]["blocks"])
-        for theirs, ours in rest.items():
-            np.testing.assert_array_equal(blocks[ours][1], weights[f"{prefix}{theirs}.weight"].T)
-            np.testing.assert_array_equal(
-                blocks[f"{ours.rsplit('/', 1)[0]}/bias"][1], weights[f"{prefix}{theirs}.bias"]
-            )
-    for key, name in {"pre_layrnorm": "pre_norm", "post_layernorm": "post_norm"}.items():
-        np.testing.assert_array_equal(params["touch"][name]["bias"], weights[f"touch_mae_model.touch_model.{key}.bias"])
-        np.testing.assert_array_equal(params["image"][name]["scale"], weights[f"vision_model.{key}.weight"])
-    for key, name in {
-        "decoder_pred": "still_head",
-        "decoder_pred_video": "clip_head",
-        "decoder_embed": "embed",
-    }.items():
-        np.testing.assert_array_equal(params["decoder"][name]["kernel"], weights[f"touch_mae_model.{key}.weight"].T)
-    block = "touch_mae_model.touch_decoder_blocks.2."
-    decoder = params["decoder"]["blocks"]
-    np.testing.assert_array_equal(
-        decoder["attention"]["out"]["kernel"][2], weights[f"{block}attention.output.dense.weight"].T
-    )
-    np.testing.assert_array_equal(decoder["mlp"]["down"]["kernel"][2], weights[f"{block}output.dense.weight"].T)
-    np.testing.assert_array_equal(decoder["norm2"]["scale"][2], weights[f"{block}layernorm_after.weight"])
-    np.testing.assert_array_equal(params["decoder"]["mask_token"], weights["touch_mae_model.mask_token"][0, 0])
-    np.testing.assert_array_equal(params["text"]["token"], weights["text_model.embeddings.token_embedding.weight"])
+        same(blocks[f"{ours}/{'scale' if 'norm' in ours else 'kernel'}"][1], weights[f"{prefix}{theirs}.weight"].T)
+        same(blocks[f"{ours}/bias"][1], weights[f"{prefix}{theirs}.bias"])
+    block, flat = "touch_decoder_blocks.2.", flatten(params)
+    for theirs, ours in {
+        "touch_model.pre_layrnorm.bias": "touch/pre_norm/bias", "mask_token": "decoder/mask_token",
+        "touch_model.post_layernorm.bias": "touch/post_norm/bias", "decoder_pred.weight": "decoder/still_head/kernel",
+        "decoder_pred_video.weight": "decoder/clip_head/kernel", "decoder_embed.weight": "decoder/embed/kernel",
+        f"{block}attention.output.dense.weight": "decoder/blocks/attention/out/kernel",
+        f"{block}output.dense.weight": "decoder/blocks/mlp/down/kernel",
+        f"{block}layernorm_after.weight": "decoder/blocks/norm2/scale",
+    }.items():  # fmt: skip
+        same(flat[ours][2] if "blocks" in ours else flat[ours], np.squeeze(weights[f"touch_mae_model.{theirs}"].T))
+    same(params["image"]["pre_norm"]["scale"], weights["vision_model.pre_layrnorm.weight"])
+    same(params["image"]["post_norm"]["scale"], weights["vision_model.post_layernorm.weight"])
+    same(params["text"]["token"], weights["text_model.embeddings.token_embedding.weight"])
     assert params["logit_scale"] == weights["logit_scale"] and params["logit_scale"].shape == ()
 
 
@@ -131,14 +93,12 @@ def test_every_wrong_key_is_listed_at_once():
 @pytest.mark.parametrize(
     ("file", "wanted", "setting"),
     [
-        (DECODER_TOKENS, STAGE1, "decoder_sensor_tokens"),
-        (STAGE2, NO_LORA, "lora_rank"),
-        (NO_LORA, STAGE2, "lora_rank"),
-        (STAGE2, MLP, "match_head"),
+        (DECODER_TOKENS, STAGE1, "decoder_sensor_tokens"), (STAGE2, NO_LORA, "lora_rank"),
+        (NO_LORA, STAGE2, "lora_rank"), (STAGE2, MLP, "match_head"),
         (STAGE1, replace(STAGE1, touch=Stack(16, 3, 4, 24)), "depths"),
         (STAGE1, replace(STAGE1, embed=13), "other shapes"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_model_names_the_setting(file, wanted, setting):
     with pytest.raises(UserError, match=setting):
         to_params(weights_of(file), wanted)
@@ -172,17 +132,12 @@ def test_a_probe_file_gives_encoder_and_classifier():
 
 @pytest.mark.parametrize("layout", ["stage1", "stage2", "clip", "openclip", "probe"])
 def test_detects_the_model(layout):
-    model = {"stage1": DECODER_TOKENS, "stage2": STAGE2}.get(layout, STAGE2)
+    model = DECODER_TOKENS if layout == "stage1" else STAGE2
     weights = weights_of(model, layout) if layout != "openclip" else openclip_of(params_of(model), model)
     detected = detect_model(weights, {"touch": 4, "image": 4, "decoder": 2, "text": 2})
-    decoder = Stack(512, 8, 16, 2048) if layout in ("clip", "openclip", "probe") else model.decoder
-    if layout in ("clip", "openclip"):
-        expected = replace(model, decoder=decoder, match_head="none", lora_rank=0)
-    elif layout == "probe":
-        expected = replace(STAGE1, decoder=decoder)
-    else:
-        expected = model
-    assert detected == expected
+    alone = {"decoder": Stack(512, 8, 16, 2048), "match_head": "none", "lora_rank": 0}
+    expected = {"clip": replace(model, **alone), "probe": replace(STAGE1, **alone)}
+    assert detected == expected.get(layout.removeprefix("open"), model)
     to_params(weights, detected)
 
 
@@ -190,30 +145,26 @@ def test_detects_the_model(layout):
 def test_head_counts_are_right_or_refused_for_every_preset(name):
     model = preset(name, stage=2, recipe="release").model
     weights = {key: np.broadcast_to(np.float32(0), shape) for key, shape in release_shapes(model).items()}
-    if name == "tiny":  # 192 wide with 6 heads: width / 64 would be 3
-        with pytest.raises(UserError, match=r"touch \(width 192\).*config\.json"):
-            detect_model(weights)
-    else:
+    heads = {part: getattr(model, part).heads for part in ("touch", "image", "decoder")}
+    assert detect_model(weights, heads | {"text": model.text.stack.heads}) == model
+    if name != "tiny":
         assert detect_model(weights) == model
-    heads = {"touch": model.touch.heads, "image": model.image.heads, "decoder": model.decoder.heads}
-    assert detect_model(weights, {**heads, "text": model.text.stack.heads}) == model
+        return
+    with pytest.raises(UserError, match=r"touch \(width 192\).*config\.json"):  # 6 heads: width / 64 would be 3
+        detect_model(weights)
 
 
 @pytest.mark.parametrize("model", [STAGE1, STAGE2], ids=["stage1", "stage2"])
 def test_own_names_are_read_too(model):
     params = params_of(model)
-    assert_same(to_params(flatten(params), model), params)
-    stage1 = {part: params[part] for part in ("touch", "decoder")}
+    flat, stage1 = flatten(params), {part: params[part] for part in ("touch", "decoder")}
     assert_same(to_params(flatten(stage1), model), stage1)
-    assert_same(
-        to_params(flatten(params) | {"force/bias": np.zeros(2), "head/bias": np.zeros(3)}, model), params
-    )  # not its own
+    for others in ({}, {"force/bias": np.zeros(2), "head/bias": np.zeros(3)}):  # of no network here
+        assert_same(to_params(flat | others, model), params)
     with pytest.raises(WeightsError, match=r"unknown keys \(2\): bogus/kernel, Touch/scale$"):
-        to_params(flatten(params) | {"bogus/kernel": np.zeros(2), "Touch/scale": np.zeros(2)}, model)
-    flat = flatten(params)
-    del flat["touch/class_token"]
+        to_params(flat | {"bogus/kernel": np.zeros(2), "Touch/scale": np.zeros(2)}, model)
     with pytest.raises(UserError, match=r"missing keys.*touch/class_token"):
-        to_params(flat, model)
+        to_params({name: array for name, array in flat.items() if name != "touch/class_token"}, model)
 
 
 def test_the_frames_of_a_kernel_keep_their_order():

@@ -1,22 +1,21 @@
-"""Files of other families of any size and in any form: the form follows the arrays, damaged files are one sentence."""
-
-from __future__ import annotations
-
 import json
 import re
+import shutil
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from safetensors.numpy import save_file
 
 from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack
-from anytouch_jax.encoder.family import family_encoder
+from anytouch_jax.encoder.family import family_encoder, prepare
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.vit import VitConfig
 from anytouch_jax.weights.convert import file_shapes
 from anytouch_jax.weights.families import FAMILIES, entries_of, load_family
+from anytouch_jax.weights.load import load_model
 from tests.weights.conftest import Call, Global, tensor, zip_bytes
 
 BY_TITLE = {family.title: family for family in FAMILIES}
@@ -105,28 +104,24 @@ def test_the_form_follows_the_arrays(title, stack, patch, more, size, given, tmp
 
 
 def test_what_the_arrays_do_not_say_is_asked_for(tmp_path):
-    _, _, arrays = made(*FORMS[-1][:5])
-    save_file(arrays, tmp_path / "model.safetensors")
-    with pytest.raises(UserError, match="no grid of patches; give the image_size"):
-        load_family(tmp_path / "model.safetensors", heads=7)
-    with pytest.raises(UserError, match=r"number of attention heads of touch \(width 28\)"):
-        load_family(tmp_path / "model.safetensors", image_size=(24, 40))
-    with pytest.raises(UserError, match="no multiple of the patches of 8"):
-        load_family(tmp_path / "model.safetensors", heads=7, image_size=(24, 44))
+    save_file(made(*FORMS[-1][:5])[2], file := tmp_path / "model.safetensors")
+    for given, words in (
+        ({"heads": 7}, "no grid of patches; give the image_size"),
+        ({"image_size": (24, 40)}, r"number of attention heads of touch \(width 28\)"),
+        ({"heads": 7, "image_size": (24, 44)}, "no multiple of the patches of 8"),
+    ):
+        with pytest.raises(UserError, match=words):
+            load_family(file, **given)
     (tmp_path / "config.json").write_text(json.dumps({"num_attention_heads": 7, "hidden_act": "quick_gelu"}))
     with pytest.raises(UserError, match=r"hidden_act of the config\.json is quick_gelu"):
-        load_family(tmp_path / "model.safetensors", image_size=(24, 40))
-
-
-def test_the_number_of_a_layer_takes_no_memory(tmp_path):
+        load_family(file, image_size=(24, 40))
+    (tmp_path / "config.json").unlink()
     _, _, arrays = made(*FORMS[-2][:5])
-    arrays["blocks.999999999.norm1.weight"] = arrays.pop("blocks.1.norm1.weight")
-    save_file(arrays, tmp_path / "model.safetensors")
+    arrays["blocks.999999999.norm1.weight"] = arrays.pop("blocks.1.norm1.weight")  # it takes no memory
+    save_file(arrays, file)
     with pytest.raises(UserError, match=r"'blocks\.1\.norm1\.weight' is missing"):
-        load_family(tmp_path / "model.safetensors", heads=7)
+        load_family(file, heads=7)
 
-
-# Files of every family in every form ----------------------------------------------------------------------------------
 
 KINDS = ("safetensors", "pth", "ckpt", "safetensors parts", "bin parts")
 SMALL = {form[0]: form for form in reversed(FORMS) if form[0] != T3}
@@ -195,14 +190,80 @@ def test_a_whole_file_is_read_and_a_damaged_one_is_one_sentence(title, kind, tmp
 
 
 @pytest.mark.parametrize("part", ["trunk.pth", "encoders/digit.pth"])
-def test_a_damaged_part_of_t3_is_one_sentence(part, tmp_path):
+def test_a_damaged_or_lonely_part_of_t3_is_one_sentence(part, tmp_path):
     _, stack, patch, more, size, _ = next(form for form in FORMS if form[0] == T3)
-    _, _, arrays = made(T3, stack, patch, more, size)
-    file = write_t3(tmp_path / "t3", arrays)
-    damaged = tmp_path / "t3" / part
+    file, damaged = write_t3(tmp_path / "t3", made(T3, stack, patch, more, size)[2]), tmp_path / "t3" / part
+    refused(tmp_path / "t3" / "trunk.pth", tmp_path / "trunk.pth", stack[2], "trunk of T3 alone")
+    refused(alone := Path(shutil.copy(file, tmp_path)), alone, stack[2], "put its trunk.pth")
+    save_file({"layer.weight": np.zeros((2, 2), "f4")}, other := tmp_path / "other.safetensors")
+    with pytest.raises(UserError, match="not weights of"):
+        load_model(other)
     data = damaged.read_bytes()
     for length in (0, len(data) // 3, len(data) - 1000):
         damaged.write_bytes(data[:length])
         refused(file, damaged, stack[2], "damaged or not a torch file|cut short")
     damaged.write_bytes(zip_bytes({"model": EVIL}))
     refused(file, damaged, stack[2], "nothing was run")
+
+
+RNG = np.random.default_rng(0)
+FRAME = RNG.integers(0, 256, (60, 80, 3), np.uint8)
+SIDE = {"height": 48, "width": 48}
+CLIP = {"size": {"shortest_edge": 52}, "crop_size": SIDE, "do_center_crop": True, "image_mean": [0.1] * 3,
+        "image_std": [0.2] * 3, "resample": 3}  # fmt: skip
+TIMM_CFG = {"mean": [0.5] * 3, "std": [0.5] * 3, "crop_pct": 0.9, "interpolation": "bicubic", "input_size": [3, 48, 48]}
+
+
+def resized(size, kernel):
+    return np.asarray(Image.fromarray(FRAME).resize(size[::-1], kernel), np.float32)
+
+
+def cropped(short, kernel, side=48):
+    """What torchvision's Resize(short) and CenterCrop(side) return."""
+    pixels = resized((short, int(short * 80 / 60)), kernel)
+    top, left = (round((length - side) / 2) for length in pixels.shape[:2])
+    return pixels[top : top + side, left : left + side]
+
+
+BILINEAR, BICUBIC, LANCZOS = Image.Resampling.BILINEAR, Image.Resampling.BICUBIC, Image.Resampling.LANCZOS
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected", "ignored"),
+    [
+        ({"config": {"architecture": "vit", "pretrained_cfg": TIMM_CFG}}, (cropped(53, BICUBIC) / 255 - 0.5) / 0.5, ""),
+        ({"config": {"architecture": "vit"} | TIMM_CFG | {"crop_pct": 1.0, "interpolation": "bilinear"}},
+         (cropped(48, BILINEAR) / 255 - 0.5) / 0.5, ""),
+        ({"config": {"pretrained_cfg": TIMM_CFG | {"crop_mode": "squash", "crop_pct": 1.0}}},
+         (resized((48, 48), BICUBIC) / 255 - 0.5) / 0.5, ""),
+        ({"config": {"pretrained_cfg": TIMM_CFG | {"crop_mode": "border"}}}, None, "crop_mode border with crop_pct"),
+        ({"preprocessor_config": CLIP}, (cropped(52, BICUBIC) / 255 - 0.1) / 0.2, ""),
+        ({"preprocessor_config": CLIP | {"size": 52, "crop_size": 48, "resample": 1}},
+         (cropped(52, LANCZOS) / 255 - 0.1) / 0.2, ""),
+        ({"preprocessor_config": {"size": SIDE, "resample": 2, "do_normalize": False}},
+         resized((48, 48), BILINEAR) / 255, ""),
+        ({"preprocessor_config": {"size": 48, "resample": 2, "image_mean": [0.5] * 3, "image_std": [0.5] * 3,
+                                  "rescale_factor": 1 / 127.5}}, (resized((48, 48), BILINEAR) / 127.5 - 0.5) / 0.5, ""),
+        ({"preprocessor_config": {"size": 48, "resample": 2, "image_mean": [9.0] * 3, "image_std": [3.0] * 3,
+                                  "do_rescale": False}}, (resized((48, 48), BILINEAR) - 9) / 3, ""),
+        ({"preprocessor_config": CLIP, "config": {"pretrained_cfg": TIMM_CFG}},
+         (cropped(52, BICUBIC) / 255 - 0.1) / 0.2, ""),
+        ({"preprocessor_config": CLIP | {"do_pad": True, "pad_size": SIDE}}, None, "do_pad True, pad_size"),
+        ({"preprocessor_config": {"size": {"shortest_edge": 52}}}, None, "size {'shortest_edge': 52}"),
+        ({"preprocessor_config": {"size": 47}}, None, "an input of 47 x 47 pixels"),
+        ({"config": {"preparation": {"mean": [0.3] * 3, "std": [1.0] * 3}, "pretrained_cfg": TIMM_CFG}},
+         cropped(53, BICUBIC) / 255 - 0.3, ""),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("title", [TIMM, HF])
+def test_what_is_stated_beside_the_weights_is_computed_or_named(tmp_path, recwarn, title, stated, expected, ignored):
+    more = {"grid": (1, 6, 6)} | ({"layer_scale": True} if title == HF else {})
+    save_file(made(title, (16, 1, 2, 32), 8, more, (48, 48))[2], str(tmp_path / "model.safetensors"))
+    for name, content in stated.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    model, _ = load_family(tmp_path, heads=2)
+    words = " ".join(str(one.message) for one in recwarn)
+    assert (ignored in words) if ignored else not words
+    if expected is not None:
+        assert model.image_size == (48, 48)
+        np.testing.assert_allclose(prepare(FRAME, None, model.preparation, model.image_size), expected, atol=1e-5)

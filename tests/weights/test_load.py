@@ -1,7 +1,3 @@
-"""Loading: runs and files give the same model, and what starts a run is checked, fitted and reported."""
-
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -24,20 +20,12 @@ from weights_world import (
 from anytouch_jax.config import SENSORS, UNIVERSAL, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights.compatible import resize_position
+from anytouch_jax.weights.compatible import match_sensors, resize_position, serve_unseen
 from anytouch_jax.weights.convert import to_params, to_release
-from anytouch_jax.weights.load import (
-    first_params,
-    load_init,
-    load_model,
-    read_weights,
-)
+from anytouch_jax.weights.load import first_params, load_init, load_model, read_weights
 from anytouch_jax.weights.safetensors import MODEL_KEY, export_safetensors, write_safetensors
 
 TRAINED = ["digit", "gelsight_mini"]
-
-
-# Runs and files -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -91,9 +79,6 @@ def test_the_authors_weights_are_known_by_their_table(tmp_path):
     few = replace(config.model, sensors=("digit", UNIVERSAL))
     write_safetensors(path, to_release(params_of(few), few), {})
     assert load_model(path).trained_sensors is None  # of another table, and without metadata
-
-
-# The start of a run ---------------------------------------------------------------------------------------------------
 
 
 def start(config, **paths):
@@ -185,9 +170,6 @@ def test_a_start_that_does_not_fit_names_the_options(stage1, tmp_path):
     assert np.array_equal(result[1]["touch"]["class_token"], params["touch"]["class_token"])
 
 
-# CLIP -----------------------------------------------------------------------------------------------------------------
-
-
 def test_clip_gives_the_towers_and_without_stage_one_the_touch_encoder(stage1, tmp_path):
     config = tiny_config(2, "paper", "pretrained")
     clip = params_of(config.model, seed=9)
@@ -259,9 +241,6 @@ def test_files_of_every_kind_hold_the_same(torch_files, tmp_path):
     assert not list(tmp_path.glob(".*"))  # no leftovers of the atomic write
 
 
-# Files of other programs ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod.", "model.", "model._orig_mod."])
 def test_prefixes_are_removed_in_every_format(torch_files, tmp_path, prefix):
     weights = {f"{prefix}{key}": value for key, value in weights_of(STAGE1).items()}
@@ -313,3 +292,38 @@ def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
         (tmp_path / name).write_text(text)
         with pytest.raises(UserError, match=f"is {kind}"):
             load_model(tmp_path / name)
+
+
+# torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x 3 image
+UP = [
+    [-0.220484018, 0.204530478, 2.152891397, 4.220484257], [1.355409384, 1.418546438, 2.801180124, 4.506895065],
+    [1.893125772, 1.390535593, 1.888761282, 3.028749228], [1.005151987, 0.140684366, 0.073182821, 0.851293325],
+]  # fmt: skip
+DOWN = [[0.572738647, 3.497573853], [1.071792603, 1.381332397]]
+
+
+@pytest.mark.parametrize("expected", [UP, DOWN])
+def test_equal_to_torch(expected):
+    table = np.concatenate([[[100.0, -100.0]], np.stack([np.arange(9) ** 2 % 7, -(np.arange(9) ** 2 % 7)], 1)])
+    flat = np.ravel(expected)
+    resized = resize_position(table.astype("f4"), 1 + len(flat))
+    assert resized.dtype == np.float32
+    np.testing.assert_array_equal(resized[0], table[0])  # the class token's row
+    np.testing.assert_allclose(resized[1:], np.stack([flat, -flat], 1), atol=1e-6)
+
+
+def test_rows_of_sensors_go_by_name():
+    table = np.arange(6.0).reshape(3, 2)
+    stored, wanted = ("digit", "gelsight", UNIVERSAL), ("gelsight", "my_gel", UNIVERSAL, "digit")
+    np.testing.assert_array_equal(match_sensors(table, stored, wanted), table[[1, 2, 2, 0]])
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_sensors_outside_training_get_the_universal_row_or_the_mean(drawn):
+    model = tiny_config().model
+    table = np.random.default_rng(0).normal(size=(len(model.sensors), 2, 3))
+    served = serve_unseen({"sensor_tokens": table}, model, ["digit", "gelsight"], universal_drawn=drawn)
+    rows = [model.sensors.index(name) for name in ("gelsight", "digit")]
+    expected = np.broadcast_to(table[model.universal_row] if drawn else table[rows].mean(0), table.shape).copy()
+    expected[rows] = table[rows]
+    np.testing.assert_allclose(served["sensor_tokens"], expected, atol=1e-12)

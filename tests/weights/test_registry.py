@@ -1,7 +1,3 @@
-"""Encoders by name: in the package, on the hub (a local stand-in), and paths."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""Encoders of photographs as the start of the touch encoder: DINOv2, ViT-MAE, ViT and CLIP."""
-
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -105,11 +101,9 @@ def test_another_form_or_family_is_one_sentence(tmp_path):
     config = run_of(load_encoder(source))
     fresh = build(config.model).init(jax.random.key(0))
     wrong = {
-        "--model.no-pre-norm": {"pre_norm": True},
-        "--model.norm-eps 1e-12": {"norm_eps": 1e-5},
-        "--model.touch.width 16": {"touch": Stack(32, 2, 2, 32)},
-        "--model.activation": {"activation": "quick_gelu"},
-    }
+        "--model.no-pre-norm": {"pre_norm": True}, "--model.norm-eps 1e-12": {"norm_eps": 1e-5},
+        "--model.touch.width 16": {"touch": Stack(32, 2, 2, 32)}, "--model.activation": {"activation": "quick_gelu"},
+    }  # fmt: skip
     for option, change in wrong.items():
         with pytest.raises(UserError, match=option):
             load_start(fresh, replace(config, model=replace(config.model, **change)), init=source)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -18,11 +16,9 @@ def _draws(matches, anchor, count=200):
 
 def test_negatives_are_elsewhere_and_by_option_of_another_object():
     keys = _keys(
-        touch=[0, 0, 1, 2, 2, -1, -1, -1, -1],
-        sensor=[0, 1, 0, 0, 1, 0, 0, 0, 0],
-        object=[5, 5, 5, 6, 6, 6, 5, -1, -1],
+        touch=[0, 0, 1, 2, 2, -1, -1, -1, -1], sensor=[0, 1, 0, 0, 1, 0, 0, 0, 0], object=[5, 5, 5, 6, 6, 6, 5, -1, -1],
         dataset=[0, 0, 0, 0, 0, 0, 0, 0, 1],
-    )
+    )  # fmt: skip
     matches = Matches(np.arange(9), keys, other_object=True)
     assert matches.anchors.tolist() == [0, 1, 3, 4]
     # 2 is the same object, 6 too; 7 may be the very same place; 8 is of another data set.

@@ -1,7 +1,3 @@
-"""Large data in parts of whole shards: the draws, and what a host of many reads."""
-
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

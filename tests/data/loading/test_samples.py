@@ -1,7 +1,3 @@
-"""Samples: cache, augmentation, and bad files that are named, or replaced and counted."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -12,15 +8,14 @@ from batch_leaves import assert_same
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading import samples
 from anytouch_jax.data.loading.loader import Loader
-from anytouch_jax.data.loading.samples import SampleError, fill_slot
+from anytouch_jax.data.loading.samples import SampleError, evaluation, fill_slot
 from anytouch_jax.data.transforms import TOUCH, augmentation_rng, subtract_background, touch_transform
 from anytouch_jax.errors import UserError
 
 
 def test_cached_frames_change_no_byte_and_are_read_once(make, settings, monkeypatch):
     rows = [{"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"} for i in range(8)]
-    manifest = make(rows)
-    noise = np.random.default_rng(0)
+    manifest, noise = make(rows), np.random.default_rng(0)
     for name in (*(f"f{i}" for i in range(8)), "gel0", "gel1"):
         path = Path(manifest.file(0)).with_name(f"{name}.png")
         assert cv2.imwrite(str(path), noise.integers(0, 255, (45, 60, 3), np.uint8))
@@ -57,9 +52,7 @@ def test_augmentation_does_not_depend_on_the_batch(make, settings):
         images_of[size] = {frame.tobytes() for step in range(6 // size) for frame in loader.batch(step).clip}
         assert len(images_of[size]) == 6
     assert images_of[2] == images_of[3] == images_of[6]  # epoch 0 is the same set of six images
-    assert not images_of[6] & {
-        frame.tobytes() for frame in Loader(manifest, settings(plain=False, batch_size=6)).batch(1).clip
-    }
+    assert not images_of[6] & {frame.tobytes() for frame in loader.batch(1).clip}
 
 
 def _truncate(path):
@@ -136,9 +129,8 @@ def test_only_bad_samples_end_in_an_error(make, settings):
     manifest = make([{}, {}])
     for i in range(2):
         manifest.file(i).unlink()
-    with pytest.raises(
-        SampleError, match=r"20 samples in a row .* step 0; the last one is row \d of .*there is no file"
-    ):
+    words = r"20 samples in a row .* step 0; the last one is row \d of .*there is no file"
+    with pytest.raises(SampleError, match=words):
         Loader(manifest, settings(on_bad_sample="skip")).batch(0)
 
 
@@ -149,3 +141,44 @@ def test_a_bad_picture_names_its_column(make, settings):
         Loader(manifest, settings(2)).batch(0)
     _, batch, info = next(Loader(manifest, settings(2, on_bad_sample="skip")).stream(0, 1))
     assert info["skipped_samples"] >= 1 and 1 not in batch.align.image[:, 14, 14, 0] - 1
+
+
+def _clips(make, **extra):
+    return make([{"sequence": f"s{i // 6}", "frame_index": i % 6, **extra} for i in range(12)])
+
+
+def test_rows_come_in_the_order_given_and_the_last_batch_is_filled_up(make, settings, read_back):
+    manifest = _clips(make)
+    rows = np.array([7, 0, 11, 3, 3, 9])
+    got = list(evaluation(manifest, rows, settings(plain=False)))
+    assert [ids.tolist() for ids, _ in got] == [[7, 0, 11, 3], [3, 9]]
+    for ids, batch in got:
+        assert batch.clip.shape == (4, 1, 28, 28, 3) and batch.sensor.tolist() == [1] * 4
+        assert read_back(batch.clip)[:, 0].tolist() == [*ids, *[ids[-1]] * (4 - len(ids))]
+    for (_, a), (_, b) in zip(got, evaluation(manifest, rows, settings(threads=0)), strict=True):
+        np.testing.assert_array_equal(a.clip, b.clip)  # no augmentation in either
+    assert list(evaluation(manifest, np.array([], int), settings())) == []
+
+
+@pytest.mark.parametrize("frames", [None, 3, 5])
+def test_clips_end_at_their_row(make, settings, read_back, frames):
+    manifest, length = _clips(make), frames or 3
+    rows = np.array([11, 5, 4])
+    ((ids, batch),) = evaluation(manifest, rows, settings(), "clip", frames=frames)
+    assert ids.tolist() == [11, 5, 4]
+    assert read_back(batch.clip)[:3].tolist() == [list(range(r - length + 1, r + 1)) for r in rows]
+    with pytest.raises(UserError, match=r"row 7 of .*manifest\.csv does not end a clip of 3 frames \(nor do 1 other"):
+        evaluation(manifest, np.array([5, 7, 6]), settings(), "clip")
+    with pytest.raises(UserError, match="does not end a clip of 30 frames"):
+        evaluation(manifest, np.array([5]), settings(), "clip", frames=30)
+
+
+def test_bad_rows_are_named_or_left_out(make, settings, read_back):
+    manifest = _clips(make)
+    for row in (0, 2, 8, 9, 10, 11):
+        manifest.file(row).unlink()
+    with pytest.raises(SampleError, match=r"row 0 of .*f0\.png"):
+        list(evaluation(manifest, np.arange(12), settings()))
+    got = list(evaluation(manifest, np.arange(12), settings(on_bad_sample="skip")))
+    assert [ids.tolist() for ids, _ in got] == [[1, 3], [4, 5, 6, 7]]  # a batch of nothing but bad rows is not given
+    assert read_back(got[0][1].clip)[:, 0].tolist() == [1, 3, 3, 3]

@@ -1,7 +1,3 @@
-"""Windows over rows where frame numbers are hard: time stamps in ns, blocks, strides beyond the recording."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,3 @@
-"""Pictures that stay where they are: in tars, in columns of Parquet files, in an object store."""
-
-from __future__ import annotations
-
 import io
 import os
 import tarfile

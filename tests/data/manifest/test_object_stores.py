@@ -1,7 +1,5 @@
 """Object stores that answer over HTTP: a corpus in S3 and on the Hugging Face hub, both served here."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import threading
@@ -100,11 +98,9 @@ def bucket(corpus, monkeypatch):
     server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     for name, value in {
-        "AWS_ENDPOINT_URL": "http://{}:{}".format(*server.get_host_and_port()),
-        "AWS_ACCESS_KEY_ID": "testing",
-        "AWS_SECRET_ACCESS_KEY": "testing",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }.items():
+        "AWS_ENDPOINT_URL": "http://{}:{}".format(*server.get_host_and_port()), "AWS_ACCESS_KEY_ID": "testing",
+        "AWS_SECRET_ACCESS_KEY": "testing", "AWS_DEFAULT_REGION": "us-east-1",
+    }.items():  # fmt: skip
         monkeypatch.setenv(name, value)
     system = fsspec.filesystem("s3", skip_instance_cache=True)
     type(system).clear_instance_cache()

@@ -17,6 +17,7 @@ from anytouch_jax.data.prepare.captions import AnnotateError, Endpoint, annotate
 from anytouch_jax.data.prepare.prompts import find_caption_jobs, make_prompt
 from anytouch_jax.data.prepare.shards import pack
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import lock
 
 
 @pytest.fixture(autouse=True)
@@ -69,9 +70,6 @@ def _words(body):
     return body["messages"][1]["content"][0]["text"]
 
 
-# What is asked ----------------------------------------------------------------------------------------------------
-
-
 def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, tmp_path):
     loose = make(_rows())
     with serve() as server:
@@ -88,20 +86,13 @@ def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, t
     assert "photograph" in _words(server.asked[0])
 
 
-def test_one_photograph_of_an_object_is_asked_about_once(make, tmp_path):
-    rows = [
-        row | {"dataset": "tacquad", "touch": f"place{i // 3}", "image_path": "mug.png"}
-        for i, row in enumerate(_rows())
-    ]
-    loose = make(rows)
+def test_one_photograph_and_one_touch_by_two_sensors_are_asked_about_once_and_pictures_are_made_small(make, tmp_path):
+    rows = [row | {"dataset": "tacquad", "touch": f"p{i // 3}", "image_path": "a.png"} for i, row in enumerate(_rows())]
     told = []
     with serve() as server:
-        done = _run(loose, server, tmp_path / "answers", confirm=lambda estimate: told.append(estimate) or True)
+        done = _run(make(rows), server, tmp_path / "one", confirm=lambda estimate: told.append(estimate) or True)
     assert len(server.asked) == done.requests == told[0].questions == 1
     assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
-
-
-def test_a_touch_by_two_sensors_has_one_caption_and_pictures_are_made_small(make, tmp_path):
     rows = _rows(2, "tacquad", touch="place")
     rows += [{"sequence": "alone", "dataset": "tacquad", "image_path": "big.png"}]
     loose = make(rows)
@@ -168,9 +159,6 @@ def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):
         find_caption_jobs(loose, families={"mine": "photo"})
 
 
-# Money ------------------------------------------------------------------------------------------------------------
-
-
 def test_nothing_is_asked_before_it_is_confirmed(make, tmp_path):
     estimates = []
     with serve() as server:
@@ -228,9 +216,6 @@ def test_an_interrupted_run_goes_on_and_asks_a_cut_line_again(make, tmp_path):
         assert len(server.asked) == 5 and len(done.captions) == 8
         _run(loose, server, tmp_path / "answers")
         assert len(server.asked) == 5
-
-
-# Failures ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_passing_failure_is_tried_again_and_a_refusal_is_not():
@@ -365,9 +350,6 @@ def test_a_run_of_failures_stops_the_spending(make, tmp_path):
     assert threading.active_count() < 8
 
 
-# The key ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_key_is_in_no_file_and_no_message(make, tmp_path, capfd):
     """A server that quotes the key in its answers and its errors, one of which is cut within the key."""
     said = []
@@ -457,9 +439,6 @@ def test_other_servers_can_be_spoken_to():
         assert _ask(server)[:2] == ("I will not", "refusal")
 
 
-# The sheet --------------------------------------------------------------------------------------------------------
-
-
 def test_the_sheet_holds_its_pictures_and_escapes_words(make, tmp_path):
     loose = make(_rows(5))
     tricky = {"object": "<script>", "caption": "Soft & <b>warm</b> to the touch."}
@@ -490,14 +469,20 @@ def test_many_pictures_that_cannot_be_read_bar_no_question(make, tmp_path):
     assert len((tmp_path / "answers" / "failures.jsonl").read_text().splitlines()) == 30
 
 
+REFUSED = (400, {}, {"error": "no"})
+
+
+def ten(number, _):
+    """Answers to ten questions."""
+    return (200, {}, chat(GOOD)) if number < 10 else REFUSED
+
+
 def test_what_failed_the_last_time_is_asked_last(make, tmp_path):
     loose, folder = make(_rows(40)), tmp_path / "answers"
-    refuse = (400, {}, {"error": "no"})
-    with serve(lambda *_: refuse) as server, pytest.raises(AnnotateError, match="in a row failed"):
+    with serve(lambda *_: REFUSED) as server, pytest.raises(AnnotateError, match="in a row failed"):
         _run(loose, server, folder, threads=1)
     assert len((folder / "failures.jsonl").read_text().splitlines()) == 25
-    good = lambda number, _: (200, {}, chat(GOOD)) if number < 10 else refuse  # noqa: E731
-    with serve(good) as server:
+    with serve(ten) as server:
         assert len(_run(loose, server, folder, threads=1, limit=35).captions) == 10
     with serve() as server:
         assert len(_run(loose, server, folder).captions) == 40
@@ -505,23 +490,14 @@ def test_what_failed_the_last_time_is_asked_last(make, tmp_path):
 
 
 def test_many_questions_that_are_always_refused_do_not_keep_back_the_answers(make, tmp_path):
-    loose, folder = make(_rows(60)), tmp_path / "answers"
-    answered = []
-
-    def never(number, body):  # all but ten
-        answered.append(number)
-        return (200, {}, chat(GOOD)) if len(answered) <= 10 else (400, {}, {"error": "no"})
-
-    with serve(never) as server:
-        done = _run(loose, server, folder, threads=1)
+    with serve(ten) as server:
+        done = _run(make(_rows(60)), server, tmp_path / "answers", threads=1)
     assert len(server.asked) == 35 and len(done.captions) == 10 and len(done.failures) == 50
     assert done.failures[-1].reason.startswith("not asked")
     assert done.manifest.present("text").sum() == 30  # three rows a touch
 
 
 def test_two_processes_do_not_pay_for_the_same_answers(make, tmp_path):
-    from anytouch_jax.files import lock
-
     loose, folder = make(_rows(3)), tmp_path / "answers"
     folder.mkdir()
     with serve() as server, lock(folder / ".lock"), pytest.raises(AnnotateError, match="another process asks for"):

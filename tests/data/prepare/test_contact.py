@@ -1,10 +1,7 @@
-"""The contact filter on gels drawn here: a lit slope with marker dots, pressed or not, sheared or not."""
-
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
+from checked_world import columns
 from press_films import gel_frame, press_film
 
 from anytouch_jax.data.images import decode
@@ -86,17 +83,16 @@ def test_the_background_is_found_among_presses_at_changing_places():
 def world(tmp_path):
     """world(rows): a manifest of rows (name, picture, cells); a `background_path` of "bg.png" is the untouched gel."""
 
-    def build(rows, **columns):
+    def build(rows, **more):
         cv2.imwrite(str(tmp_path / "bg.png"), gel()[..., ::-1])
-        full = []
-        usual = {"sensor": "gelsight_mini", "sequence": "s", "split": "train"}
+        full, usual = [], {"sensor": "gelsight_mini", "sequence": "s", "split": "train"}
         for i, (name, picture, cells) in enumerate(rows):
             if picture is not None:
                 cv2.imwrite(str(tmp_path / name), picture[..., ::-1])
             full.append({"path": name, "frame_index": i, **usual, **cells})
         names = {key: None for row in full for key in row}
         table = {key: [row.get(key) for row in full] for key in names}
-        return manifests.from_columns({**table, **columns}, tmp_path / "m.parquet")
+        return manifests.from_columns({**table, **more}, tmp_path / "m.parquet")
 
     return build
 
@@ -220,9 +216,7 @@ def test_a_picture_of_the_untouched_gel_decides_what_the_frames_cannot(world, tm
 
 
 def _marked(manifest, scores, **kwargs):
-    return c.mark_contact(
-        manifest, c.ContactScores(np.array(scores, np.float32), np.full(len(scores), "given", object)), **kwargs
-    )
+    return c.mark_contact(manifest, _scores(scores), **kwargs)
 
 
 def test_marks_keep_what_the_dataset_says_and_what_is_unknown(world):
@@ -282,9 +276,7 @@ def test_one_odd_file_ends_nothing(tmp_path):
     (tmp_path / "data" / "3.png").unlink()
     (tmp_path / "data" / "3.png").symlink_to(tmp_path / "away.png")
     cv2.imwrite(str(tmp_path / "data" / "5.png"), np.zeros((3, 180, 3), np.uint8))
-    columns = {"path": [f"{n}.png" for n in range(12)], "sensor": ["digit"] * 12, "sequence": ["s"] * 12,
-               "frame_index": list(range(12)), "split": ["train"] * 12}  # fmt: skip
-    manifest = manifests.from_columns(columns, tmp_path / "data" / "m.csv")
+    manifest = manifests.from_columns(columns(12), tmp_path / "data" / "m.csv")
     scores = c.contact_scores(manifest, workers=1)
     assert np.flatnonzero(np.isnan(scores.score)).tolist() == [3, 5]
     for number in (6, 7, 8, 9, 10):
@@ -296,14 +288,9 @@ def test_one_odd_file_ends_nothing(tmp_path):
     assert "7.png" in lines[at + 3] and "`anytouch data verify`" in lines[at + 6]
 
 
-# Quality ------------------------------------------------------------------------------------------------------------
-
-
-def _manifest(folder, splits=None, **columns):
-    rows = len(next(iter(columns.values())))
-    table = {"path": [f"{i}.png" for i in range(rows)], "sensor": ["digit"] * rows, "sequence": ["s"] * rows,
-             "frame_index": list(range(rows)), "split": splits or ["train"] * rows}  # fmt: skip
-    return manifests.from_columns({**table, **columns}, folder / "m.parquet")
+def _manifest(folder, splits=None, **more):
+    rows = len(next(iter(more.values())))
+    return manifests.from_columns(columns(rows, split=splits or ["train"] * rows, **more), folder / "m.parquet")
 
 
 def _scores(values, reason="given"):
@@ -319,8 +306,8 @@ def test_precision_recall_and_correlation_on_a_table_of_hand(tmp_path):
     assert got.parts == {"sensor digit": (5, 2 / 3, 2 / 3), "background given": (5, 2 / 3, 2 / 3)}
     strict = c.contact_quality(manifest, _scores([1, 2, 9, 9, 9, 9]), above=1.0)
     assert (strict.positives, strict.recall) == (2, 1.0)
-    splits, columns = ["train", "test", "background"], {"label.contact": [1, 0, 0], "label.contact_score": [9.0, 9, 1]}
-    manifest, scores = _manifest(tmp_path, splits, **columns), _scores([9, 9, 9])
+    splits, labels = ["train", "test", "background"], {"label.contact": [1, 0, 0], "label.contact_score": [9.0, 9, 1]}
+    manifest, scores = _manifest(tmp_path, splits, **labels), _scores([9, 9, 9])
     assert c.contact_quality(manifest, scores).rows == 2  # background rows say nothing
     free = c.contact_quality(_manifest(tmp_path, **{"label.contact": [0]}), _scores([9]))
     assert free.precision == 0 and np.isnan(free.recall)
@@ -362,9 +349,7 @@ def test_an_estimated_gel_is_stored_and_becomes_the_background(tmp_path):
     pictures, contact = press_film("dotted", 0.5, frames=16)
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture[..., ::-1])
-    columns = {"path": [f"{number}.png" for number in range(16)], "sensor": ["gelsight_mini"] * 16,
-               "sequence": ["a"] * 16, "frame_index": list(range(16)), "split": ["train"] * 16}  # fmt: skip
-    table = manifests.from_columns(columns, tmp_path / "a.csv")
+    table = manifests.from_columns(columns(16), tmp_path / "a.csv")
     stored = c.store_backgrounds(table, c.contact_scores(table), tmp_path / "gels")
     assert len({stored.file(row, "background_path") for row in range(16)}) == 1
     free = np.mean([decode(stored.file(row)) for row in np.flatnonzero(~contact)], axis=0)

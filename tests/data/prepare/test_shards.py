@@ -54,9 +54,6 @@ def _assert_same_batches(one, two, config, steps=5):
         assert_same(a, b)
 
 
-# What is stored ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("stage", "recipe", "threads"), [(1, "paper", 0), (2, "paper", 3), (2, "release", 2)])
 @pytest.mark.parametrize("shard_bytes", [1, 1 << 30])
 def test_a_packed_manifest_gives_the_same_batches_byte_for_byte(
@@ -137,9 +134,6 @@ def test_packed_manifests_go_on_working_when_filtered_moved_or_packed_again(make
         assert packed.read_file(part.file(row)) == loose.file(old).read_bytes()
     twice = manifests.read(pack(part, tmp_path / "twice"))
     assert packed.read_file(twice.file(1)) == loose.file(3).read_bytes()
-
-
-# Interruptions ----------------------------------------------------------------------------------------------------
 
 
 def _bytes_of(folder):
@@ -234,9 +228,6 @@ def test_a_file_that_cannot_be_packed_is_named(make, tmp_path, harm):
     } <= {".lock"}
 
 
-# Damage -----------------------------------------------------------------------------------------------------------
-
-
 def _harm(shard, harm, row):
     at, data = int(packed.read_shard_index(shard)[row]["offset"]), bytearray(shard.read_bytes())
     if harm in ("short", "compressed"):
@@ -272,9 +263,6 @@ def test_damage_is_one_sentence_with_shard_and_row(make, settings, tmp_path, har
         loader = Loader(again, settings(1, threads=2, batch_size=24, clip_share=0.0, on_bad_sample="skip"))
         ((_, _, info),) = loader.stream(0, 1)
         assert info["skipped_samples"] >= 1
-
-
-# Reading ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_random_file_costs_one_read_of_its_length_and_pieces_are_put_together(make, tmp_path, monkeypatch):
@@ -369,9 +357,6 @@ def test_a_pack_under_way_is_not_taken_over_before_its_first_shard(make, tmp_pat
     for line in (out / "SHA256SUMS").read_text().splitlines():
         digest, name = line.split("  ")
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
-
-
-# Shards of version 1 ----------------------------------------------------------------------------------------------
 
 
 def _version_1(loose, out):

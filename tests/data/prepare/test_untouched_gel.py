@@ -1,7 +1,3 @@
-"""Estimates of the untouched gel on films made here, pressed for 10 to 95 % of the time."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from press_films import LOOKS, SENSORS, gel_frame, press_film

@@ -13,9 +13,11 @@ from checked_world import finding_rows, image_pairs, patterned, plain_rows, with
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import replace_column, select_rows
+from anytouch_jax.data.prepare.licences import NO, UNKNOWN, YES, allows, commercial_only, commercial_use, licences
 from anytouch_jax.data.prepare.repair import repair
 from anytouch_jax.data.prepare.shards import pack
 from anytouch_jax.data.prepare.verify import split_hash, verify
+from anytouch_jax.errors import UserError
 
 
 @pytest.fixture
@@ -28,9 +30,6 @@ IMAGE = cv2.resize(np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8
 
 def _encoded(suffix, image=IMAGE):
     return cv2.imencode(suffix, image)[1].tobytes()
-
-
-# Files ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_clean_manifest_has_no_findings(make):
@@ -151,9 +150,6 @@ def test_a_size_that_is_not_the_sensors_is_found(make):
     assert finding_rows(report) == {"wrong_size": [2, 7]} and report.ok
     assert "20 x 20, where most of its sensor or sequence are 16 x 12" in report.findings[0].examples[0]
     assert "12 x 16, where most of its sensor or sequence are 50 x 40" in report.findings[0].examples[1]
-
-
-# Rows -------------------------------------------------------------------------------------------------------------
 
 
 def test_duplicates_leaks_and_repeated_rows_are_told_apart(make):
@@ -280,9 +276,6 @@ def test_the_report_is_whole_as_json(make):
     assert finding["count"] == 1100 and finding["rows"] == list(range(1000)) and len(finding["examples"]) == 5
 
 
-# Swapped ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("witness", [True, False])
 def test_some_swapped_rows_are_pointed_at_and_what_is_not_swapped_is_not_suspected(make, tmp_path, witness):
     loose = image_pairs(tmp_path, make, swap=lambda i: i % 4 == 1, witness=witness)
@@ -293,9 +286,6 @@ def test_some_swapped_rows_are_pointed_at_and_what_is_not_swapped_is_not_suspect
     if not witness:  # a photograph is none
         loose = replace_column(loose, "background_path", ["see3.png"] * 24)
     assert {"swapped", "swapped_rows"}.isdisjoint(finding_rows(verify(loose)))
-
-
-# Splits -----------------------------------------------------------------------------------------------------------
 
 
 def test_the_split_hash_sees_splits_and_nothing_else(make):
@@ -315,9 +305,6 @@ def test_the_split_hash_sees_splits_and_nothing_else(make):
     assert split_hash(without) != split_hash(dash)
 
 
-# Manifests that come from elsewhere -------------------------------------------------------------------------------
-
-
 def test_a_csv_with_bom_quotes_and_strange_names_is_verified(make, tmp_path):
     names = ["plain.png", "with space.png", "grün,kommatisch.png", 'quo"te.png', "日本/語 #1.png", "line\nbreak.png"]
     loose = make([{"path": name} for name in names])
@@ -327,3 +314,108 @@ def test_a_csv_with_bom_quotes_and_strange_names_is_verified(make, tmp_path):
     assert got.column("path").to_pylist() == names and verify(got).findings == ()
     again = manifests.read(pack(got, tmp_path / "out"))
     assert verify(again).findings == ()
+
+
+@pytest.mark.parametrize("witness", [True, False])
+def test_a_swapped_dataset_is_suspected_and_mended_only_with_a_witness(make, tmp_path, witness):
+    loose = image_pairs(tmp_path, make, swap=lambda i: True, witness=witness)
+    report = verify(loose)
+    (finding,) = (f for f in report.findings if f.kind == "swapped")
+    assert finding.rows.tolist() == list(range(24)) and finding.level == ("error" if witness else "warning")
+    assert ("suspected" in finding.sentence) != witness and "'tvl'" in finding.sentence
+    fixed = repair(loose, report)
+    if not witness:
+        assert not fixed.done and any("swapped" in sentence for sentence in fixed.left)
+        fixed = repair(loose, report, swap=["tvl"])
+    assert len(fixed.done) == 1 and not any("swapped" in sentence for sentence in fixed.left)
+    assert fixed.manifest.column("path").to_pylist()[:2] == ["see0.png", "see1.png"]
+    assert fixed.manifest.column("image_path").to_pylist()[:2] == ["touch0.png", "touch1.png"]
+    assert "swapped" not in finding_rows(verify(fixed.manifest))
+    with pytest.raises(UserError, match="no dataset 'tlv' to swap; the manifest has tvl"):
+        repair(loose, report, swap=["tlv"])
+
+
+def test_an_exchanged_row_lives_by_its_new_touch_image(make, tmp_path):
+    loose = image_pairs(tmp_path, make, swap=lambda i: True, witness=True)
+    (tmp_path / "touch3.png").unlink()  # a photograph, in truth
+    (tmp_path / "see5.png").write_bytes(b"")  # a touch image, in truth
+    fixed = repair(loose, verify(loose), swap=["tvl"])
+    kept = fixed.manifest.column("path").to_pylist()
+    assert "see5.png" not in kept and kept[3] == "see3.png" and fixed.manifest.value(3, "image_path") is None
+    assert len(kept) == 24
+
+
+def test_repair_says_when_it_cannot_or_may_not(make, tmp_path):
+    loose = make(plain_rows())
+    with pytest.raises(UserError, match="of another manifest"):
+        repair(select_rows(loose, np.arange(3)), verify(loose))
+    manifests.write(loose, tmp_path / "manifest.csv")
+    before = (tmp_path / "manifest.csv").read_bytes()
+    loose = manifests.read(tmp_path / "manifest.csv")
+    loose.file(0).unlink()
+    fixed = repair(loose, verify(loose))
+    assert (tmp_path / "manifest.csv").read_bytes() == before and len(fixed.manifest) == 5
+    for row in range(1, 6):
+        loose.file(row).unlink()
+    with pytest.raises(UserError, match="are the files really in"):
+        repair(loose, verify(loose))
+
+
+def test_a_row_is_dropped_for_one_reason_only(make):
+    loose = make([{"path": "one.png", "sequence": "s"}] * 2 + [{"path": "two.png"}])
+    loose.file(0).write_bytes(b"no picture")
+    assert repair(loose, verify(loose)).done == ("dropped 2 rows whose touch image cannot be used (2 unreadable)",)
+
+
+def test_backgrounds_that_changed_places_too_are_no_witness(make, tmp_path):
+    """TVL: the frames without contact lie in the same two folders as the others."""
+    loose = image_pairs(tmp_path, make, swap=lambda i: True, witness=False)
+    split = ["background" if i % 4 == 0 else "train" for i in range(24)]
+    loose = replace_column(loose, "split", split)
+    loose = replace_column(loose, "background_path", ["touch0.png"] * 24)
+    report = verify(loose)
+    (finding,) = (f for f in report.findings if f.kind == "swapped")
+    assert finding.level == "warning" and "suspected" in finding.sentence
+    fixed = repair(loose, report, swap=["tvl"])
+    assert fixed.manifest.column("path").to_pylist()[:2] == ["see0.png", "see1.png"]
+    assert fixed.manifest.column("background_path").null_count == 24
+
+
+def test_backgrounds_go_with_the_dataset_that_is_exchanged(make, tmp_path):
+    loose = image_pairs(tmp_path, make, swap=lambda i: True, witness=True)
+    split = ["background" if i % 4 == 0 else "train" for i in range(24)] + ["background"]
+    loose = replace_column(loose, "split", split)
+    fixed = repair(loose, verify(loose))
+    assert fixed.manifest.column("path").to_pylist()[:24] == [f"see{i}.png" for i in range(24)]
+
+
+@pytest.mark.parametrize(
+    ("licence", "use"),
+    [
+        ("MIT", YES), ("mit license", YES), ("Apache-2.0", YES), ("Apache 2.0 License", YES), ("BSD-3-Clause", YES),
+        ("CC-BY-4.0", YES), ("CC BY-SA 4.0", YES), ("CC0", YES), ("CC-BY-NC-4.0", NO), ("CC BY-NC-SA 4.0", NO),
+        ("non-commercial", NO), ("for research use only", NO), ("academic only", NO), ("Noncommercial terms", NO),
+        ("custom", UNKNOWN), ("", UNKNOWN), (None, UNKNOWN), ("MIT, data under other terms", UNKNOWN),
+        ("ncsa", UNKNOWN),
+    ],
+)  # fmt: skip
+def test_licences_by_name(licence, use):
+    assert allows(licence) == use
+
+
+def test_commercial_rows_are_those_that_certainly_are(make):
+    cases = [("MIT", None), ("MIT", True), ("MIT", False), ("CC-BY-NC-4.0", True), (None, True), (None, None),
+             ("custom", True), ("custom", None)]  # fmt: skip
+    rows = [{"license": name, "commercial": flag, "dataset": f"d{i % 2}"} for i, (name, flag) in enumerate(cases)]
+    loose = make(rows)
+    assert commercial_use(loose).tolist() == [YES, YES, NO, NO, YES, UNKNOWN, YES, UNKNOWN]
+    kept = commercial_only(loose)
+    assert kept.manifest.column("path").to_pylist() == [f"f{i}.png" for i in (0, 1, 4, 6)]
+    assert (kept.non_commercial, kept.unknown) == (2, 2)
+    assert kept.manifest.where(3) == loose.where(6)
+    report = verify(loose)
+    assert finding_rows(report) == {"licence_conflict": [3]} and "'CC-BY-NC-4.0'" in report.findings[0].examples[0]
+    result = licences(loose)
+    assert sum(entry.rows for entry in result) == 8 and result[0] == ("MIT", YES, ("d0", "d1"), 2)
+    with pytest.raises(UserError, match=r"2 may not, 2 do not say"):
+        commercial_only(select_rows(loose, np.array([2, 3, 5, 7])))

@@ -1,7 +1,5 @@
 """One fixture: index a small dataset, and check what must hold for every manifest."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

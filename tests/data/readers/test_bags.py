@@ -1,7 +1,3 @@
-"""Recordings of robots: MCAP files, ROS 1 and ROS 2 bags written in the test, images by time and labels by nearest."""
-
-from __future__ import annotations
-
 import base64
 import json
 import sys
@@ -289,7 +285,5 @@ def test_the_nearest_value_within_a_tenth_of_a_second():
     series = [(0, "a"), (10**8, "b"), (10**9, "c")]
     times = np.array([-1, 4 * 10**7, 6 * 10**7, 5 * 10**8, 10**9 + 10**8, 2 * 10**9])
     assert bags.nearest_values(times, series) == ["a", "a", "b", None, "c", None]
-    assert bags.nearest_values(times[:2], []) == [None, None] and bags.nearest_values(times[:2], series[:1]) == [
-        "a",
-        "a",
-    ]
+    assert bags.nearest_values(times[:2], []) == [None, None]
+    assert bags.nearest_values(times[:2], series[:1]) == ["a", "a"]

@@ -1,7 +1,3 @@
-"""What readers share: listings without a look at the frames, numbers, hash splits, columns."""
-
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 
@@ -42,10 +38,8 @@ def test_links_hidden_files_and_odd_names_are_counted_not_followed(tmp_path, rea
 
 def test_no_frame_is_opened_or_stated(tmp_path, monkeypatch):
     fill_ycb(tmp_path, ("a", "b"), 50)
-    paths = []
-    real_stat, real_scan = os.stat, os.scandir
+    paths, scans, real_stat, real_scan = [], [], os.stat, os.scandir
     monkeypatch.setattr(os, "stat", lambda path, *a, **k: (paths.append(os.fspath(path)), real_stat(path, *a, **k))[1])
-    scans = []
     monkeypatch.setattr(os, "scandir", lambda path: (scans.append(os.fspath(path)), real_scan(path))[1])
     READERS["ycb_slide"].read(DatasetIndex("ycb_slide", tmp_path))
     assert not [path for path in paths if str(path).endswith(".jpg")]
@@ -57,11 +51,8 @@ def test_hash_splits_are_stable_disjoint_and_of_the_wanted_share():
     of = {f"o{k}": hash_split("x", f"o{k}", options) for k in range(4000)}
     shares = {split: sum(one == split for one in of.values()) / len(of) for split in ("train", "val", "test")}
     assert shares == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.03)
-    assert [hash_split("ycb_slide", name, IndexOptions(0.5, 0.25)) for name in ("mug", "hammer", "ball")] == [
-        "test",
-        "val",
-        "test",
-    ]  # fixed: a change of the rule moves every published split
+    fixed = [hash_split("ycb_slide", name, IndexOptions(0.5, 0.25)) for name in ("mug", "hammer", "ball")]
+    assert fixed == ["test", "val", "test"]  # a change of the rule moves every published split
     wider = replace(options, test=0.4)
     assert all(hash_split("x", name, wider) != "train" for name, split in of.items() if split != "train")
     assert {hash_split("x", f"o{k}", IndexOptions(0, 0)) for k in range(50)} == {"train"}

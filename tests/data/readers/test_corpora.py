@@ -1,7 +1,3 @@
-"""Corpora in shards: small look-alikes of gelsight-mini-pretrain and FoTa, on disk and in an object store."""
-
-from __future__ import annotations
-
 import io
 import json
 import tarfile
@@ -75,21 +71,27 @@ def test_shards_in_an_object_store_are_indexed_by_their_metadata(corpus, tmp_pat
         system.rm("/far", recursive=True)
 
 
-def write_tar(file, samples):
+def write_samples(file, samples):
+    """A tar with a file for each (name, data): numbers are pictures of that grey, others JSON or text."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with tarfile.open(file, "w") as archive:
-        for key, (value, labels) in samples.items():
-            for suffix, data in (("png", png(value)), ("json", json.dumps(labels).encode())):
-                info = tarfile.TarInfo(f"{key}.{suffix}")
-                info.size = len(data)
-                archive.addfile(info, io.BytesIO(data))
+        for name, value in samples:
+            text = value if isinstance(value, str) else json.dumps(value)
+            data = png(value) if isinstance(value, int) else text.encode()
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+
+
+def write_tar(file, samples):
+    """A tar with a picture and JSON for each key: (grey, labels)."""
+    files = {key: (("png", value), ("json", json.dumps(labels))) for key, (value, labels) in samples.items()}
+    write_samples(file, [(f"{key}.{end}", data) for key, both in files.items() for end, data in both])
 
 
 def test_fota_names_sensors_by_data_set_and_takes_labels_from_json(tmp_path):
     pose = {"x_mm": 1.5, "object_name": "key1", "nested": [1, 2]}
-    write_tar(
-        tmp_path / "panda_key1_Mini_Mini_left" / "train" / "data-000000.tar", {"a-0": (1, pose), "a-1": (2, pose)}
-    )
+    write_tar(tmp_path / "panda_key1_Mini_Mini_left/train/data-000000.tar", {"a-0": (1, pose), "a-1": (2, pose)})
     contact = {"has_contact": True, "contact_class": "rock"}
     write_tar(tmp_path / "touch_and_go" / "val" / "data-000000.tar", {"b": (3, json.dumps(contact)), "c": (4, contact)})
     report, rows = table_of(tmp_path, "fota")
@@ -118,18 +120,6 @@ def test_any_webdataset_is_read_with_a_sensor(tmp_path):
     write_tar(tmp_path / "shards" / "01.tar", {"x": (1, {"hardness": deep})})
     with pytest.raises(UserError, match=r"01\.tar, x\.json has more than 64 levels of JSON"):
         table_of(tmp_path, "webdataset", sensor="digit", val=0.0, test=0.5)
-
-
-def write_samples(file, samples):
-    """A tar with a file for each (name, data): numbers are pictures of that grey, others JSON or text."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with tarfile.open(file, "w") as archive:
-        for name, value in samples:
-            data = png(value) if isinstance(value, int) else value.encode() if isinstance(value, str) else None
-            data = json.dumps(value).encode() if data is None else data
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            archive.addfile(info, io.BytesIO(data))
 
 
 @pytest.mark.parametrize(

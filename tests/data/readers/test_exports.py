@@ -1,7 +1,3 @@
-"""Pictures that readers write belong to their source, and nothing of the user is changed."""
-
-from __future__ import annotations
-
 import os
 
 import cv2
@@ -39,9 +35,8 @@ def test_a_film_recorded_again_replaces_its_pictures_and_keeps_what_else_lies_th
     read("recordings", root, sensor="digit", export=True)
     assert os.stat(root / "mug/pour/000000.png").st_ino == before
     film(root / "mug/pour.avi", 200, count)
-    assert any(
-        "changed after its pictures in mug/pour" in one for one in read("recordings", root, sensor="digit").reasons
-    )
+    reasons = read("recordings", root, sensor="digit").reasons
+    assert any("changed after its pictures in mug/pour" in one for one in reasons)
     table = read("recordings", root, sensor="digit", export=True)
     assert greys(table, root) == {"mug/pour": [200] * count} and set(table["text"]) == {"mine"}
     assert not [one for one in (root / "mug").iterdir() if one.name.startswith(".")]

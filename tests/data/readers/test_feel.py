@@ -1,5 +1,3 @@
-"""Feel, its pickled splits and its HDF5 files."""
-
 import json
 import os
 import pickle

@@ -1,7 +1,3 @@
-"""Indexing: options, places of the manifest, links, missing folders, and edited manifests."""
-
-from __future__ import annotations
-
 import os
 
 import pytest
@@ -55,6 +51,9 @@ def test_folders_that_lead_elsewhere_are_refused(tmp_path):
     assert not list((tmp_path / "root").glob("*.parquet"))
 
 
+EMPTY = "visgel cloth objectfolder_real ycb_slide octopi tacquad tvl ssvtp feel objectfolder real_touch touch_and_go"
+
+
 @pytest.mark.parametrize(
     ("name", "renamed", "says"),
     [
@@ -64,21 +63,12 @@ def test_folders_that_lead_elsewhere_are_refused(tmp_path):
         ("objectfolder_real", "tactile/1/0/gelsite/0.png", "gelsight/<n>.png"),
         ("ycb_slide", "real/mug/dataset_0/frame/frame_0000000.jpg", "is ROOT the folder that holds 'real'"),
         ("octopi", "dataset/apple_0.mov.png", "process_dataset.py"),
+        *((name, None, "expected .*is ROOT the folder") for name in EMPTY.split()),
     ],
 )
-def test_a_renamed_folder_is_an_error(tmp_path, read, name, renamed, says):
-    fill(tmp_path, [renamed])
+def test_a_renamed_or_empty_folder_is_an_error(tmp_path, read, name, renamed, says):
+    fill(tmp_path, [renamed] if renamed else [])
     with pytest.raises(UserError, match=says):
-        read(name)
-
-
-EMPTY = ("visgel", "cloth", "objectfolder_real", "ycb_slide", "octopi", "tacquad", "tvl", "ssvtp", "feel",
-         "objectfolder", "real_touch", "touch_and_go")  # fmt: skip
-
-
-@pytest.mark.parametrize("name", EMPTY)
-def test_an_empty_folder_is_an_error(tmp_path, read, name):
-    with pytest.raises(UserError, match=r"expected .*is ROOT the folder"):
         read(name)
 
 
@@ -111,13 +101,9 @@ def test_an_edited_manifest_is_not_replaced_without_keep(tmp_path, read, edited,
     (tmp_path / "ball" / "2.png").unlink()
     report = index("recordings", tmp_path, out, options=options, keep=True)
     rows = {row["path"]: row for row in manifests.read(out).table.to_pylist()}
-    assert {path: row["split"] for path, row in rows.items() if row["split"] == "test"}.keys() == {
-        "mug/0.png",
-        "mug/1.png",
-        "mug/2.png",
-        "mug/3.png",
-        "mug/more/0.png",
-    }  # fmt: skip - new frames and recordings stand where their object does
+    # New frames and recordings stand where their object does.
+    tested = {path for path, row in rows.items() if row["split"] == "test"}
+    assert tested == {*(f"mug/{n}.png" for n in range(4)), "mug/more/0.png"}
     assert sum(row["label.material"] == "clay" for row in rows.values()) == 4 and len(rows) == 8
     assert rows["mug/3.png"]["label.material"] is None and "kept from hand" in " ".join(report.notes)
 

@@ -1,7 +1,3 @@
-"""A LeRobot data set (version 3) made here: read, embedded, written back; frame indices and time stamps agree."""
-
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -142,12 +138,10 @@ def test_a_data_set_is_embedded_and_the_features_are_a_column(root, tmp_path, ca
     ("cameras", "names"),
     [
         (["observation.left.tactile", "observation.right.tactile"], ["left", "right"]),
-        ([GEL, FILM], ["gel", "tactile_film"]),
-        (["a.left.gel", "a.left.gel.back"], ["a.left.gel", "a.left.gel.back"]),
-        (["gel_left", "gel_right"], ["gel_left", "gel_right"]),
-        ([GEL], [GEL]),
+        ([GEL, FILM], ["gel", "tactile_film"]), (["a.left.gel", "a.left.gel.back"], ["a.left.gel", "a.left.gel.back"]),
+        (["gel_left", "gel_right"], ["gel_left", "gel_right"]), ([GEL], [GEL]),
     ],
-)
+)  # fmt: skip
 def test_the_columns_of_cameras_are_called_by_what_distinguishes_them(cameras, names):
     assert lerobot.camera_names(cameras) == names
 
@@ -228,9 +222,8 @@ def test_every_value_that_is_asked_for_is_a_label_or_reported(root, value, label
     edit(root, lambda number: {"f": value(number)})
     report = index("lerobot", root, options=IndexOptions(sensor="digit", keys=(GEL,), values=("f",)))
     table = report.manifest.table
-    assert {name: table[name].to_pylist() for name in table.column_names if name.startswith("label.f")} == {
-        f"label.{name}": values for name, values in labels.items()
-    }
+    found = {name: table[name].to_pylist() for name in table.column_names if name.startswith("label.f")}
+    assert found == {f"label.{name}": values for name, values in labels.items()}
     assert any("no row has a value of label.f" in note for note in report.notes) == (not labels)
     assert any("not read: observation.force" in note for note in report.notes)
 
@@ -248,9 +241,7 @@ def test_splits_that_the_data_set_states_are_used(root, splits, expected):
     info = json.loads((root / "meta/info.json").read_text()) | {"splits": splits}
     (root / "meta/info.json").write_text(json.dumps(info))
     report = index("lerobot", root, options=IndexOptions(sensor="digit", keys=(GEL,), val=0.0, test=1.0))
-    found = dict(
-        zip(report.manifest.table["episode"].to_pylist(), report.manifest.table["split"].to_pylist(), strict=True)
-    )
+    found = dict(zip(*(report.manifest.table[name].to_pylist() for name in ("episode", "split")), strict=True))
     assert found == dict(enumerate(expected or ["test"] * 3))
     assert any("meta/info.json" in note for note in report.notes)
     (root / "meta/info.json").write_text(json.dumps(info | {"splits": {"train": "0:2", "test": "1:3"}}))

@@ -1,5 +1,3 @@
-"""TVL (HCT) and SSVTP."""
-
 import json
 
 import cv2
@@ -30,11 +28,8 @@ def _recording(root, name=REC, part="data1", count=6):
 
 def _contact(root, numbers, name=REC, part="data1", background="digit_background.png"):
     keys = [f"{name}/tactile/{_names(99)[i]}" for i in numbers]
-    table = {
-        "tactile": keys,
-        "vision": [k.replace("tactile", "vision") for k in keys],
-        "background": [background] * len(keys),
-    }
+    vision = [key.replace("tactile", "vision") for key in keys]
+    table = {"tactile": keys, "vision": vision, "background": [background] * len(keys)}
     (root / f"hct/{part}/contact.json").write_text(json.dumps(table))
 
 
@@ -56,10 +51,8 @@ def test_a_background_is_any_frame_of_a_recording_and_one_that_is_not_there_is_c
     _recording(tmp_path, count=60)
     late, lost = _names(60)[55], "0-9.000001.jpg"
     keys = [f"{REC}/tactile/{name}" for name in _names(3)]
-    contact = {
-        "tactile": keys,
-        "background": [f"{REC}/tactile/{late}", f"{REC}/tactile/{lost}", "digit_background.png"],
-    }
+    behind = [f"{REC}/tactile/{late}", f"{REC}/tactile/{lost}", "digit_background.png"]
+    contact = {"tactile": keys, "background": behind}
     (tmp_path / "hct/data1/contact.json").write_text(json.dumps(contact))
     table = read("tvl")
     behind = [table.rows[f"hct/data1/{key}"]["background_path"] for key in keys]

@@ -1,7 +1,3 @@
-"""Influence coefficients and their convolution, against sums, integrals and limits."""
-
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,3 @@
-"""Friction against Mindlin, Cattaneo and Lubkin, and the laws of Coulomb. One grid for all: 48 x 48."""
-
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

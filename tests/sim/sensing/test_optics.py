@@ -1,7 +1,3 @@
-"""Pictures of a deformed skin: what must not change, what must move, and how much."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,3 @@
-"""The sensors' records, their looks, and their units."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax.numpy as jnp

@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+from touch_world import make_touches
+
+from anytouch_jax.config import from_json, to_json
+from anytouch_jax.nn.functional import build
+from anytouch_jax.simulated import SIMULATED
+from anytouch_jax.weights.tree import flatten
+from experiments.encoders import lookalikes, motion
+from experiments.encoders.train import configure
+from experiments.pages.encoders import lookalikes as page
+from experiments.records import write_record
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_a_stage_is_understood(stage):
+    config = configure(stage, ["a.csv"], 3, {"data.batch_size": 16})
+    assert config.stage == stage and config.run.seed == 3 and config.data.batch_size == 16
+    assert config.data.manifests == (SIMULATED, "a.csv") and dict(config.data.weights)[SIMULATED] > 1
+    assert config.data.background == "either" and config.model.image_size == 112 and config.model.fields
+    assert from_json(to_json(config)) == config
+    assert (config.model.match_head == "cosine") == (stage == 2)
+
+
+def test_the_encoder_and_its_decoder_of_fields_keep_their_size():
+    params = build(configure(1, [], 0, {}).model).abstract()
+    millions = {name: sum(leaf.size for leaf in flatten(part).values()) / 1e6 for name, part in params.items()}
+    assert millions["touch"] < 4 and millions["fields"] < 2
+
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.slow
+def test_it_learns_a_field_that_no_mean_shows():
+    """The first two values of a token change with the field of a turn, whose mean over the picture is zero."""
+    n, side = 300, 4
+    y, x = np.mgrid[:side, :side].reshape(2, -1) / side - 0.375
+    sign = RNG.choice([-1.0, 1.0], n)
+    tokens = RNG.standard_normal((n, 2, side * side, 6)).astype(np.float32)
+    tokens[:, 1] = tokens[:, 0] + 0.1 * RNG.standard_normal(tokens[:, 0].shape)
+    tokens[:, 1, :, :2] += sign[:, None, None] * np.stack([-y, x], -1)
+    turn = np.where(sign > 0, *motion.TURNS)
+    split = np.array(["train", "train", "val", "test"])[np.arange(n) % 4]
+    clips = motion.Clips(tokens, turn, np.full(n, "none"), np.full(n, "digit"), split, np.arange(n))
+    splits = {name: np.flatnonzero(split == name) for name in ("train", "val", "test")}
+    found = motion.score(motion.fit(clips, splits["train"], splits["val"]), clips, splits["test"])
+    assert found["turn"]["share"] > 0.95 and found["slide"]["clips"] == 0
+    assert motion.pooled_score(clips, splits) < 0.75
+
+
+def test_a_perfect_encoder_finds_every_touch_and_noise_finds_chance(tmp_path, monkeypatch):
+    data = make_touches(tmp_path / "data", touches={"test": 52, "train": 2}, frames=1)
+    rng = np.random.default_rng(0)
+
+    def embed(encoder, table, rows, **_):
+        codes = table.codes("touch")[rows] if encoder != "noise" else np.arange(len(rows))
+        return rows, rng.normal(size=(1000, 16))[codes].astype(np.float32)
+
+    monkeypatch.setattr(lookalikes, "embed_rows", embed)
+    record = lookalikes.recall({"a": "perfect", "b": "noise"}, data)
+    scores = {name: one["share"] for name, one in record["scores"].items()}
+    assert set(scores) == {"a", "b", "pixels"} and record["touches"] == 52 * 3
+    assert scores["a"] == 1.0 and scores["b"] < 0.1
+    write_record(tmp_path / "lookalikes.jsonl", "fine", record | {"encoders": {"a": "mark"}})
+    made = page(tmp_path)
+    assert made.tables[0][0][:2] == ("fine alignment", "a") and made.readme["a"].mean == pytest.approx(100)
+    assert made.findings == [f"fine alignment: `a` finds 100 %, and pixels {100 * scores['pixels']:.0f} %."]

@@ -30,7 +30,7 @@ from anytouch_jax.sim import scene
 from anytouch_jax.sim.recorder import ClipOutput, Recorder
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import photo
-from anytouch_jax.sim.sensing.sensors import SENSORS
+from anytouch_jax.sim.sensing.own import find_sensor
 from anytouch_jax.sim.world import captions, objects
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
@@ -149,10 +149,10 @@ def _write_recording(
     scenes: Scenes, thing: objects.Object, recording: Recording, take: ClipOutput, out: Path
 ) -> list[Row]:
     """Write the files of one recording. Returns the rows of its frames and of its background."""
-    touch, kind = recording.touch, SENSORS[recording.sensor].kind
-    name = f"{touch.number:06d}-{recording.sensor}"
-    common = _common_row(scenes, thing, recording) | {"sequence": name}
-    folder = Path(recording.sensor) / f"{touch.number:06d}"
+    touch, sensor = recording.touch, find_sensor(recording.sensor)
+    kind, name = sensor.kind, f"{touch.number:06d}-{sensor.name}"
+    common = _common_row(scenes, thing, recording, sensor.name) | {"sequence": name}
+    folder = Path(sensor.name) / f"{touch.number:06d}"
     (out / folder).mkdir(parents=True, exist_ok=True)
     photograph = caption = None
     if recording.has_photo:
@@ -191,14 +191,14 @@ def _write_recording(
     return rows
 
 
-def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording) -> Row:
+def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording, sensor: str) -> Row:
     """Return the columns that all frames of a recording share."""
     touch = recording.touch
     return {
-        "sensor": recording.sensor,
+        "sensor": sensor,
         "split": touch.split,
         "dataset": f"simulated-{scenes.grade}",
-        "unit": f"{recording.sensor}-{f'{touch.split}-{touch.number:06d}' if scenes.units == 'each' else scenes.seed}",
+        "unit": f"{sensor}-{f'{touch.split}-{touch.number:06d}' if scenes.units == 'each' else scenes.seed}",
         "stride": 1,
         "touch": f"{touch.number:06d}",
         "object": thing.name,

@@ -26,6 +26,7 @@ from anytouch_jax.sim.draws import Draws
 from anytouch_jax.sim.recorder import RELIEF, SPACING, ClipInput, ClipOutput, View, simulate_clip, stack_trees
 from anytouch_jax.sim.scene import Scenes, draw_by_hand, draw_gesture, draw_place, moved, objects_and_splits
 from anytouch_jax.sim.sensing.optics import Photometry
+from anytouch_jax.sim.sensing.own import find_sensor
 from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Sensor, bases, draw_drift, draw_unit, look
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object, draw_object
@@ -44,7 +45,7 @@ class SensorFamily(NamedTuple):
 
     field: Any  # (2,) mm
     gel: Any  # (2,) modulus kPa, thickness mm
-    shade: Any  # (5,) skin mm, contrast, vignette, halo mm, noise
+    shade: Any  # (6,) skin mm, contrast, vignette, halo mm, noise, spread
     markers: Any  # (5,) pitch mm, radius mm, aspect, share, bend
     ink: Any  # (3,)
     photometry: Photometry
@@ -113,7 +114,7 @@ def family(sensor: Sensor) -> SensorFamily:
     """Return the numbers of a camera sensor. Raises UserError for a field sensor."""
     photometry = look(sensor)
     markers = sensor.markers or Markers(pitch=2.0, radius=0.3, share=0.0)
-    shade = (sensor.skin, sensor.contrast, sensor.vignette, sensor.halo, sensor.noise)
+    shade = (sensor.skin, sensor.contrast, sensor.vignette, sensor.halo, sensor.noise, sensor.spread)
     lattice = (markers.pitch, markers.radius, markers.aspect, markers.share, markers.bend)
     widest = np.minimum(photometry.widest, 1e3)
     numbers = (sensor.field, (sensor.gel.modulus, sensor.gel.thickness), shade, lattice, markers.ink)
@@ -133,13 +134,13 @@ def untouched(sensor: Sensor) -> np.ndarray:
 
 def as_sensor(numbers: SensorFamily) -> Sensor:
     """Return a `Sensor` of these numbers, which may be traced."""
-    skin, contrast, vignette, halo, noise = numbers.shade
+    skin, contrast, vignette, halo, noise, spread = numbers.shade
     pitch, radius, aspect, share, bend = numbers.markers
     gel = Gel(modulus=numbers.gel[0], poisson=0.48, thickness=numbers.gel[1])
     markers = Markers(pitch, radius, aspect, share, tuple(numbers.ink), bend)
     return Sensor(
         "family", (numbers.field[0], numbers.field[1]), (0, 0), gel, markers, "image", skin, contrast, vignette, halo,
-        noise,
+        noise, spread=spread,
     )  # fmt: skip
 
 
@@ -167,7 +168,7 @@ def make_world(things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, pl
     material = np.array([(thing.material.modulus, thing.material.friction) for thing in things], np.float32)
     rng = np.random.default_rng([seed, _PLACES])
     spots = np.stack([[draw_place(rng)[0] for _ in range(places)] for _ in things]).astype(np.float32)
-    kinds = [SENSORS[name] for name in sensors]
+    kinds = [find_sensor(name) for name in sensors]
     return World(
         relief, material, stack_trees([family(one) for one in kinds]), np.stack([*map(untouched, kinds)]), spots
     )
@@ -239,9 +240,11 @@ def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -
             numbers = jax.tree.map(partial(jnp.where, is_wild), wild(numbers, other, rng), numbers)
             sensor = jnp.where(is_wild, families, sensor)
         pitch = jnp.max(numbers.field) / GRID
-        numbers = numbers._replace(field=numbers.field * _cropped(rng))
+        whole = numbers.shade[5] < 1  # one device, which is not cropped or upside down
+        numbers = numbers._replace(field=numbers.field * jnp.where(whole, 1.0, _cropped(rng)))
         unit = draw_unit(as_sensor(numbers), rng, world.gels, own_gels)
-        unit = unit._replace(mirror=unit.mirror * jnp.stack([jnp.float32(1), rng.choice([-1.0, 1.0])]))  # upside down
+        down = jnp.where(whole, 1.0, rng.choice([-1.0, 1.0]))
+        unit = unit._replace(mirror=unit.mirror * jnp.stack([jnp.float32(1), down]))
         hand = draw_by_hand(sampling.depth, rng, gesture, yaw)
         straight = (gesture, yaw, jnp.zeros(2), jnp.zeros(2))
         own, turn, offset, tilt = jax.tree.map(partial(jnp.where, by_hand), hand, straight)

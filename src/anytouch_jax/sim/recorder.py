@@ -20,7 +20,8 @@ from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
-from anytouch_jax.sim.sensing.sensors import SENSORS, Sensor, gel_to_object, rotated, unit_gel
+from anytouch_jax.sim.sensing.own import find_sensor
+from anytouch_jax.sim.sensing.sensors import Sensor, gel_to_object, rotated, unit_gel
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object
 
@@ -250,7 +251,7 @@ class Recorder:
         if name not in self._programs:
             scenes = self._scenes
             one = partial(
-                simulate_clip, sensor=SENSORS[name], fidelity=scenes.fidelity, size=scenes.size, fields=scenes.fields
+                simulate_clip, sensor=find_sensor(name), fidelity=scenes.fidelity, size=scenes.size, fields=scenes.fields
             )
             self._programs[name] = jax.jit(jax.vmap(one))
         return self._programs[name]

@@ -18,7 +18,8 @@ import numpy as np
 from anytouch_jax.config.parsing import Below1, Count, NotNegative, Share, check
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.draws import Rng, either, namespace_of
-from anytouch_jax.sim.sensing.sensors import SENSORS, THINNEST, Unit, draw_drift, draw_unit
+from anytouch_jax.sim.sensing.own import find_sensor, sensor_number
+from anytouch_jax.sim.sensing.sensors import THINNEST, Unit, draw_drift, draw_unit
 from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
 
 Array = np.ndarray
@@ -62,10 +63,11 @@ class Scenes:
     first: NotNegative[int] = 0  # number of the first touch
 
     def __post_init__(self) -> None:
-        for what, names, known in (("sensor", self.sensors, tuple(SENSORS)), ("field", self.fields, FIELDS)):
-            for name in names:
-                if name not in known:
-                    raise UserError(f"there is no simulated {what} {name!r}; choose among {', '.join(known)}")
+        for name in self.fields:
+            if name not in FIELDS:
+                raise UserError(f"there is no simulated field {name!r}; choose among {', '.join(FIELDS)}")
+        kinds = [find_sensor(name) for name in self.sensors]
+        for what, names in (("sensor", [one.name for one in kinds]), ("field", self.fields)):
             if len(set(names)) != len(names):
                 raise UserError(f"name each {what} once, not {', '.join(names)}")
         if not self.sensors:
@@ -73,15 +75,15 @@ class Scenes:
         check(self)
         if self.size and not 16 <= self.size <= _MAX_SIZE:
             raise UserError(f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not {self.size}")
-        if self.fields and all(SENSORS[name].kind == "field" for name in self.sensors):
+        if self.fields and all(one.kind == "field" for one in kinds):
             raise UserError("fields are written next to images, and no sensor has a camera: omit --fields")
         low, high = self.depth
         if not 0 <= low <= high < math.inf:
             raise UserError(f"depth is a range of mm from 0 on, lowest first, not {low:g} to {high:g}")
-        thin = min(self.sensors, key=lambda name: SENSORS[name].gel.thickness)
-        thinnest = SENSORS[thin].gel.thickness * (THINNEST if self.units == "each" else 1.0)
+        thin = min(kinds, key=lambda one: one.gel.thickness)
+        thinnest = thin.gel.thickness * (THINNEST if self.units == "each" else 1.0)
         if high >= thinnest:
-            raise UserError(f"depth {high:g} mm may go through the gel of {thin}: stay below {thinnest:g} mm")
+            raise UserError(f"depth {high:g} mm may go through the gel of {thin.name}: stay below {thinnest:g} mm")
 
 
 class Touch(NamedTuple):
@@ -196,11 +198,12 @@ def draw_by_hand(depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: A
 
 def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     """Return the clip of `touch` by `sensor`. Draws do not depend on the other sensors."""
-    rng = np.random.default_rng([scenes.seed, _RECORDING, touch.number, list(SENSORS).index(sensor)])
-    unit = draw_unit(SENSORS[sensor], rng)
+    kind = find_sensor(sensor)
+    rng = np.random.default_rng([scenes.seed, _RECORDING, touch.number, sensor_number(kind)])
+    unit = draw_unit(kind, rng)
     if scenes.units == "one":
         unit = shared_unit(scenes, sensor)
-    if SENSORS[sensor].kind == "field":  # it has no camera
+    if kind.kind == "field":  # it has no camera
         unit = unit._replace(mirror=np.ones(2, np.float32), window=np.zeros(2, np.float32), zoom=np.float32(1))
     gesture, yaw, offset, tilt = touch.gesture, touch.yaw, np.zeros(2), np.zeros(2)
     if scenes.grade == "coarse":
@@ -214,8 +217,9 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
 
 def shared_unit(scenes: Scenes, sensor: str) -> Unit:
     """Return the unit of `sensor` for units "one": not mirrored, not rotated, not moved."""
-    rng = np.random.default_rng([scenes.seed, _UNIT, list(SENSORS).index(sensor)])
-    unit, none = draw_unit(SENSORS[sensor], rng), np.zeros(2, np.float32)
+    kind = find_sensor(sensor)
+    rng = np.random.default_rng([scenes.seed, _UNIT, sensor_number(kind)])
+    unit, none = draw_unit(kind, rng), np.zeros(2, np.float32)
     return unit._replace(mirror=none + 1, rotation=none[0], offset=none)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.sim.contact.mechanics import Fidelity
 from anytouch_jax.sim.recorder import SPACING, ClipInput, simulate_clip
-from anytouch_jax.sim.sensing.sensors import SENSORS, Unit, identity_unit
+from anytouch_jax.sim.sensing.own import find_sensor
+from anytouch_jax.sim.sensing.sensors import Unit, identity_unit
 
 FIELDS = ("displacement", "shear", "pressure")
 
@@ -45,11 +46,10 @@ def simulate_touch(
     all but the pictures can be differentiated with respect to pose and drag. Use it under jit. Raises UserError for a
     sensor without a camera.
     """
-    if sensor not in SENSORS or SENSORS[sensor].kind != "image":
-        cameras = ", ".join(name for name, one in SENSORS.items() if one.kind == "image")
-        raise UserError(f"there is no simulated camera sensor {sensor!r}; choose among {cameras}")
+    kind = find_sensor(sensor)
+    if kind.kind != "image":
+        raise UserError(f"{sensor} has no camera; name a sensor that has one")
     refuse_forked()
-    kind = SENSORS[sensor]
     pose, relief = jnp.atleast_2d(jnp.asarray(pose, jnp.float32)), jnp.asarray(height_map, jnp.float32)
     if relief.ndim != 2 or pose.shape[1] != 4:
         raise UserError(

@@ -50,12 +50,12 @@ def has_dots(picture: np.ndarray) -> bool:
 def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BLUR) -> np.ndarray:
     """Return the colour difference f32 (h, w) of two pictures u8 (h, w, 3), without light, tint and noise."""
     change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
-    change -= _light(change)
+    change -= change_of_light(change)
     red, green, blue = cv2.split(np.abs(cv2.GaussianBlur(change, (0, 0), blur)))
     return cv2.max(cv2.max(red, green), blue)
 
 
-def _light(change: np.ndarray) -> np.ndarray:
+def change_of_light(change: np.ndarray) -> np.ndarray:
     """Return the change of light f32 (h, w, 3): for each colour a plane that fits most of the picture.
 
     Each lamp of a sensor drifts by itself, which brightens one side. A press covers the smaller part of a picture.

@@ -1,4 +1,4 @@
-"""Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`.
+"""Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`, or a file (`own`).
 
 `looks.npz` has the untouched gels of camera sensors and the colours of their dents. The code that fitted it has left
 (`experiments/results/tried.md`). GelSight, GelSight Mini, DIGIT and 9DTact look like real units. GelSlim and DuraGel
@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_arrays
 from anytouch_jax.sim.contact.mechanics import Gel
 from anytouch_jax.sim.draws import Rng, namespace_of
 
@@ -57,6 +58,9 @@ class Sensor:
     # Tac3D's camera with 640 columns.
     noise: float = 1.0
     real: bool = True  # whether its look is that of real units
+    spread: float = 1.0  # of units, relative to a family's: 1 is also mirrored and cropped, less is one device
+    arrays: str = ""  # .npz file of its look; "" is that of the package
+    version: int = 0  # of that file, which may be written again
 
 
 class Photometry(NamedTuple):
@@ -99,10 +103,13 @@ SENSORS: dict[str, Sensor] = {
 }  # fmt: skip
 
 
-@lru_cache(maxsize=1)
-def _stored() -> dict[str, Array]:
+@lru_cache(maxsize=8)
+def _stored(sensor: Sensor) -> dict[str, Array]:
+    if sensor.arrays:
+        return read_arrays(sensor.arrays)
     with (files("anytouch_jax.sim.sensing") / "looks.npz").open("rb") as file, np.load(file) as pack:
-        return {name: np.asarray(pack[name]) for name in pack.files}
+        start = f"{sensor.name}."
+        return {name.removeprefix(start): np.asarray(pack[name]) for name in pack.files if name.startswith(start)}
 
 
 @lru_cache(maxsize=16)
@@ -110,7 +117,7 @@ def bases(sensor: Sensor) -> Array:
     """Return untouched images (units, h, w, 3) f32 in 0..1 of the whole field. They are black for a field sensor."""
     if sensor.kind == "field":
         return np.zeros((1, 30, 30, 3), np.float32)
-    stored = _stored()[f"{sensor.name}.bases"]
+    stored = _stored(sensor)["bases"]
     return stored.astype(np.float32) / 255 if stored.dtype == np.uint8 else stored
 
 
@@ -118,7 +125,7 @@ def look(sensor: Sensor) -> Photometry:
     """Return the photometry of a camera sensor. Raises UserError for a field sensor."""
     if sensor.kind != "image":
         raise UserError(f"{sensor.name} has no camera: use optics.measure_field")
-    normal, halo, steepest, widest = (_stored()[f"{sensor.name}.{part}"] for part in Photometry._fields)
+    normal, halo, steepest, widest = (_stored(sensor)[part] for part in Photometry._fields)
     return Photometry(normal, halo, float(steepest), widest)
 
 
@@ -185,19 +192,19 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
     units), DIGIT (3 units), 9DTact (3 units). The number of draws does not depend on the sensor, so several sensors can
     share a stream.
     """
-    xp = namespace_of(rng)
+    xp, spread = namespace_of(rng), sensor.spread
     share = sensor.markers.share if sensor.markers else 0.0
     # Measured: the dots of the 8 gels are 0.131 or 0.183 short sides apart, which is 1.85 mm at a zoom of 1 or 0.72.
-    zoom = rng.uniform(0.68, 1.0)
+    zoom = 1 + spread * (rng.uniform(0.68, 1.0) - 1)
     room = (1 - zoom) / 2 * xp.asarray(sensor.field[::-1])
     dirt = rng.uniform(size=SPECKS) < rng.uniform(0, 0.6)  # measured: 0 to 4 specks or scratches a gel
     return _unit(
         base=_draw_base(bases(sensor) if real is None else real, rng, of),
-        tint=xp.exp(rng.normal(0, 0.09) + rng.normal(0, 0.05, 3)),  # measured: means differ by 9 %, colours by 5 %
-        gain=sensor.contrast * xp.exp(rng.normal(0, 0.25) + rng.normal(0, 0.15, 3)),
-        light_angle=rng.normal(0, np.deg2rad(10)),
-        lights=xp.concatenate([rng.normal(0, 0.1, 2), rng.uniform(0.8, 1.05, 2)]),
-        uneven=rng.normal(0, 0.08, (5, 3)),  # on top of the measured ones in `base`
+        tint=xp.exp(spread * (rng.normal(0, 0.09) + rng.normal(0, 0.05, 3))),  # measured: means differ by 9 %, colours by 5 %
+        gain=sensor.contrast * xp.exp(spread * (rng.normal(0, 0.25) + rng.normal(0, 0.15, 3))),
+        light_angle=spread * rng.normal(0, np.deg2rad(10)),
+        lights=xp.concatenate([spread * rng.normal(0, 0.1, 2), 1 + spread * (rng.uniform(0.8, 1.05, 2) - 1)]),
+        uneven=spread * rng.normal(0, 0.08, (5, 3)),  # on top of the measured ones in `base`
         focus=rng.uniform(0.02, 0.15),
         specks=xp.concatenate([
             rng.uniform(-1, 1, (SPECKS, 2)), xp.exp(rng.uniform(math.log(0.06), math.log(0.9), (SPECKS, 1))),
@@ -207,15 +214,15 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
         thickness=xp.exp(rng.normal(0, 0.08)),
         modulus=xp.exp(rng.normal(0, 0.15)),
         marked=rng.uniform() < share,
-        marker_pitch=rng.uniform(0.92, 1.08),
+        marker_pitch=1 + spread * (rng.uniform(0.92, 1.08) - 1),
         marker_phase=rng.uniform(0, 1, 2),
-        marker_size=rng.uniform(0.8, 1.25),  # measured: radii of 0.30 to 0.44 mm
+        marker_size=1 + spread * (rng.uniform(0.8, 1.25) - 1),  # measured: radii of 0.30 to 0.44 mm
         zoom=zoom,
         window=rng.uniform(-1, 1, 2) * room,
-        mirror=xp.where(rng.uniform(size=2) < np.array([0.5, 0.0]), -1, 1),
+        mirror=xp.where((rng.uniform(size=2) < np.array([0.5, 0.0])) & (spread >= 1), -1, 1),
         rotation=rng.normal(0, np.deg2rad(8)),
         offset=rng.normal(0, 0.4, 2),
-        noise=sensor.noise * xp.exp(rng.normal(0, 0.5)),  # measured: 10 to 90 % of the recordings have 0.2 to 1.7
+        noise=sensor.noise * xp.exp(spread * rng.normal(0, 0.5)),  # measured: 10 to 90 % of the recordings have 0.2 to 1.7
         quality=rng.integers(70, 97),
     )  # fmt: skip
 

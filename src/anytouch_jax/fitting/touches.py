@@ -1,0 +1,102 @@
+"""Simulated touches of your own sensor next to the known ones: for its picture, and for its tokens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import jax
+import numpy as np
+
+from anytouch_jax.config import SimulatedConfig
+from anytouch_jax.data.images import encode
+from anytouch_jax.files import atomic_write
+from anytouch_jax.sim import endless
+from anytouch_jax.sim.endless import CAMERAS, Sampling, SimulatedTouches, World
+from anytouch_jax.sim.scene import Scenes
+
+Array = np.ndarray
+OBJECTS = 160  # of a world
+COUNT = 24  # touches of a batch, each by a known sensor and by yours
+SIZE = 112  # pixels of a side
+FOLDS = 5
+COLUMNS = 6  # of the picture
+TILE = 150  # pixels of a picture's height in it
+
+sample = jax.jit(endless.sample_touches, static_argnames=("sampling", "count"))
+
+
+def own_world(sensor: str | Path, split: Literal["train", "test"]) -> World:
+    """Return the world of your sensor (family 0) and all known ones, with objects of a split of training."""
+    usual = SimulatedConfig()
+    scenes = Scenes(objects=usual.objects, seed=usual.seed, depth=usual.depth)
+    things = endless.objects_of(scenes, split, variants=2)[:OBJECTS]
+    return jax.device_put(endless.make_world(things, (str(sensor), *CAMERAS)))
+
+
+def own_touches(key: Any, world: World, *, size: int = SIZE) -> SimulatedTouches:
+    """Return COUNT touches of `world`. The second take of each is by family 0, your sensor."""
+    return sample(key, world, sampling=Sampling(takes=2, size=size), count=COUNT, gallery=0)
+
+
+def compare(frames: Array, gel: Array, sensor: str | Path, out: Path, seed: int = 0) -> float:
+    """Write a picture of real frames u8 (N, h, w, 3) above simulated ones, and return what a classifier still sees.
+
+    That is the share of held-out pictures that a linear classifier calls real or simulated rightly: 0.5 is chance.
+    """
+    world, count = own_world(sensor, "train"), min(len(frames), 2 * COUNT)
+    real = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
+    parts = [
+        jax.device_get(own_touches(jax.random.fold_in(jax.random.key(seed), n), world))
+        for n in range(-(-len(real) // COUNT))
+    ]
+    made = np.concatenate([part.clip[:, 1, -1] for part in parts])[: len(real)]
+    behind = np.concatenate([part.background[:, 1] for part in parts])[: len(real)]
+    atomic_write(out, encode(_picture(real, made)))
+    small = [_small(frame) - _small(gel) for frame in real]
+    return separable(small, [a.astype(np.float32) - b for a, b in zip(made, behind, strict=True)], seed)
+
+
+def _small(picture: Array) -> Array:
+    return cv2.resize(picture, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def _picture(real: Array, made: Array) -> Array:
+    """Return two rows of real pictures above two rows of simulated ones, u8."""
+    wide = round(TILE * real.shape[2] / real.shape[1])
+    rows = []
+    for group in (real, made):
+        chosen = group[np.linspace(0, len(group) - 1, 2 * COLUMNS).astype(int)]
+        tiles = [cv2.resize(one, (wide, TILE), interpolation=cv2.INTER_AREA) for one in chosen]
+        rows += [np.concatenate(tiles[first : first + COLUMNS], 1) for first in (0, COLUMNS)]
+    line = np.full((6, rows[0].shape[1], 3), 255, np.uint8)
+    return np.concatenate([*rows[:2], line, *rows[2:]])
+
+
+def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
+    """Return the share of held-out differences f32 (h, w, 3) that a ridge classifier on simple statistics gets right."""
+    rows = np.stack([_statistics(one) for one in (*real, *made)])
+    kind = np.repeat([1.0, -1.0], [len(real), len(made)])
+    order = np.random.default_rng(seed).permutation(len(rows))
+    right = []
+    for fold in range(FOLDS):
+        test = order[fold::FOLDS]
+        train = np.setdiff1d(order, test)
+        middle, scale = rows[train].mean(0), rows[train].std(0) + 1e-6
+        x, y = (rows[train] - middle) / scale, kind[train]
+        weights = np.linalg.solve(x.T @ x + 10.0 * np.eye(x.shape[1]), x.T @ (y - y.mean()))
+        guess = ((rows[test] - middle) / scale) @ weights + y.mean()
+        right.append(np.sign(guess) == kind[test])
+    return float(np.concatenate(right).mean())
+
+
+def _statistics(change: Array) -> Array:
+    """Return means, deviations, tails and detail at three scales of a difference f32 (h, w, 3), and its colours."""
+    parts: list[Any] = [change.mean((0, 1)), *np.percentile(change, (2, 10, 90, 98), axis=(0, 1))]
+    for blur in (0.0, 1.5, 4.0):
+        one = cv2.GaussianBlur(change, (0, 0), blur) if blur else change
+        parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=0)).mean((0, 1))))
+        parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=1)).mean((0, 1))))
+    parts.append(np.corrcoef(change.reshape(-1, 3).T + 1e-3 * np.random.default_rng(0).normal(size=(3, change[..., 0].size)))[np.triu_indices(3, 1)])
+    return np.concatenate(parts)

@@ -1,0 +1,123 @@
+"""A user's own sensor: a folder `NAME.sensor` with readable numbers (sensor.json) and the arrays of its look.
+
+Wherever the simulator takes the name of a sensor, it takes such a folder too.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zlib
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check, parse_json, read_value
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_write, read_arrays
+from anytouch_jax.sim.contact.mechanics import Gel
+from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Photometry, Sensor
+
+SUFFIX, NUMBERS, ARRAYS = ".sensor", "sensor.json", "look.npz"
+MM = Range(4, 40, "4 to 40 mm")
+SHAPES = {"bases": (0, 0, 0, 3), "normal": (20, 6, 3), "halo": (3, 3, 3), "steepest": (), "widest": (3,)}  # 0: any
+
+
+@dataclass(frozen=True)
+class OwnSensor:
+    """What sensor.json holds. Lengths are in mm, pixels are (height, width).
+
+    `sure` says how each part was found and how sure it is. The simulator does not read it.
+    """
+
+    name: str
+    width_mm: Annotated[float, MM]
+    height_mm: Annotated[float, MM]
+    pixels: Annotated[tuple[int, int], Range(16, 4096, "16 to 4096")]
+    noise: NotNegative[float]  # standard deviation of a pixel, 0 to 255
+    dots: Markers | None = None
+    thickness_mm: Annotated[float, Range(1, 20, "1 to 20 mm")] = 3.0
+    modulus_kpa: Annotated[float, Range(5, 5000, "5 to 5000 kPa")] = 150.0
+    skin_mm: NotNegative[float] = 0.1  # smallest detail that the coating passes
+    halo_mm: Above0[float] = 1.0  # width of the soft shadow
+    contrast: Finite[float] = 1.0  # of dents, over that of the pictures
+    spread: Annotated[float, Range(0, 1, "0 to 1")] = 0.3  # variation of simulated devices: 1 is that of a product
+    sure: dict = None  # type: ignore[type-arg, assignment]
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def find_sensor(word: str) -> Sensor:
+    """Return the sensor of a name in `SENSORS`, or of a folder NAME.sensor. Raises UserError for another word."""
+    if word in SENSORS:
+        return SENSORS[word]
+    if Path(word).suffix == SUFFIX:
+        return read_sensor(word)
+    raise UserError(
+        f"there is no simulated sensor {word!r}; choose among {', '.join(SENSORS)}, or name a folder{SUFFIX} of "
+        "`anytouch sensor fit`"
+    )
+
+
+def sensor_number(sensor: Sensor) -> int:
+    """Return the number that separates the random streams of sensors."""
+    return list(SENSORS).index(sensor.name) if sensor.name in SENSORS else zlib.crc32(sensor.name.encode())
+
+
+def read_numbers(folder: str | Path) -> OwnSensor:
+    """Return sensor.json of a folder. Raises UserError for a missing or damaged file."""
+    file = Path(folder) / NUMBERS
+    try:
+        numbers: OwnSensor = read_value(OwnSensor, parse_json(file.read_bytes()), "sensor")
+    except OSError as error:
+        raise UserError(f"{file}: {error.strerror}. Make the sensor with `anytouch sensor fit`.") from None
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from None
+    if numbers.name in SENSORS:
+        raise UserError(f"{file}: {numbers.name} is a sensor of the table; give yours another name")
+    return numbers
+
+
+def read_sensor(folder: str | Path) -> Sensor:
+    """Return the sensor of a folder NAME.sensor. Raises UserError for a missing or damaged file."""
+    path = Path(folder).expanduser().resolve()
+    one, file = read_numbers(path), path / ARRAYS
+    if fault := _fault(file, file.stat().st_mtime_ns if file.is_file() else 0):
+        raise UserError(f"{file}: {fault}. Fit the sensor again.")
+    return Sensor(
+        one.name, (one.height_mm, one.width_mm), one.pixels,
+        Gel(modulus=one.modulus_kpa, poisson=0.48, thickness=one.thickness_mm), one.dots, skin=one.skin_mm,
+        contrast=one.contrast, halo=one.halo_mm, noise=one.noise, spread=one.spread, arrays=str(file),
+        version=file.stat().st_mtime_ns,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=16)
+def _fault(file: Path, _: int) -> str:
+    """Return what is wrong with the arrays of a look, "" for nothing."""
+    try:
+        arrays = read_arrays(file)
+    except (OSError, ValueError) as error:
+        return str(getattr(error, "strerror", None) or error)
+    for name, shape in SHAPES.items():
+        array = arrays.get(name)
+        fits = array is not None and array.ndim == len(shape) and all(
+            b in (0, a) for a, b in zip(array.shape, shape, strict=True)
+        )  # fmt: skip
+        if not fits or not np.isfinite(array).all() or not 0 < array.size < 1 << 20:
+            return f"the array {name} is missing, or has another shape than {shape}"
+    return "" if len(arrays["bases"]) <= MOST_BASES else f"more than {MOST_BASES} untouched gels"
+
+
+def write_sensor(folder: str | Path, numbers: OwnSensor, bases: Any, look: Photometry) -> Path:
+    """Write a folder NAME.sensor, with untouched gels u8 (n, h, w, 3), and return it."""
+    path, data = Path(folder), io.BytesIO()
+    arrays = {name: np.asarray(value, np.float32) for name, value in look._asdict().items()}
+    np.savez(data, bases=np.asarray(bases, np.uint8), **arrays)
+    atomic_write(path / ARRAYS, data.getvalue())
+    atomic_write(path / NUMBERS, json.dumps(asdict(numbers), indent=2) + "\n")
+    return path

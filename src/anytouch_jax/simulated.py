@@ -27,6 +27,7 @@ from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.sim import endless, scene
 from anytouch_jax.sim.contact.mechanics import KPA_MM2
 from anytouch_jax.sim.endless import Sampling, SimulatedTouches, World
+from anytouch_jax.sim.sensing.own import find_sensor
 from anytouch_jax.sim.sensing.photo import seeded_photograph
 from anytouch_jax.sim.world import captions
 from anytouch_jax.sim.world.objects import Object
@@ -97,7 +98,7 @@ class SimulatedLoader:
         self.config, self.tokenizer, self.notes = config, tokenizer, list[str]()
         self.objects = training_objects(config)
         world = endless.make_world(self.objects, simulated.sensors, places=simulated.places, seed=simulated.seed)
-        self._rows = np.array([model.sensor_row(name) for name in simulated.sensors] + [model.universal_row], np.int32)
+        self._rows = np.array([model.sensor_row(find_sensor(name).name) for name in simulated.sensors] + [model.universal_row], np.int32)
         self._real = None if manifest is None else load_real(manifest, config, log)
         weight = dict(config.data.weights or ()).get(SIMULATED, WEIGHT)
         self._count = size if self._real is None else max(1, min(size - 1, round(size * weight / (weight + 1))))
@@ -319,7 +320,7 @@ def _assemble(
     sensor = jnp.asarray(rows)[touches.sensor]
     keys = jax.random.split(key, 6)
     takes = [
-        _Touches(_prepared(keys[m], touches.clip[:, m], touches.background[:, m], config), sensor[:, m])
+        _Touches(prepared(keys[m], touches.clip[:, m], touches.background[:, m], config), sensor[:, m])
         for m in range(touches.clip.shape[1])
     ]
     fields = None
@@ -398,7 +399,7 @@ def _real_touches(key: Array, real: Real, rows: Array, config: Config) -> _Touch
     which = jax.random.bernoulli(gel, 0.4, (len(rows),)).astype(jnp.int32)  # the stored picture, or the median
     background = real.gel[real.gel_of[rows[:, -1]], which]
     moved = augmented(warp, jnp.concatenate([real.frame[rows], background[:, None]], 1), config)
-    return _Touches(_prepared(prepare, moved[:, :-1], moved[:, -1], config), real.sensor[rows[:, -1]])
+    return _Touches(prepared(prepare, moved[:, :-1], moved[:, -1], config), real.sensor[rows[:, -1]])
 
 
 def augmented(key: Array, clip: Array, config: Config) -> Array:
@@ -432,7 +433,7 @@ def _warped(clip: Array, draw: Array, affine: tuple[float, float, float]) -> Arr
     return jnp.moveaxis(warped, 1, -1)
 
 
-def _prepared(key: Array, clip: Array, background: Array, config: Config, *, jitter: bool = True) -> Array:
+def prepared(key: Array, clip: Array, background: Array, config: Config, *, jitter: bool = True) -> Array:
     """Return clips u8 (B, T, S, S, 3) as the network reads them: with or without the background subtracted.
 
     With `jitter` brightness, contrast and colours change a little, as by another camera.
@@ -465,7 +466,7 @@ def field_batch(key: Array, touches: SimulatedTouches, sensor: Array, config: Co
     # Force outside of the picture cannot be seen.
     force = force.at[:, 2].set(jnp.mean(shown, (1, 2)) * jnp.exp(aspect))
     return FieldBatch(
-        _prepared(key, clip, touches.background[:count, -1], config, jitter=False), sensor[:count, -1], aspect,
+        prepared(key, clip, touches.background[:count, -1], config, jitter=False), sensor[:count, -1], aspect,
         fields[..., 0] / width[:, None, None], fields[..., 1:3] / width[:, None, None, None], shown, force,
         labels["torque"] / (scale * width), labels["slip"],
     )  # fmt: skip

@@ -5,22 +5,31 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_home, log, refuse_unused
-from anytouch_jax.config.parsing import Count, NotNegative, Seed
+from anytouch_jax.config.parsing import Above0, Count, NotNegative, Seed
+from anytouch_jax.errors import UserError
+
+SUFFIX = ".sensor"  # of a folder of `anytouch sensor fit`
 
 
 @dataclass(frozen=True)
 class AdaptOptions:
-    """Fit sensor tokens for a new sensor to a few of its frames. All other parameters stay frozen.
+    """Make tokens for a new sensor: trained on simulated touches of it, or fitted to a few labelled frames.
 
-    Example: anytouch adapt --model runs/stage1 --data mine.csv --sensor my_gel --labels material --out runs/my_gel
+    Example: anytouch adapt --sensor mine.sensor --minutes 8 --out runs/mine
+
+    A sensor of `anytouch sensor fit` needs no data. Ctrl-C keeps the state, and the same command continues. Tokens
+    that find fewer simulated touches than the universal ones are not saved. With --data, tokens are fitted to --labels.
     """
 
-    model: Path
-    """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
-    data: tuple[Path, ...]  # Manifests with frames of the sensor in split train.
-    sensor: str  # Name of the sensor, as in the column sensor of the manifest.
+    sensor: str  # Folder NAME.sensor of `anytouch sensor fit`, or a name in the column sensor of the manifest.
     out: Path  # Run folder to write, for embed, probe and retrieve.
+    model: Path = Path(DEFAULT)
+    """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
+    minutes: Above0[float] = 8.0  # Minutes of training on simulated touches.
+    deep: bool = False  # Train the first blocks too, and hold the features of known sensors.
+    data: tuple[Path, ...] = ()  # Manifests with labelled frames of the sensor in split train.
     frames: NotNegative[int] = 100
     """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
     labels: str | None = None
@@ -30,11 +39,16 @@ class AdaptOptions:
 
 
 def run(options: AdaptOptions) -> int:
-    """Fit the tokens of a new sensor and write a run folder."""
+    """Make the tokens of a new sensor and write a run folder; 130 after Ctrl-C."""
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder.adapt import adapt, check_empty, save
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    if Path(options.sensor).suffix == SUFFIX:
+        return _simulated(options)
+    if not options.data:
+        raise UserError(f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as --sensor")
+    refuse_unused(options, ("minutes", "deep"), "with --data, where the frames are what is fitted")
     if not options.frames:
         refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
     check_empty(options.out)
@@ -53,5 +67,35 @@ def run(options: AdaptOptions) -> int:
     print(
         f"{options.out}: tokens of {options.sensor} fitted to {options.frames} frames. "
         f"The loss on frames {where} went from {adapted.before:.4f} to {adapted.after:.4f}."
+    )
+    return 0
+
+
+def _simulated(options: AdaptOptions) -> int:
+    """Train the tokens of a sensor of `anytouch sensor fit`."""
+    from anytouch_jax.encoder.adapt import check_empty, save
+    from anytouch_jax.fitting.tokens import adapt_by_simulation
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    refuse_unused(options, ("data", "frames", "labels", "steps"), f"with a sensor of {SUFFIX}, which is simulated")
+    check_empty(options.out)
+    check_home(options.out)
+    enable_compilation_cache()
+    state = options.out.with_name(f"{options.out.name}.part.npz")
+    log("compiling the simulator: about two minutes at first")
+    adapted = adapt_by_simulation(
+        options.model, options.sensor, minutes=options.minutes, deep=options.deep, state=state, seed=options.seed,
+        log=log,
+    )  # fmt: skip
+    if adapted is None:
+        log(f"interrupted: {state} keeps the state. Run the same command again to continue.")
+        return 130
+    save(adapted, options.model, options.out)
+    state.unlink(missing_ok=True)
+    name = adapted.metadata["source"]["sensor"]
+    print(
+        f"{options.out}: tokens of {name}, {len(adapted.losses)} steps. Of held-out simulated touches by {name}, the "
+        f"nearest one by a known sensor is the same touch in {adapted.after:.1%}. With universal tokens it is in "
+        f"{adapted.before:.1%}."
     )
     return 0

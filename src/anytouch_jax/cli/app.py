@@ -29,6 +29,7 @@ from anytouch_jax.cli import (
     probe,
     report,
     retrieve,
+    sensor,
     simulate,
     stream,
     train,
@@ -52,7 +53,7 @@ class Command(NamedTuple):
         return (inspect.getdoc(self.options) or "").splitlines()[0]
 
 
-GROUPS = {"data": "Prepare a manifest of tactile frames.", "probe": "Probe frozen features with simple heads."}
+GROUPS = {"data": "Prepare a manifest of tactile frames.", "sensor": "Simulate your own sensor.", "probe": "Probe frozen features with simple heads."}
 COMMANDS = {
     "data simulate": Command(simulate.SimulateOptions, simulate.run),
     "data index": Command(index.DatasetOptions, index.run),
@@ -68,6 +69,7 @@ COMMANDS = {
     "probe tasks": Command(probe.TasksOptions, probe.run_tasks),
     "probe benchmark": Command(probe.BenchmarkOptions, probe.run_benchmark),
     "retrieve": Command(retrieve.RetrieveOptions, retrieve.run),
+    "sensor fit": Command(sensor.SensorOptions, sensor.run),
     "report": Command(report.ReportOptions, report.run),
     "adapt": Command(adapt.AdaptOptions, adapt.run),
     "export": Command(export.ExportOptions, export.run),

@@ -52,7 +52,7 @@ def run(options: SensorOptions) -> int:
         log(f"{part}: {words}")
     log("simulating touches of it, about two minutes at the first time")
     seen, picture = fitted.seen, options.out / "look.png"
-    share = compare(seen.frames[seen.pressed], seen.gel, options.out, picture)
+    share = compare(seen.frames[seen.pressed], seen.gel, options.out, picture, ball_mm=options.ball_mm)
     print(f"{options.out}: {options.name}, {fitted.colour.source}")
     print(
         f"{picture}: real pictures above simulated ones. A linear classifier knows one from the other in {share:.0%} of "

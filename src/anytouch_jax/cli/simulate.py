@@ -31,7 +31,7 @@ class SimulateOptions:
     out: Path  # Folder for images and manifest.parquet.
     touches: Count[int] = 400  # Number of places to touch. Every sensor feels each place once.
     sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
-    """Sensors: gelsight, gelsight_mini, gelslim, digit, 9dtact, duragel, tac3d (a force field)."""
+    """Sensors: gelsight, gelsight_mini, gelslim, digit, 9dtact, duragel, tac3d (a force field), or your NAME.sensor."""
     seed: Seed = 0  # Random seed.
     grade: Literal["fine", "coarse"] = "fine"
     """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""

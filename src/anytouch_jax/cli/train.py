@@ -111,7 +111,7 @@ def run(request: TrainRequest) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
     from anytouch_jax.train.progress import Terminated, terminating
 
-    options, config = request
+    options, config = request[0], _with_own_sensors(request[1])
     _refuse_unread(options, config)
     try:
         with terminating():
@@ -129,6 +129,17 @@ def run(request: TrainRequest) -> int:
     if place is None or place.index == 0:
         log(f"{options.run}: {result.step} of {config.run.steps} steps")
     return 0
+
+
+def _with_own_sensors(config: Config) -> Config:
+    """Return the configuration with tokens for the sensors of `anytouch sensor fit` among the simulated ones."""
+    folders = [word for word in config.simulated.sensors if word.endswith(".sensor")]
+    if not folders:
+        return config
+    from anytouch_jax.sim.sensing.own import read_numbers
+
+    names = dict.fromkeys((*config.model.sensors, *(read_numbers(folder).name for folder in folders)))
+    return replace(config, model=replace(config.model, sensors=tuple(names)))
 
 
 def _preset(options: TrainOptions) -> Config:

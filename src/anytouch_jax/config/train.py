@@ -122,7 +122,7 @@ class SimulatedConfig:
     variants: Count[int] = 1  # Objects of each kind, with other sizes and phases.
     seed: NotNegative[int] = 41  # Seed of the objects and of the kinds that are held out.
     sensors: tuple[str, ...] = ("gelsight_mini", "digit", "gelsight", "gelslim", "duragel", "9dtact")
-    """Sensors that are simulated."""
+    """Sensors that are simulated: names, or folders NAME.sensor of `anytouch sensor fit`."""
     coarse: Share = 0.4  # Share of touches at which each sensor touches as by hand.
     wild: Share = 0.0  # Share of touches by sensors that mix two others, for the universal tokens.
     depth: NotNegative[tuple[float, float]] = (0.15, 1.0)  # Range of the deepest press, mm.

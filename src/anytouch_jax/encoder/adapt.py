@@ -75,9 +75,9 @@ def adapt(
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")
     if frames and labels is None:
         raise UserError("the tokens are fitted to classes; name a column with --labels, or copy with --frames 0")
-    loaded, params = _read_model(run)
+    loaded, params = read_model(run)
     stored = loaded.metadata if loaded.from_run else {}
-    config, params, row = _with_row(loaded, params, sensor, str(run), log)
+    config, params, row = with_row(loaded, params, sensor, str(run), log)
     source = {"run": str(run), "sensor": sensor, "frames": frames, "labels": labels, "manifest": manifest.content_hash}
     metadata: dict[str, Any] = {name: stored[name] for name in ("preprocessing", "data") if name in stored}
     metadata |= {"sensors": list(config.model.sensors), "source": source}
@@ -105,8 +105,8 @@ def adapt(
         measure = partial(jax.jit(loss), clip=_read(manifest, config, rows), target=classes[rows])
         clip = _read(manifest, config, fitted)
         tokens, history = _fit(loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed)
-        before, after = float(measure(touch)), float(measure(_put(touch, row, tokens)))
-        return Adapted(config, _put(params, row, tokens), history, before, after, measured, metadata)
+        before, after = float(measure(touch)), float(measure(put_tokens(touch, row, tokens)))
+        return Adapted(config, put_tokens(params, row, tokens), history, before, after, measured, metadata)
 
 
 def check_empty(out: Path) -> None:
@@ -156,7 +156,7 @@ def choose_frames(
     return np.sort(rows[np.argsort(turn, kind="stable")[:count]])
 
 
-def _read_model(run: str | Path) -> tuple[Loaded, Params]:
+def read_model(run: str | Path) -> tuple[Loaded, Params]:
     """Return the model, and its stored parameters. Raises UserError for an encoder of another family."""
     path = registry.locate(run)
     family, weights = load_family(path)
@@ -166,7 +166,7 @@ def _read_model(run: str | Path) -> tuple[Loaded, Params]:
     return loaded, checkpoint.load_params(path)[0] if loaded.from_run else loaded.params
 
 
-def _with_row(loaded: Loaded, params: Params, sensor: str, run: str, log: Log) -> tuple[Config, Params, int]:
+def with_row(loaded: Loaded, params: Params, sensor: str, run: str, log: Log) -> tuple[Config, Params, int]:
     """Return the model with a row for `sensor` that equals the universal tokens, and the row."""
     config, model, trained = loaded.config, loaded.config.model, loaded.trained_sensors
     check_spelling(sensor, model.sensors)
@@ -189,10 +189,10 @@ def _with_row(loaded: Loaded, params: Params, sensor: str, run: str, log: Log) -
         tokens = np.concatenate([tokens, start[None]])
     row = model.sensors.index(sensor)
     params = params | {"touch": params["touch"] | {"sensor_tokens": tokens}}
-    return replace(config, model=model), _put(params, row, start), row
+    return replace(config, model=model), put_tokens(params, row, start), row
 
 
-def _put(params: Params, row: int, tokens: Any) -> Params:
+def put_tokens(params: Params, row: int, tokens: Any) -> Params:
     """Return `params` with other tokens (S, D) in one row."""
     table = jnp.asarray(params["touch"]["sensor_tokens"]).at[row].set(tokens)
     return params | {"touch": params["touch"] | {"sensor_tokens": table}}
@@ -242,7 +242,7 @@ def _fit(
         key_rows, _ = jax.random.split(key)
         # Drawn with replacement: epochs would need another shape for every number of frames.
         rows = jax.random.randint(key_rows, (BATCH,), 0, clip.shape[0])
-        value, grad = jax.value_and_grad(lambda t: loss(_put(params, row, t), clip[rows], target[rows]))(tokens)
+        value, grad = jax.value_and_grad(lambda t: loss(put_tokens(params, row, t), clip[rows], target[rows]))(tokens)
         updates, state = tx.update(grad, state)
         return optax.apply_updates(tokens, updates), state, value
 

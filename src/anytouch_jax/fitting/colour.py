@@ -31,7 +31,7 @@ ROUNDS = ((0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0
 FEATURES = len(POWERS) * len(PLACES)
 # Root mean square of the slope of the gel where its change is above a quarter of the strongest, and its mean depth there in mm, in
 # simulated touches of 0.15 to 1.0 mm. They set the scale where no ball does.
-USUAL_TILT, USUAL_DEPTH = 0.2, 0.4
+USUAL_TILT, USUAL_DEPTH = 0.22, 0.3
 UNSURE = "Without a ball of known size the strength is a usual one. It may be off by half: edit contrast."
 
 

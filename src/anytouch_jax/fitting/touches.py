@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,9 @@ from anytouch_jax.data.images import encode
 from anytouch_jax.files import atomic_write
 from anytouch_jax.sim import endless
 from anytouch_jax.sim.endless import CAMERAS, Sampling, SimulatedTouches, World
+from anytouch_jax.sim.recorder import RELIEF
 from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.sim.touch import ball
 
 Array = np.ndarray
 OBJECTS = 160  # of a world
@@ -27,12 +30,22 @@ TILE = 150  # pixels of a picture's height in it
 sample = jax.jit(endless.sample_touches, static_argnames=("sampling", "count"))
 
 
-def own_world(sensor: str | Path, split: Literal["train", "test"]) -> World:
-    """Return the world of your sensor (family 0) and all known ones, with objects of a split of training."""
+def own_world(
+    sensor: str | Path, split: Literal["train", "test"], known: Sequence[str] = CAMERAS, ball_mm: float | None = None
+) -> World:
+    """Return the world of your sensor (family 0) and the `known` ones, with objects of a split of training.
+
+    All objects are balls of `ball_mm`, if that is given.
+    """
     usual = SimulatedConfig()
     scenes = Scenes(objects=usual.objects, seed=usual.seed, depth=usual.depth)
     things = endless.objects_of(scenes, split, variants=2)[:OBJECTS]
-    return jax.device_put(endless.make_world(things, (str(sensor), *CAMERAS)))
+    world = endless.make_world(things, (str(sensor), *known))
+    if ball_mm is not None:
+        edge = RELIEF // 4
+        one = np.pad(ball(ball_mm, RELIEF - 2 * edge), edge, constant_values=-ball_mm / 2)
+        world = world._replace(relief=np.broadcast_to(one.astype(np.float16), world.relief.shape))
+    return jax.device_put(world)
 
 
 def own_touches(key: Any, world: World, *, size: int = SIZE) -> SimulatedTouches:
@@ -40,12 +53,14 @@ def own_touches(key: Any, world: World, *, size: int = SIZE) -> SimulatedTouches
     return sample(key, world, sampling=Sampling(takes=2, size=size), count=COUNT, gallery=0)
 
 
-def compare(frames: Array, gel: Array, sensor: str | Path, out: Path, seed: int = 0) -> float:
+def compare(
+    frames: Array, gel: Array, sensor: str | Path, out: Path, *, ball_mm: float | None = None, seed: int = 0
+) -> float:
     """Write a picture of real frames u8 (N, h, w, 3) above simulated ones, and return what a classifier still sees.
 
-    That is the share of held-out pictures that a linear classifier calls real or simulated rightly: 0.5 is chance.
+    Both are presses of a ball of `ball_mm`, if that is given. The result is the share of held-out pictures that a linear classifier calls real or simulated rightly: 0.5 is chance.
     """
-    world, count = own_world(sensor, "train"), min(len(frames), 2 * COUNT)
+    world, count = own_world(sensor, "train", ball_mm=ball_mm), min(len(frames), 2 * COUNT)
     real = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
     parts = [
         jax.device_get(own_touches(jax.random.fold_in(jax.random.key(seed), n), world))
@@ -98,5 +113,6 @@ def _statistics(change: Array) -> Array:
         one = cv2.GaussianBlur(change, (0, 0), blur) if blur else change
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=0)).mean((0, 1))))
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=1)).mean((0, 1))))
-    parts.append(np.corrcoef(change.reshape(-1, 3).T + 1e-3 * np.random.default_rng(0).normal(size=(3, change[..., 0].size)))[np.triu_indices(3, 1)])
+    colours = np.cov(change.reshape(-1, 3).T) + np.eye(3)
+    parts.append((colours / np.sqrt(np.outer(np.diag(colours), np.diag(colours))))[np.triu_indices(3, 1)])
     return np.concatenate(parts)

@@ -1,0 +1,202 @@
+"""Tokens for your own sensor, trained on simulated touches of it.
+
+Each touch is felt by your sensor and by a known one. The features of yours are drawn to those that the frozen encoder
+has of the known one, among the features of other touches. No touch repeats.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from anytouch_jax.bars import bar
+from anytouch_jax.encoder.adapt import Adapted, Params, put_tokens, read_model, with_row
+from anytouch_jax.encoder.arrays import Log
+from anytouch_jax.encoder.base import precision
+from anytouch_jax.errors import CheckError, UserError
+from anytouch_jax.files import atomic_write, read_arrays
+from anytouch_jax.fitting.touches import COUNT, own_touches, own_world
+from anytouch_jax.nn.attention import usable
+from anytouch_jax.nn.functional import build
+from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.ops import losses
+from anytouch_jax.sim.endless import CAMERAS, SimulatedTouches
+from anytouch_jax.sim.sensing.own import read_numbers
+from anytouch_jax.simulated import prepared
+
+RATE, DEEP_RATE = 3e-3, 1e-4  # of Adam, for tokens and for blocks
+FIRST = 2  # blocks that are trained with `deep`
+KEPT = 480  # features of touches before, that a touch must not be taken for
+HEAT = 0.07  # temperature of the contrast
+REUSE = 2  # steps with the same touches in other light
+BATCHES = 10  # of held-out touches, before and after
+SAVED = 60.0  # seconds between saved states
+State = dict[str, Any]
+
+
+def adapt_by_simulation(
+    run: str | Path, sensor: str | Path, *, minutes: float, deep: bool = False, state: Path | None = None, seed: int = 0,
+    log: Log = print,
+) -> Adapted | None:  # fmt: skip
+    """Return the model of `run` with tokens for the sensor of a folder NAME.sensor, trained for `minutes`.
+
+    With `deep` the first blocks are trained too, and the features of known sensors are held where they are. `before`
+    and `after` are the shares of held-out touches that are found among 240 by a known sensor, with universal tokens and
+    with the new ones. After Ctrl-C the result is None: the next call continues from the file `state`. Raises UserError,
+    and CheckError if the new tokens find fewer.
+    """
+    numbers = read_numbers(sensor)
+    loaded, params = read_model(run)
+    stored = loaded.metadata if loaded.from_run else {}
+    config, params, row = with_row(loaded, params, numbers.name, str(run), log)
+    known = tuple(name for name in loaded.trained_sensors or CAMERAS if name in CAMERAS)
+    if not known:
+        raise UserError(f"{run} was trained on no sensor that is simulated, so nothing can be matched; name another run")
+    size = config.model.image_size
+    rows = np.array([row, *(config.model.sensor_row(name) for name in known)], np.int32)
+    net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))
+    plain = config.with_settings({"data.background": "subtract" if config.data.background != "keep" else "keep"})
+    frozen = jax.device_put({"touch": params["touch"]})
+
+    def encode(weights: Params, clip: Any, of: Any) -> Any:
+        return losses.normalise(net.encode_touch(weights, normalise_touch(clip), of))
+
+    def merged(train: State, frozen: Params) -> Params:
+        touch = frozen["touch"] | {name: part for name, part in train.items() if name != "tokens"}
+        return put_tokens({"touch": touch}, row, train["tokens"])
+
+    def loss(train: State, frozen: Params, key: Any, touches: SimulatedTouches, queue: Any, seen: Any) -> Any:
+        keys = jax.random.split(key)
+        other, own = (prepared(keys[m], touches.clip[:, m], touches.background[:, m], config) for m in (0, 1))
+        of = jnp.asarray(rows)[touches.sensor]
+        target = jax.lax.stop_gradient(encode(frozen, other, of[:, 0]))
+        z = encode(merged(train, frozen), own, of[:, 1])
+        among = jnp.where(seen[None], z @ queue.T, -1.0)  # -1 is no rival
+        logits = jnp.concatenate([z @ target.T, among], 1) / HEAT
+        by_known = touches.sensor[:, 0] > 0
+        cost = optax.softmax_cross_entropy_with_integer_labels(logits, jnp.arange(len(z)))
+        value = jnp.sum(cost * by_known) / jnp.maximum(by_known.sum(), 1)
+        if deep:
+            held = encode(merged(train, frozen), other, of[:, 0])
+            value = value + 10.0 * jnp.mean(1 - jnp.sum(held * target, 1))
+        return value, target
+
+    tx = optax.scale_by_adam()
+
+    @jax.jit
+    def step(train: State, moments: Any, frozen: Params, key: Any, touches: Any, queue: Any, seen: Any, rate: Any) -> Any:
+        (value, target), grad = jax.value_and_grad(loss, has_aux=True)(train, frozen, key, touches, queue, seen)
+        updates, moments = tx.update(grad, moments)
+        rates = {name: RATE if name == "tokens" else DEEP_RATE for name in train}
+        moved = {name: jax.tree.map(lambda x, r=rates[name]: -rate * r * x, part) for name, part in updates.items()}
+        if deep:
+            moved["blocks"] = jax.tree.map(lambda x: x.at[FIRST:].set(0), moved["blocks"])
+        return optax.apply_updates(train, moved), moments, value, target
+
+    @jax.jit
+    def features(train: State, frozen: Params, touches: Any) -> tuple[Any, Any]:
+        key, of = jax.random.key(0), jnp.asarray(rows)[touches.sensor]
+        other, own = (
+            prepared(key, touches.clip[:, m], touches.background[:, m], plain, jitter=False) for m in (0, 1)
+        )
+        return encode(merged(train, frozen), own, of[:, 1]), encode(merged(train, frozen), other, of[:, 0])
+
+    train: State = {"tokens": jnp.asarray(params["touch"]["sensor_tokens"][row])}
+    if deep:
+        train |= {name: jax.tree.map(jnp.asarray, params["touch"][name]) for name in ("patch", "blocks")}
+    identity = f"{numbers} {loaded.trained_sensors} {deep} {minutes} {seed}"
+    with precision(config):
+        world, test = (own_world(sensor, split, known) for split in ("train", "test"))
+        root = jax.random.key(seed)
+        held = [own_touches(jax.random.fold_in(root, (1 << 29) + n), test, size=size) for n in range(BATCHES)]
+        score = partial(_found, held, lambda train, touches: features(train, frozen, touches))
+        before = score(train)
+        train, history, finished = _train(
+            train, tx.init(train), step, frozen, lambda n: own_touches(jax.random.fold_in(root, n), world, size=size),
+            config.model.embed, 60 * minutes, root, state, identity, log,
+        )  # fmt: skip
+        if not finished:
+            return None
+        after = score(train)
+    if after < before:
+        raise CheckError(
+            f"the new tokens find {after:.1%} of held-out simulated touches by a known sensor, and the universal ones "
+            f"{before:.1%}: nothing is saved. Look at look.png of {sensor}, or give more --minutes."
+        )
+    params = params | {"touch": params["touch"] | {name: part for name, part in train.items() if name != "tokens"}}
+    source = {"run": str(run), "sensor": numbers.name, "minutes": minutes, "deep": deep, "steps": len(history)}
+    metadata: dict[str, Any] = {name: stored[name] for name in ("preprocessing", "data") if name in stored}
+    metadata |= {"sensors": list(config.model.sensors), "source": source}
+    metadata |= {} if loaded.trained_sensors is None else {"seen": [*loaded.trained_sensors, numbers.name]}
+    return Adapted(config, put_tokens(params, row, train["tokens"]), history, before, after, "simulated", metadata)
+
+
+def _found(held: list[SimulatedTouches], features: Callable[..., Any], train: State) -> float:
+    """Return the share of held-out touches by your sensor that are nearest to the same touch by a known one."""
+    parts = [features(train, touches) for touches in held]
+    own, other = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
+    by_known = np.concatenate([np.asarray(touches.sensor[:, 0]) > 0 for touches in held])
+    nearest = (own @ other[by_known].T).argmax(1)[by_known]
+    return float((nearest == np.arange(by_known.sum())).mean())
+
+
+def _train(
+    train: State, moments: Any, step: Callable[..., Any], frozen: Params, touches_of: Callable[[int], Any], width: int,
+    seconds: float, root: Any, file: Path | None, identity: str, log: Log,
+) -> tuple[State, tuple[float, ...], bool]:  # fmt: skip
+    """Train for `seconds` in all, from the state in `file` if there is one. False is an interruption, with a state."""
+    leaves, tree = jax.tree.flatten((train, moments))
+    spent, history = 0.0, list[float]()
+    if file is not None and file.is_file():
+        arrays = read_arrays(file)
+        if str(arrays.get("identity")) != identity:
+            raise UserError(f"{file} belongs to another adaptation; remove it, or name another --out")
+        leaves = [jnp.asarray(arrays[f"leaf{n}"], leaf.dtype) for n, leaf in enumerate(leaves)]
+        spent, history = float(arrays["spent"]), [float(value) for value in arrays["history"]]
+        log(f"continued after {spent:.0f} of {seconds:.0f} seconds")
+    train, moments = jax.tree.unflatten(tree, leaves)
+    queue, seen = jnp.zeros((KEPT, width)), np.zeros(KEPT, bool)
+
+    def save() -> None:
+        if file is not None:
+            data = io.BytesIO()
+            kept = {f"leaf{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves((train, moments)))}
+            np.savez(data, identity=identity, spent=spent, history=history, **kept)  # type: ignore[arg-type]
+            atomic_write(file, data.getvalue())
+
+    touches, saved = None, spent
+    try:
+        with bar(round(seconds), "seconds of training") as advance:
+            begun = time.monotonic() - spent
+            while spent < seconds:
+                number = len(history)
+                if touches is None or number % REUSE == 0:
+                    touches = touches_of(number // REUSE)
+                rate = 0.5 * (1 + np.cos(np.pi * min(spent / seconds, 1)))
+                key = jax.random.fold_in(jax.random.fold_in(root, 1 << 30), number)
+                train, moments, value, target = step(train, moments, frozen, key, touches, queue, seen, rate)
+                if number % REUSE == 0:
+                    at = number // REUSE * COUNT % KEPT
+                    queue, seen[at : at + COUNT] = queue.at[at : at + COUNT].set(target), True
+                if number == 0:  # compiling is not training
+                    begun = time.monotonic() - spent
+                history.append(float(value))
+                spent = time.monotonic() - begun
+                advance(min(round(spent), round(seconds)))
+                if spent - saved > SAVED:
+                    saved = spent
+                    save()
+    except KeyboardInterrupt:
+        save()
+        return train, tuple(history), False
+    return train, tuple(history), True

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,11 +46,11 @@ State = dict[str, Any]
 
 def adapt_by_simulation(
     run: str | Path, sensor: str | Path, *, minutes: float, deep: bool = False, state: Path | None = None, seed: int = 0,
-    log: Log = print,
+    known: Sequence[str] = CAMERAS, log: Log = print,
 ) -> Adapted | None:  # fmt: skip
     """Return the model of `run` with tokens for the sensor of a folder NAME.sensor, trained for `minutes`.
 
-    With `deep` the first blocks are trained too, and the features of known sensors are held where they are. `before`
+    `known` are the simulated sensors that take part. With `deep` the first blocks are trained too, and the features of known sensors are held where they are. `before`
     and `after` are the shares of held-out touches that are found among 240 by a known sensor, with universal tokens and
     with the new ones. After Ctrl-C the result is None: the next call continues from the file `state`. Raises UserError,
     and CheckError if the new tokens find fewer.
@@ -59,7 +59,7 @@ def adapt_by_simulation(
     loaded, params = read_model(run)
     stored = loaded.metadata if loaded.from_run else {}
     config, params, row = with_row(loaded, params, numbers.name, str(run), log)
-    known = tuple(name for name in loaded.trained_sensors or CAMERAS if name in CAMERAS)
+    known = tuple(name for name in loaded.trained_sensors or CAMERAS if name in known)
     if not known:
         raise UserError(f"{run} was trained on no sensor that is simulated, so nothing can be matched; name another run")
     size = config.model.image_size

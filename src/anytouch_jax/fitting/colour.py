@@ -26,6 +26,7 @@ DEPTHS = np.linspace(0.05, 1.6, 24)  # mm
 _GRID, _SIDE = 96, 14.0  # points and mm of the solved gel
 SKIN = 0.13  # mm: detail that the coating and the lens pass
 HALOS, THICKNESSES = (0.35, 1.0, 1.6), (2.0, 3.0, 4.5)  # mm, of the soft shadow and of the gel: the best is chosen
+THIN = 5  # the search looks at every so many pixels
 PLAIN = 9  # powers of the normal with which the presses are placed
 ROUNDS = ((0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03))  # steps of the search, mm of place and depth
 FEATURES = len(POWERS) * len(PLACES)
@@ -147,7 +148,7 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
     # A pixel that is not clear has change 0 and features 0.
     flat, seen = change.reshape(len(change), -1, 3).astype(np.float64), clear.reshape(len(clear), -1, 1)
     flat = flat * seen
-    few, thin, some = flat[:, ::3], Grid(*(values[::3] for values in part)), seen[:, ::3]
+    few, thin, some = flat[:, ::THIN], Grid(*(values[::THIN] for values in part)), seen[:, ::THIN]
     usual = known[THICKNESSES[1], HALOS[1]]
     poses = np.stack([_first_pose(one, part, usual) for one in flat])
     if float(np.median(poses[:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
@@ -155,10 +156,19 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
             f"the dents are wider than a ball of {ball_mm:g} mm makes them, if the picture is {width_mm:g} mm wide; "
             "check --width-mm and --ball-mm"
         )
-    poses = _placed(few, some, thin, usual, poses, ROUNDS)
-    tries = {key: _placed(few, some, thin, one, poses, ROUNDS[-3:]) for key, one in known.items()}
-    best = min(tries, key=lambda key: _plain(few, some, thin, known[key], tries[key])[0])
-    rows = [w * design(*_at(part, known[best], pose)) for pose, w in zip(tries[best], seen, strict=True)]
+    tries = dict[tuple[float, float], tuple[float, Array]]()
+
+    def attempt(key: tuple[float, float], poses: Array, rounds: Any) -> None:
+        placed = _placed(few, some, thin, known[key], poses, rounds)
+        tries[key] = _plain(few, some, thin, known[key], placed)[0], placed
+
+    for halo in HALOS:
+        attempt((THICKNESSES[1], halo), poses, ROUNDS)
+    nearest = min(tries, key=lambda key: tries[key][0])
+    for thickness in (THICKNESSES[0], THICKNESSES[2]):
+        attempt((thickness, nearest[1]), tries[nearest][1], ROUNDS[-3:])
+    best = min(tries, key=lambda key: tries[key][0])
+    rows = [w * design(*_at(part, known[best], pose)) for pose, w in zip(tries[best][1], seen, strict=True)]
     gram, target = sum(r.T @ r for r in rows), sum(r.T @ d for r, d in zip(rows, flat, strict=True))
     coefficients = _ridge(gram, target, _PENALTY)
     left = sum(float(((one - r @ coefficients) ** 2).sum()) for one, r in zip(flat, rows, strict=True))

@@ -134,7 +134,7 @@ def adapt_by_simulation(
             f"{before:.1%}: nothing is saved. Look at look.png of {sensor}, or give more --minutes."
         )
     params = params | {"touch": params["touch"] | {name: part for name, part in train.items() if name != "tokens"}}
-    source = {"run": str(run), "sensor": numbers.name, "minutes": minutes, "deep": deep, "steps": len(history)}
+    source = {"run": str(run), "sensor": numbers.name, "frames": 0, "minutes": minutes, "deep": deep}
     metadata: dict[str, Any] = {name: stored[name] for name in ("preprocessing", "data") if name in stored}
     metadata |= {"sensors": list(config.model.sensors), "source": source}
     metadata |= {} if loaded.trained_sensors is None else {"seen": [*loaded.trained_sensors, numbers.name]}

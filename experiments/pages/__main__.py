@@ -25,6 +25,7 @@ TRIED = "tried.jsonl"
 PAGES: Mapping[str, tuple[str, Callable[[Path], Page]]] = {
     "real": ("real.jsonl", encoders.real),
     "lookalikes": ("lookalikes.jsonl", encoders.lookalikes),
+    "new_sensor": ("new_sensor.jsonl", encoders.new_sensor),
     "motion": ("motion.jsonl", encoders.motion),
     "measure": ("measure.jsonl", encoders.measure),
     "backgrounds": ("backgrounds.jsonl", encoders.backgrounds),

@@ -145,6 +145,20 @@ def lookalikes(folder: Path) -> Page:
     return Page("lookalikes", [rows], findings, (answer, f"{readme[best].shown()} %"), readme=readme)
 
 
+def new_sensor(folder: Path) -> Page:
+    """Look-alikes asked by a known sensor as if it was new."""
+    kinds = {"universal": "universal tokens", "adapted": "adapted by simulation", "own": "its own tokens"}
+    rows, gains = [], []
+    for key, record in read_records(folder / "new_sensor.jsonl").items():
+        scores = {kind: percent([one["share"], *one["interval"]]) for kind, one in record["scores"].items()}
+        steps = record["simulated"][0] if record["simulated"] else 0
+        rows += [(key, words, steps if kind == "adapted" else None, scores[kind]) for kind, words in kinds.items()]
+        refused = "" if steps else " (refused: the universal tokens stay)"
+        gains.append(f"{key}: {scores['universal'].mean:.0f} % with universal tokens, {scores['adapted'].mean:.0f} % "
+                     f"adapted{refused}, {scores['own'].mean:.0f} % with its own.")  # fmt: skip
+    return Page("new_sensor", [rows], gains)
+
+
 def trust(folder: Path) -> Page:
     """Calibration, coverage and novelty of heads, and health of sensor units."""
     by_kind: dict[str, dict[str, Mapping[str, Any]]] = {}

@@ -98,7 +98,9 @@ class SimulatedLoader:
         self.config, self.tokenizer, self.notes = config, tokenizer, list[str]()
         self.objects = training_objects(config)
         world = endless.make_world(self.objects, simulated.sensors, places=simulated.places, seed=simulated.seed)
-        self._rows = np.array([model.sensor_row(find_sensor(name).name) for name in simulated.sensors] + [model.universal_row], np.int32)
+        self._rows = np.array(
+            [model.sensor_row(find_sensor(name).name) for name in simulated.sensors] + [model.universal_row], np.int32
+        )
         self._real = None if manifest is None else load_real(manifest, config, log)
         weight = dict(config.data.weights or ()).get(SIMULATED, WEIGHT)
         self._count = size if self._real is None else max(1, min(size - 1, round(size * weight / (weight + 1))))

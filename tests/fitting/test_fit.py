@@ -1,4 +1,4 @@
-"""The fit of a sensor: hidden parameters of simulated devices come back, and pictures that cannot be fitted are refused."""
+"""The fit of a sensor: hidden parameters of simulated devices come back, and unfit pictures are refused."""
 
 import numpy as np
 import pytest

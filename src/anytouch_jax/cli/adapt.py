@@ -47,7 +47,9 @@ def run(options: AdaptOptions) -> int:
     if Path(options.sensor).suffix == SUFFIX:
         return _simulated(options)
     if not options.data:
-        raise UserError(f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as --sensor")
+        raise UserError(
+            f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as --sensor"
+        )
     refuse_unused(options, ("minutes", "deep"), "with --data, where the frames are what is fitted")
     if not options.frames:
         refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")

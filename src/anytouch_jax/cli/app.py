@@ -53,7 +53,11 @@ class Command(NamedTuple):
         return (inspect.getdoc(self.options) or "").splitlines()[0]
 
 
-GROUPS = {"data": "Prepare a manifest of tactile frames.", "sensor": "Simulate your own sensor.", "probe": "Probe frozen features with simple heads."}
+GROUPS = {
+    "data": "Prepare a manifest of tactile frames.",
+    "sensor": "Simulate your own sensor.",
+    "probe": "Probe frozen features with simple heads.",
+}
 COMMANDS = {
     "data simulate": Command(simulate.SimulateOptions, simulate.run),
     "data index": Command(index.DatasetOptions, index.run),

@@ -55,7 +55,7 @@ def run(options: SensorOptions) -> int:
     share = compare(seen.frames[seen.pressed], seen.gel, options.out, picture, ball_mm=options.ball_mm)
     print(f"{options.out}: {options.name}, {fitted.colour.source}")
     print(
-        f"{picture}: real pictures above simulated ones. A linear classifier knows one from the other in {share:.0%} of "
-        "the cases, where 50 % is chance."
+        f"{picture}: real pictures above simulated ones. A linear classifier knows one from the other in {share:.0%} "
+        "of the cases, where 50 % is chance."
     )
     return 0

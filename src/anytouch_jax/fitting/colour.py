@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.errors import UserError
@@ -28,10 +29,17 @@ SKIN = 0.13  # mm: detail that the coating and the lens pass
 HALOS, THICKNESSES = (0.35, 1.0, 1.6), (2.0, 3.0, 4.5)  # mm, of the soft shadow and of the gel: the best is chosen
 THIN = 5  # the search looks at every so many pixels
 PLAIN = 9  # powers of the normal with which the presses are placed
-ROUNDS = ((0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03))  # steps of the search, mm of place and depth
+ROUNDS = (
+    (0.8, 0.2),
+    (0.4, 0.1),
+    (0.2, 0.1),
+    (0.1, 0.05),
+    (0.1, 0.05),
+    (0.05, 0.03),
+)  # steps of the search, mm of place and depth
 FEATURES = len(POWERS) * len(PLACES)
-# Root mean square of the slope of the gel where its change is above a quarter of the strongest, and its mean depth there in mm, in
-# simulated touches of 0.15 to 1.0 mm. They set the scale where no ball does.
+# Root mean square of the slope of the gel, where its change is above a quarter of the strongest, and of its depth there
+# in mm, in simulated touches of 0.15 to 1.0 mm. They set the scale where no ball does.
 USUAL_TILT, USUAL_DEPTH = 0.22, 0.3
 UNSURE = "Without a ball of known size the strength is a usual one. It may be off by half: edit contrast."
 
@@ -78,10 +86,13 @@ def _profiles(ball_mm: float) -> dict[tuple[float, float], _Profiles]:
     away, radius = np.hypot(*np.meshgrid(line, line)), ball_mm / 2
     surface = np.where(away < radius, np.sqrt(np.maximum(radius**2 - away**2, 0)) - radius, -radius - 5)
     middle, pitch = _GRID // 2, _SIDE / _GRID
-    solve = jax.jit(jax.vmap(
-        lambda depth, gel: press(surface.astype(np.float32), depth, gel, pitch, fidelity="fast").displacement, (0, None)
-    ))  # fmt: skip
-    found = {}
+    height = jnp.asarray(surface, jnp.float32)
+
+    @jax.jit
+    def solve(depths: Any, gel: Gel) -> Any:
+        return jax.vmap(lambda depth: press(height, depth, gel, pitch, fidelity="fast").displacement)(depths)
+
+    found = dict[tuple[float, float], _Profiles]()
     for thickness in THICKNESSES:
         dents = np.asarray(solve(DEPTHS.astype(np.float32), Gel(150.0, thickness=np.float32(thickness))))
 
@@ -216,7 +227,12 @@ def _first_pose(change: Array, grid: Grid, profiles: _Profiles) -> Array:
 
 
 def _search(
-    change: Array, seen: Array, grid: Grid, profiles: _Profiles, pose: Array, coefficients: Array,
+    change: Array,
+    seen: Array,
+    grid: Grid,
+    profiles: _Profiles,
+    pose: Array,
+    coefficients: Array,
     steps: tuple[float, ...],
 ) -> Array:
     """Return a pose that no step along x, y or depth makes better, after four steps at most."""

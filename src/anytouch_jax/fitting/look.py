@@ -110,11 +110,13 @@ def _check_flat(gel: Array) -> None:
     corners = [gel[rows, columns] for rows in (slice(height), slice(-height, None))
                for columns in (slice(width), slice(-width, None))]  # fmt: skip
     if max(float(corner.max(-1).mean()) for corner in corners) < DARK < gel[3 * height : -3 * height].mean() / 3:
-        raise UserError("the picture is round, so the sensor is not flat; a flat gel that fills the picture can be fitted")
+        raise UserError(
+            "the picture is round, so the sensor is not flat; a flat gel that fills the picture can be fitted"
+        )
 
 
 def find_dots(gel: Array) -> Dots | None:
-    """Return the dots of an untouched gel u8 (h, w, 3), dark or light ones; None for a gel without a lattice of them."""
+    """Return the dots of an untouched gel u8 (h, w, 3), dark or light ones; None without a lattice of them."""
     found = [_dots_of(gel, sign) for sign in (1, -1)]
     return next((one for one in found if one is not None), None)
 
@@ -189,7 +191,7 @@ def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
 
 
 def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Array, Array]:
-    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, without light and dots, and where they are seen."""
+    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, without light and dots, and where they show."""
     height, width = gel.shape[:2]
     size = (round(width * WORK / max(height, width)), round(height * WORK / max(height, width)))
     weight = np.ones((height, width), np.float32) if dots is None else (~dots.mask).astype(np.float32)

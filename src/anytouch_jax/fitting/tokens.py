@@ -34,26 +34,26 @@ from anytouch_jax.sim.endless import CAMERAS, SimulatedTouches
 from anytouch_jax.sim.sensing.own import read_numbers
 from anytouch_jax.simulated import prepared
 
-RATE, DEEP_RATE = 3e-3, 1e-4  # of Adam, for tokens and for blocks
+RATE, DEEP_RATE = 1e-3, 1e-4  # of Adam, for tokens and for blocks
 FIRST = 2  # blocks that are trained with `deep`
 KEPT = 480  # features of touches before, that a touch must not be taken for
 HEAT = 0.07  # temperature of the contrast
-REUSE = 2  # steps with the same touches in other light
+REUSE = 4  # steps with the same touches in other light
 BATCHES = 10  # of held-out touches, before and after
 SAVED = 60.0  # seconds between saved states
 State = dict[str, Any]
 
 
 def adapt_by_simulation(
-    run: str | Path, sensor: str | Path, *, minutes: float, deep: bool = False, state: Path | None = None, seed: int = 0,
-    known: Sequence[str] = CAMERAS, log: Log = print,
+    run: str | Path, sensor: str | Path, *, minutes: float, deep: bool = False, state: Path | None = None,
+    seed: int = 0, known: Sequence[str] = CAMERAS, log: Log = print,
 ) -> Adapted | None:  # fmt: skip
     """Return the model of `run` with tokens for the sensor of a folder NAME.sensor, trained for `minutes`.
 
-    `known` are the simulated sensors that take part. With `deep` the first blocks are trained too, and the features of known sensors are held where they are. `before`
-    and `after` are the shares of held-out touches that are found among 240 by a known sensor, with universal tokens and
-    with the new ones. After Ctrl-C the result is None: the next call continues from the file `state`. Raises UserError,
-    and CheckError if the new tokens find fewer.
+    `known` are the simulated sensors that take part. With `deep` the first blocks are trained too, and the features of
+    known sensors are held where they are. `before` and `after` are the shares of held-out touches that are found among
+    some 200 by a known sensor, with universal tokens and with the new ones. After Ctrl-C the result is None: the next
+    call continues from the file `state`. Raises UserError, and CheckError if the new tokens find fewer.
     """
     numbers = read_numbers(sensor)
     loaded, params = read_model(run)
@@ -61,7 +61,9 @@ def adapt_by_simulation(
     config, params, row = with_row(loaded, params, numbers.name, str(run), log)
     known = tuple(name for name in loaded.trained_sensors or CAMERAS if name in known)
     if not known:
-        raise UserError(f"{run} was trained on no sensor that is simulated, so nothing can be matched; name another run")
+        raise UserError(
+            f"{run} was trained on no sensor that is simulated, so nothing can be matched; name another run"
+        )
     size = config.model.image_size
     rows = np.array([row, *(config.model.sensor_row(name) for name in known)], np.int32)
     net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))
@@ -94,7 +96,9 @@ def adapt_by_simulation(
     tx = optax.scale_by_adam()
 
     @jax.jit
-    def step(train: State, moments: Any, frozen: Params, key: Any, touches: Any, queue: Any, seen: Any, rate: Any) -> Any:
+    def step(
+        train: State, moments: Any, frozen: Params, key: Any, touches: Any, queue: Any, seen: Any, rate: Any
+    ) -> Any:
         (value, target), grad = jax.value_and_grad(loss, has_aux=True)(train, frozen, key, touches, queue, seen)
         updates, moments = tx.update(grad, moments)
         rates = {name: RATE if name == "tokens" else DEEP_RATE for name in train}
@@ -106,9 +110,7 @@ def adapt_by_simulation(
     @jax.jit
     def features(train: State, frozen: Params, touches: Any) -> tuple[Any, Any]:
         key, of = jax.random.key(0), jnp.asarray(rows)[touches.sensor]
-        other, own = (
-            prepared(key, touches.clip[:, m], touches.background[:, m], plain, jitter=False) for m in (0, 1)
-        )
+        other, own = (prepared(key, touches.clip[:, m], touches.background[:, m], plain, jitter=False) for m in (0, 1))
         return encode(merged(train, frozen), own, of[:, 1]), encode(merged(train, frozen), other, of[:, 0])
 
     train: State = {"tokens": jnp.asarray(params["touch"]["sensor_tokens"][row])}

@@ -58,7 +58,8 @@ def compare(
 ) -> float:
     """Write a picture of real frames u8 (N, h, w, 3) above simulated ones, and return what a classifier still sees.
 
-    Both are presses of a ball of `ball_mm`, if that is given. The result is the share of held-out pictures that a linear classifier calls real or simulated rightly: 0.5 is chance.
+    Both are presses of a ball of `ball_mm`, if that is given. The result is the share of held-out pictures that a
+    linear classifier names rightly as real or simulated: 0.5 is chance.
     """
     world, count = own_world(sensor, "train", ball_mm=ball_mm), min(len(frames), 2 * COUNT)
     real = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
@@ -90,7 +91,7 @@ def _picture(real: Array, made: Array) -> Array:
 
 
 def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
-    """Return the share of held-out differences f32 (h, w, 3) that a ridge classifier on simple statistics gets right."""
+    """Return the share of held-out differences f32 (h, w, 3) that a ridge classifier on statistics gets right."""
     rows = np.stack([_statistics(one) for one in (*real, *made)])
     kind = np.repeat([1.0, -1.0], [len(real), len(made)])
     order = np.random.default_rng(seed).permutation(len(rows))

@@ -251,7 +251,11 @@ class Recorder:
         if name not in self._programs:
             scenes = self._scenes
             one = partial(
-                simulate_clip, sensor=find_sensor(name), fidelity=scenes.fidelity, size=scenes.size, fields=scenes.fields
+                simulate_clip,
+                sensor=find_sensor(name),
+                fidelity=scenes.fidelity,
+                size=scenes.size,
+                fields=scenes.fields,
             )
             self._programs[name] = jax.jit(jax.vmap(one))
         return self._programs[name]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,7 +45,7 @@ class OwnSensor:
     halo_mm: Above0[float] = 1.0  # width of the soft shadow
     contrast: Finite[float] = 1.0  # of dents, over that of the pictures
     spread: Annotated[float, Range(0, 1, "0 to 1")] = 0.3  # variation of simulated devices: 1 is that of a product
-    sure: dict = None  # type: ignore[type-arg, assignment]
+    sure: dict = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check(self)
@@ -108,7 +108,7 @@ def _fault(file: Path, _: int) -> str:
         fits = array is not None and array.ndim == len(shape) and all(
             b in (0, a) for a, b in zip(array.shape, shape, strict=True)
         )  # fmt: skip
-        if not fits or not np.isfinite(array).all() or not 0 < array.size < 1 << 20:
+        if array is None or not fits or not np.isfinite(array).all() or not 0 < array.size < 1 << 20:
             return f"the array {name} is missing, or has another shape than {shape}"
     return "" if len(arrays["bases"]) <= MOST_BASES else f"more than {MOST_BASES} untouched gels"
 
@@ -117,7 +117,7 @@ def write_sensor(folder: str | Path, numbers: OwnSensor, bases: Any, look: Photo
     """Write a folder NAME.sensor, with untouched gels u8 (n, h, w, 3), and return it."""
     path, data = Path(folder), io.BytesIO()
     arrays = {name: np.asarray(value, np.float32) for name, value in look._asdict().items()}
-    np.savez(data, bases=np.asarray(bases, np.uint8), **arrays)
+    np.savez(data, allow_pickle=False, bases=np.asarray(bases, np.uint8), **arrays)
     atomic_write(path / ARRAYS, data.getvalue())
     atomic_write(path / NUMBERS, json.dumps(asdict(numbers), indent=2) + "\n")
     return path

@@ -1,4 +1,4 @@
-"""Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`, or a file (`own`).
+"""Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`, see also `own`.
 
 `looks.npz` has the untouched gels of camera sensors and the colours of their dents. The code that fitted it has left
 (`experiments/results/tried.md`). GelSight, GelSight Mini, DIGIT and 9DTact look like real units. GelSlim and DuraGel
@@ -200,7 +200,8 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
     dirt = rng.uniform(size=SPECKS) < rng.uniform(0, 0.6)  # measured: 0 to 4 specks or scratches a gel
     return _unit(
         base=_draw_base(bases(sensor) if real is None else real, rng, of),
-        tint=xp.exp(spread * (rng.normal(0, 0.09) + rng.normal(0, 0.05, 3))),  # measured: means differ by 9 %, colours by 5 %
+        # Measured: means differ by 9 %, colours by 5 %.
+        tint=xp.exp(spread * (rng.normal(0, 0.09) + rng.normal(0, 0.05, 3))),
         gain=sensor.contrast * xp.exp(spread * (rng.normal(0, 0.25) + rng.normal(0, 0.15, 3))),
         light_angle=spread * rng.normal(0, np.deg2rad(10)),
         lights=xp.concatenate([spread * rng.normal(0, 0.1, 2), 1 + spread * (rng.uniform(0.8, 1.05, 2) - 1)]),
@@ -222,7 +223,8 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
         mirror=xp.where((rng.uniform(size=2) < np.array([0.5, 0.0])) & (spread >= 1), -1, 1),
         rotation=rng.normal(0, np.deg2rad(8)),
         offset=rng.normal(0, 0.4, 2),
-        noise=sensor.noise * xp.exp(spread * rng.normal(0, 0.5)),  # measured: 10 to 90 % of the recordings have 0.2 to 1.7
+        # Measured: 10 to 90 % of the recordings have 0.2 to 1.7.
+        noise=sensor.noise * xp.exp(spread * rng.normal(0, 0.5)),
         quality=rng.integers(70, 97),
     )  # fmt: skip
 

@@ -73,7 +73,7 @@ COMMANDS = {
     "probe tasks": Command(probe.TasksOptions, probe.run_tasks),
     "probe benchmark": Command(probe.BenchmarkOptions, probe.run_benchmark),
     "retrieve": Command(retrieve.RetrieveOptions, retrieve.run),
-    "sensor fit": Command(sensor.SensorOptions, sensor.run),
+    "sensor fit": Command(sensor.FitOptions, sensor.run),
     "report": Command(report.ReportOptions, report.run),
     "adapt": Command(adapt.AdaptOptions, adapt.run),
     "export": Command(export.ExportOptions, export.run),

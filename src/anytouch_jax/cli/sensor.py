@@ -13,7 +13,7 @@ from anytouch_jax.config.parsing import Above0
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorOptions:
+class FitOptions:
     """Fit the look of your sensor to 5 to 50 pictures of it, for the simulator.
 
     Example: anytouch sensor fit pictures/ --name mine --width-mm 18.6 --out mine.sensor
@@ -31,7 +31,7 @@ class SensorOptions:
     ball_mm: Above0[float | None] = None  # All presses are of a ball of this diameter, mm. Its slopes are known.
 
 
-def run(options: SensorOptions) -> int:
+def run(options: FitOptions) -> int:
     """Fit a sensor and write its folder."""
     from anytouch_jax.data.images import decode, list_images, to_rgb
     from anytouch_jax.fitting.fit import check_name, fit_sensor

@@ -17,7 +17,7 @@ SUFFIX = ".sensor"  # of a folder of `anytouch sensor fit`
 class AdaptOptions:
     """Make tokens for a new sensor: trained on simulated touches of it, or fitted to a few labelled frames.
 
-    Example: anytouch adapt --sensor mine.sensor --minutes 8 --out runs/mine
+    Example: anytouch adapt --sensor mine.sensor --minutes 6 --out runs/mine
 
     A sensor of `anytouch sensor fit` needs no data. Ctrl-C keeps the state, and the same command continues. Tokens
     that find fewer simulated touches than the universal ones are not saved. With --data, tokens are fitted to --labels.
@@ -27,7 +27,7 @@ class AdaptOptions:
     out: Path  # Run folder to write, for embed, probe and retrieve.
     model: Path = Path(DEFAULT)
     """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
-    minutes: Above0[float] = 8.0  # Minutes of training on simulated touches.
+    minutes: Above0[float] = 6.0  # Minutes of training on simulated touches.
     deep: bool = False  # Train the first blocks too, and hold the features of known sensors.
     data: tuple[Path, ...] = ()  # Manifests with labelled frames of the sensor in split train.
     frames: NotNegative[int] = 100

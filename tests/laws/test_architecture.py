@@ -36,9 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     # ops: unit-norm embeddings, and the contrast that fits a new sensor's tokens
     "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "files", "errors", "bars", "shown"},
     # a simulator of a user's sensor, and tokens of an encoder that are trained on it
-    "fitting": {
-        "sim", "simulated", "encoder", "nn", "objectives", "ops", "data", "config", "files", "errors", "bars",
-    },  # fmt: skip
+    "fitting": {"sim", "simulated", "encoder", "nn", "objectives", "ops", "data", "config", "files", "errors", "bars"},
     # objectives: stage 1's errors on pixels are measured by stage 1's own functions
     "evaluate": {"encoder", "objectives", "data", "ops", "config", "files", "errors", "bars", "shown"},
     "view": {"evaluate", "encoder", "data", "config", "files", "errors"},

@@ -50,7 +50,7 @@ HERE = {
     "--out report": "--out report --touches 40", " ...": "", "info FILE": "info runs/stage1",
 }  # fmt: skip
 # Two need files of the size of ViT-L or ViT-B: tests of weights and of `train --init` run them with small ones.
-# The viewer serves until it is stopped: it has tests that stop it. A user's own sensor is fitted and adapted in its tests.
+# The viewer serves until it is stopped: it has tests that stop it. So has a user's own sensor.
 ELSEWHERE = ("--preset large", "--preset base", "anytouch view", "mine.sensor", "--sensor mine ")
 # Numbers that no two runs share: times, rates, and the last digits of a float32.
 FREE = re.compile(

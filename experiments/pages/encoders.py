@@ -157,7 +157,7 @@ def new_sensor(folder: Path) -> Page:
         refused = "" if steps else " (refused: the universal tokens stay)"
         gains.append(f"{key}: {scores['universal'].mean:.0f} % with universal tokens, {scores['adapted'].mean:.0f} % "
                      f"adapted{refused}, {scores['own'].mean:.0f} % with its own.")  # fmt: skip
-    return Page("new_sensor", [rows], gains if apart else ["No difference is shown: the intervals overlap.", *gains])
+    return Page("new_sensor", [rows], gains if apart else ["No difference is shown: the intervals overlap."])
 
 
 def trust(folder: Path) -> Page:

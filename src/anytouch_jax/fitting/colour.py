@@ -41,7 +41,7 @@ FEATURES = len(POWERS) * len(PLACES)
 # Root mean square of the slope of the gel, where its change is above a quarter of the strongest, and of its depth there
 # in mm, in simulated touches of 0.15 to 1.0 mm. They set the scale where no ball does.
 USUAL_TILT, USUAL_DEPTH = 0.22, 0.3
-UNSURE = "Without a ball of known size the strength is a usual one. It may be off by half: edit contrast."
+UNSURE = "Without a ball of known size the strength is a usual one, perhaps half or double the true one: edit contrast."
 
 
 class Colour(NamedTuple):

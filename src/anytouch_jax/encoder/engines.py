@@ -295,6 +295,8 @@ def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[..., Any]:
         return _call(names, lambda given: [np.asarray(value) for value in model(given).values()])
     options = package.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = threads, 3
+    # Threads that spin for work between the frames of a camera take a core from all else.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     running = package.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     names = [output.name for output in running.get_outputs()]
     return _call(names, lambda given: running.run(names, given))

@@ -7,10 +7,9 @@ from pathlib import Path
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_home, log, refuse_unused
+from anytouch_jax.config import OWN_SENSOR
 from anytouch_jax.config.parsing import Above0, Count, NotNegative, Seed
 from anytouch_jax.errors import UserError
-
-SUFFIX = ".sensor"  # of a folder of `anytouch sensor fit`
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ def run(options: AdaptOptions) -> int:
     from anytouch_jax.encoder.adapt import adapt, check_empty, save
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    if Path(options.sensor).suffix == SUFFIX:
+    if Path(options.sensor).suffix == OWN_SENSOR:
         return _simulated(options)
     if not options.data:
         raise UserError(
@@ -79,7 +78,7 @@ def _simulated(options: AdaptOptions) -> int:
     from anytouch_jax.fitting.tokens import adapt_by_simulation
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    refuse_unused(options, ("data", "frames", "labels", "steps"), f"with a sensor of {SUFFIX}, which is simulated")
+    refuse_unused(options, ("data", "frames", "labels", "steps"), f"with a sensor of {OWN_SENSOR}, which is simulated")
     check_empty(options.out)
     check_home(options.out)
     enable_compilation_cache()

@@ -202,12 +202,9 @@ def _run(path: Path) -> list[str]:
     saved, best = checkpoint.steps(path / "checkpoints"), checkpoint.best_of(path / "checkpoints")
     model = [_model(config.model), _sensors(config.model, metadata.get("seen"))]
     if "sensor" in source:
-        data = (
-            f"trained on {minutes:g} minutes of simulated touches"
-            if (minutes := source.get("minutes"))
-            else (f"fitted to {source['frames']} frames")
-        )
-        adapted = f"tokens of {source['sensor']} {data}"
+        frames, minutes = source["frames"], source.get("minutes")
+        how = f"trained on {minutes:g} minutes of simulated touches" if minutes else f"fitted to {frames} frames"
+        adapted = f"tokens of {source['sensor']} {how}"
         lines = [f"{path}: the run {source['run']}, with {adapted}", *model]
     else:
         checkpoints = f", checkpoints at {', '.join(map(str, saved))}" if saved else ""

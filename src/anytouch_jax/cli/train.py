@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple, get_type_hints
 from anytouch_jax.cli.arguments import is_option, options_of, parse_options, spelled
 from anytouch_jax.cli.output import log
 from anytouch_jax.config import (
+    OWN_SENSOR,
     Config,
     DataConfig,
     LossConfig,
@@ -133,7 +134,7 @@ def run(request: TrainRequest) -> int:
 
 def _with_own_sensors(config: Config) -> Config:
     """Return the configuration with tokens for the sensors of `anytouch sensor fit` among the simulated ones."""
-    folders = [word for word in config.simulated.sensors if word.endswith(".sensor")]
+    folders = [word for word in config.simulated.sensors if word.endswith(OWN_SENSOR)]
     if not folders:
         return config
     from anytouch_jax.sim.sensing.own import read_numbers

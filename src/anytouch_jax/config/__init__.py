@@ -2,6 +2,7 @@
 
 from anytouch_jax.config.model import (
     FIELD_SENSORS,
+    OWN_SENSOR,
     SENSORS,
     UNIVERSAL,
     ModelConfig,

@@ -18,6 +18,7 @@ _MOST = 1 << 20  # of every size: a damaged configuration must not ask for the w
 Size = Annotated[int, Range(1, _MOST, f"1 to {_MOST}")]
 Number = Annotated[int, Range(0, _MOST, f"0 to {_MOST}")]
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
+OWN_SENSOR = ".sensor"  # ending of a folder of `anytouch sensor fit`
 OTHER_SENSORS = ("dtact", "tactip")  # sensors without tokens whose names are nearly those of others
 _LETTERS = 2  # by which a misspelt name differs from the right one
 

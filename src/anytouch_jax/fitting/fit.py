@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config import FIELD_SENSORS, SENSORS, check_spelling
+from anytouch_jax.config import FIELD_SENSORS, OWN_SENSOR, SENSORS, check_spelling
 from anytouch_jax.errors import UserError
 from anytouch_jax.fitting import colour, look
 from anytouch_jax.fitting.colour import Colour
@@ -52,8 +52,8 @@ def fit_sensor(
     All presses are of a ball of `ball_mm`, if that is given. Raises UserError for pictures that cannot be fitted.
     """
     check_name(name)
-    if Path(out).suffix != own.SUFFIX:
-        raise UserError(f"{out} must end in {own.SUFFIX}; choose another --out")
+    if Path(out).suffix != OWN_SENSOR:
+        raise UserError(f"{out} must end in {OWN_SENSOR}; choose another --out")
     height, width = pictures[0].shape[:2]
     height_mm = width_mm * height / width
     if not all(MM.low <= side <= MM.high for side in (width_mm, height_mm)):

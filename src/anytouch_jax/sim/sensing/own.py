@@ -15,13 +15,14 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from anytouch_jax.config import OWN_SENSOR
 from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check, parse_json, read_value
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, read_arrays
 from anytouch_jax.sim.contact.mechanics import Gel
 from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Photometry, Sensor
 
-SUFFIX, NUMBERS, ARRAYS = ".sensor", "sensor.json", "look.npz"
+NUMBERS, ARRAYS = "sensor.json", "look.npz"
 MM = Range(4, 40, "4 to 40 mm")
 SHAPES = {"bases": (0, 0, 0, 3), "normal": (20, 6, 3), "halo": (3, 3, 3), "steepest": (), "widest": (3,)}  # 0: any
 
@@ -55,10 +56,10 @@ def find_sensor(word: str) -> Sensor:
     """Return the sensor of a name in `SENSORS`, or of a folder NAME.sensor. Raises UserError for another word."""
     if word in SENSORS:
         return SENSORS[word]
-    if Path(word).suffix == SUFFIX:
+    if Path(word).suffix == OWN_SENSOR:
         return read_sensor(word)
     raise UserError(
-        f"there is no simulated sensor {word!r}; choose among {', '.join(SENSORS)}, or name a folder{SUFFIX} of "
+        f"there is no simulated sensor {word!r}; choose among {', '.join(SENSORS)}, or name a folder{OWN_SENSOR} of "
         "`anytouch sensor fit`"
     )
 

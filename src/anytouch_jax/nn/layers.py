@@ -15,6 +15,7 @@ from jax.typing import DTypeLike
 
 from anytouch_jax.config import ModelConfig, Stack
 from anytouch_jax.nn.attention import attention
+from anytouch_jax.ops.losses import row_sums
 
 Activation = Callable[[Array], Array]
 Turn = Callable[[Array], Array]
@@ -151,8 +152,8 @@ class LayerNorm(nnx.Module):
 
     def __call__(self, x: Array) -> Array:
         wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
-        centred = wide - jnp.mean(wide, axis=-1, keepdims=True)
-        variance = jnp.mean(centred * centred, axis=-1, keepdims=True)
+        centred = wide - row_sums(wide) / wide.shape[-1]
+        variance = row_sums(centred * centred) / wide.shape[-1]
         scale, bias = (jnp.expand_dims(p[...], range(x.ndim - 1)) for p in (self.scale, self.bias))
         return (centred * jax.lax.rsqrt(variance + self.eps) * scale + bias).astype(self.dtype)
 

@@ -5,6 +5,7 @@ B batch, N positions, T frames, C values of a patch, E embedding width. Arrays m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import jax
@@ -28,6 +29,17 @@ def mean(values: Array, count: Array | int | None = None) -> Array:
     """Return the sum of `values` over their number or `count`. That of nothing is 0."""
     count = values.size if count is None else count
     return jnp.sum(values) / jnp.maximum(jnp.asarray(count, values.dtype), 1)
+
+
+def row_sums(x: Array) -> Array:
+    """Return the sums (..., 1) of x (..., N) over its last axis.
+
+    On a CPU by a product with ones, into which XLA fuses what makes `x`. Its sums write `x` to memory first.
+    """
+    if jax.default_backend() != "cpu":
+        return jnp.sum(x, axis=-1, keepdims=True)
+    rows = x.reshape(math.prod(x.shape[:-1]), x.shape[-1])
+    return jnp.dot(rows, jnp.ones((x.shape[-1], 1), x.dtype), precision="highest").reshape(*x.shape[:-1], 1)
 
 
 def _equal_shapes(**arrays: Array) -> None:

@@ -20,6 +20,7 @@ import optax
 
 from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError
+from anytouch_jax.ops.losses import row_sums
 from anytouch_jax.weights.tree import flatten
 
 Array = jax.Array
@@ -75,7 +76,12 @@ def packing(tree: Tree, small: int = SMALL) -> Packing:
 
 def global_norm(arrays: Sequence[Array]) -> Array:
     """Return the Euclidean norm of all elements, f32 ()."""
-    return jnp.sqrt(sum(jnp.sum(jnp.square(x.astype(jnp.float32))) for x in arrays))
+
+    def squares(x: Array) -> Array:
+        x = x.astype(jnp.float32)
+        return jnp.sum(row_sums(x * x) if x.ndim > 1 else x * x)
+
+    return jnp.sqrt(sum(map(squares, arrays)))
 
 
 class OptState(NamedTuple):
@@ -135,9 +141,10 @@ def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | flo
 def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
     """Return AdamW as PyTorch computes it, with decoupled decay by `config.weight_decay` and optional clipping.
 
-    Call `update(grads, state, params, *, used=None, step=None, learning_rate=None)`. `used` is a tree of Python bools.
-    An unused parameter does not change, and does not count in the clipping norm. The rate is `learning_rate`, or that
-    of `schedule` at `step`, so that a skipped step does not shift the schedule.
+    Call `update(grads, state, params, *, used=None, step=None, learning_rate=None, good=True)`. `used` is a tree of
+    Python bools. An unused parameter does not change, and does not count in the clipping norm. The rate is
+    `learning_rate`, or that of `schedule` at `step`, so that a skipped step does not shift the schedule. If `good`
+    bool () is False, the state stays.
     """
     options, rate = config.optim, schedule(config)
 
@@ -154,26 +161,28 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
         used: Tree | None = None,
         step: Array | float | None = None,
         learning_rate: Array | float | None = None,
+        good: Array | bool = True,
         **_: Any,
     ) -> tuple[Tree, OptState]:
         if params is None or (step is None and learning_rate is None):
             raise TypeError("update needs params, and step or learning_rate")
         lr = jnp.asarray(rate(step) if learning_rate is None else learning_rate, jnp.float32)  # type: ignore[arg-type]
         layout = packing(params)
-        directions, count, mu, nu = _adamw(config, layout, grads, state, params, used)
-        updates = layout.unpack([(-lr * d).astype(d.dtype) for d in directions])
+        changes, count, mu, nu = _adamw(config, layout, grads, state, params, used, good, lr)
+        updates = layout.unpack(changes)
         if options.layer_decay != 1:
             slower = [d * depth_rate(name, d.shape, config) for name, d in flatten(updates).items()]
             updates = layout.treedef.unflatten(slower)
-        return updates, OptState(count, mu, nu, lr)
+        return updates, OptState(count, mu, nu, jnp.where(good, lr, state.learning_rate))
 
     return optax.GradientTransformationExtraArgs(init, update)
 
 
 def _adamw(
-    config: Config, layout: Packing, grads: Tree, state: OptState, params: Tree, used: Tree | None
-) -> tuple[list[Array], Array, tuple[Array, ...], tuple[Array, ...]]:
-    """Return packed directions before the learning rate, counts and moments. An unused leaf has direction 0."""
+    config: Config, layout: Packing, grads: Tree, state: OptState, params: Tree, used: Tree | None,
+    good: Array | bool, rate: Array,
+) -> tuple[list[Array], Array, tuple[Array, ...], tuple[Array, ...]]:  # fmt: skip
+    """Return packed updates, counts and moments. An unused leaf has update 0."""
     options = config.optim
     uses = np.asarray([True] * len(layout.shapes) if used is None else layout.treedef.flatten_up_to(used))
     decays = np.asarray(list(match_rules(config.weight_decay, flatten(params)).values()), np.float32)
@@ -184,19 +193,21 @@ def _adamw(
     if options.grad_clip is not None:
         length = global_norm([jnp.where(here, g, 0) for here, g in zip(use, gradients, strict=True)])
         gradients = tuple(g * jnp.minimum(1.0, options.grad_clip / length) for g in gradients)
-    directions, mus, nus = [], list(state.mu), list(state.nu)
+    updates, mus, nus = [], list(state.mu), list(state.nu)
     for k, (grad, value) in enumerate(zip(gradients, layout.pack(params), strict=True)):
         if not np.any(use[k]):
-            directions.append(jnp.zeros_like(value))
+            updates.append(jnp.zeros_like(value))
             continue
-        mu = options.beta1 * mus[k] + (1 - options.beta1) * grad
-        nu = options.beta2 * nus[k] + (1 - options.beta2) * grad * grad
-        mu_hat, nu_hat = mu / layout.spread(k, first), nu / layout.spread(k, second)
-        direction = mu_hat / (jnp.sqrt(nu_hat) + options.eps) + layout.spread(k, decays) * value
+        keep = good if np.all(use[k]) else use[k] & good
+        mu, nu = (
+            options.beta1 * mus[k] + (1 - options.beta1) * grad,
+            options.beta2 * nus[k] + (1 - options.beta2) * grad * grad,
+        )
+        mus[k], nus[k] = (jnp.where(keep, new, old).astype(old.dtype) for new, old in ((mu, mus[k]), (nu, nus[k])))
+        # One division comes last, which XLA does not repeat for each reader.
+        size = jnp.sqrt(nus[k] / layout.spread(k, second)) + options.eps
+        update = -rate * (mus[k] / layout.spread(k, first) + layout.spread(k, decays) * value * size) / size
         if not np.all(use[k]):  # where a count is 0, the corrected moments are NaN
-            direction, mu, nu = (
-                jnp.where(use[k], new, old) for new, old in ((direction, 0.0), (mu, mus[k]), (nu, nus[k]))
-            )
-        directions.append(direction.astype(value.dtype))
-        mus[k], nus[k] = mu.astype(mus[k].dtype), nu.astype(nus[k].dtype)
-    return directions, count, tuple(mus), tuple(nus)
+            update = jnp.where(use[k], update, 0.0)
+        updates.append(update.astype(value.dtype))
+    return updates, jnp.where(good, count, state.counts), tuple(mus), tuple(nus)

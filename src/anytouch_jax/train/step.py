@@ -13,7 +13,7 @@ from anytouch_jax.batch import AlignBatch
 from anytouch_jax.config import Config
 from anytouch_jax.errors import ConfigError, refuse_forked
 from anytouch_jax.shown import shown_short
-from anytouch_jax.train.optim import global_norm, match_rules, optimizer, packing
+from anytouch_jax.train.optim import OptState, global_norm, match_rules, optimizer, packing
 from anytouch_jax.weights.tree import flatten, nest
 
 Array = jax.Array
@@ -26,7 +26,6 @@ TrainedFn = Callable[[Any], Sequence[tuple[str, bool]]]
 StepFn = Callable[..., tuple["TrainState", dict[str, Array]]]
 
 
-@shown_short
 @shown_short
 class TrainState(NamedTuple):
     """The state of training: `step` i32 (), trainable and frozen parameters as nested dicts, the optimiser's state."""
@@ -78,9 +77,9 @@ def make_step(
     The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. A run for a time passes the share
     of its time as `progress`, which then decides the learning rate too. Only trainable parameters are
     differentiated. Those that a batch does not train by the rules of `trained` (`objectives.trained_by`) are skipped,
-    as in PyTorch (golden H_mixed). If the loss or the gradient norm is not finite, the update is not applied, `step`
-    advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm, param_norm (before the
-    update), update_norm, learning_rate, skipped.
+    as in PyTorch (golden H_mixed). If the loss, or the norm of gradients or parameters, is not finite, no update is
+    applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm, param_norm
+    (before the update), update_norm, learning_rate, skipped.
 
     `accumulate` micro-batches (rows m, m + accumulate, ...) run in turn, and their losses, gradients and metrics are
     averaged: equal to the large batch for a mean over rows, not for InfoNCE. Raises ConfigError for rows that do not
@@ -110,31 +109,30 @@ def make_step(
             return value, metrics, grads
 
         value, metrics, grads = gradients(parts, key) if accumulate == 1 else _mean_over(gradients, parts, key)
-        updates, opt_state = tx.update(grads, state.opt_state, state.trainable, used=used, step=at)
-        return _finish(state, value, metrics, grads, updates, opt_state)
+        layout = packing(state.trainable)
+        norms = {"grad_norm": global_norm(layout.pack(grads)), "param_norm": global_norm(layout.pack(state.trainable))}
+        # As the change waits for both norms, XLA overwrites parameters and moments in place.
+        good = jnp.isfinite(value) & jnp.isfinite(norms["grad_norm"]) & jnp.isfinite(norms["param_norm"])
+        updates, opt_state = tx.update(grads, state.opt_state, state.trainable, used=used, step=at, good=good)
+        return _finish(state, good, metrics | norms | {"loss": value}, updates, opt_state)
 
     return step
 
 
 def _finish(
-    state: TrainState, loss: Array, metrics: dict[str, Array], grads: Tree, updates: Tree, opt_state: Any
+    state: TrainState, good: Array, metrics: dict[str, Array], updates: Tree, opt_state: Any
 ) -> tuple[TrainState, dict[str, Array]]:
-    """Apply the update if loss and gradient are finite, and return the new state and its metrics."""
-    # The update is read only once: for a second reader XLA would keep a copy as large as the parameters. So
-    # `update_norm` is the norm of the change of the parameters, and does not decide whether a step is skipped.
-    layout = packing(state.trainable)
-    grad_norm = global_norm(layout.pack(grads))
-    good = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
-    new = (optax.apply_updates(state.trainable, updates), opt_state)
-    old = (state.trainable, state.opt_state)
-    trainable, opt_state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
-    before = layout.pack(state.trainable)
+    """Apply the update if `good`, and return the new state and its metrics."""
+    rate = getattr(opt_state, "learning_rate", jnp.nan)
+
+    def kept(new: Tree, old: Tree) -> Tree:
+        return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
+
+    trainable = kept(optax.apply_updates(state.trainable, updates), state.trainable)
+    opt_state = opt_state if isinstance(opt_state, OptState) else kept(opt_state, state.opt_state)
     metrics = metrics | {
-        "loss": loss,
-        "grad_norm": grad_norm,
-        "param_norm": global_norm(before),
-        "update_norm": global_norm([a - b for a, b in zip(layout.pack(trainable), before, strict=True)]),
-        "learning_rate": jnp.asarray(getattr(new[1], "learning_rate", jnp.nan)),
+        "update_norm": jnp.where(good, global_norm(packing(updates).pack(updates)), 0.0),
+        "learning_rate": jnp.asarray(rate),
         "skipped": jnp.where(good, 0.0, 1.0),
     }
     metrics = {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()}

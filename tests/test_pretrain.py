@@ -102,7 +102,7 @@ def test_a_resumed_run_equals_one_run_bit_for_bit(straight, world, tmp_path):
 def test_two_steps_and_two_more_are_bit_for_bit_four_as_users_run_them(world, tmp_path, stage):
     """Each part is its own process, on one device and with all of XLA's optimisations, unlike this process."""
     settings = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
-    settings["PYTHONPATH"] = os.pathsep.join([str(TESTS.parent / "src"), str(TESTS), settings.get("PYTHONPATH", "")])
+    settings["PYTHONPATH"] = os.pathsep.join(str(p) for p in (TESTS.parent / "src", TESTS, TESTS / "support"))
 
     def part(name, stop):
         command = [sys.executable, "-c", ALONE, str(world), str(stage), str(tmp_path / name), str(stop)]

@@ -56,6 +56,8 @@ ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
 CHECKED  := src tests docs $(wildcard experiments integrations)
 OPTIONS   = --run $(RUN) --preset $(PRESET)$(if $(STEPS), --steps $(STEPS))$(if $(STOP_AFTER), --stop-after $(STOP_AFTER))$(if $(SAVE), --save-every $(SAVE))$(if $(BATCH), --batch $(BATCH))
+STUDIED   = $(if $(RUNS), --runs $(RUNS))$(if $(STUDY), --study $(STUDY))$(if $(filter-out 0,$(QUICK)), --quick)$(if $(OUT), --out $(OUT))
+TOUCHES  := --touches 850 --sensors gelsight_mini digit gelsight gelslim duragel 9dtact --seed 41 --depth 0.15 1.0 --frames 6 --objects 480 --size 128 --vision 0.4 --text 0.7
 # Simulated data are made when they are what is asked for and are not there.
 scenes    = $(if $(filter $(SCENES)/manifest.parquet,$(DATA)),$(DATA))
 
@@ -138,10 +140,10 @@ compare: $(STAMP) ## encoders of all families: what they cost, and what your fil
 	$(PY) -m experiments.compare.run$(if $(ENCODERS), --encoders $(ENCODERS) --data $(DATA) --label $(LABEL))$(if $(OUT), --out $(OUT))
 
 pouring: $(STAMP) ## pour beads by touch alone, as the paper's table: [RUNS="anytouch=path static=path t3=path" STUDY= QUICK=1 OUT=]
-	RUNS="$(RUNS)" STUDY="$(STUDY)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.pouring.study
+	$(PY) -m experiments.pouring.study$(STUDIED)
 
 translation: $(STAMP) ## one sensor's touch as another feels it, as the paper's table: [RUNS="anytouch=path t3=path" STUDY= STEPS1=3000 QUICK=1 OUT=]
-	RUNS="$(RUNS)" STUDY="$(STUDY)" STEPS1="$(STEPS1)" QUICK="$(QUICK)" OUT="$(OUT)" $(PY) -m experiments.translation.study
+	$(PY) -m experiments.translation.study$(STUDIED)$(if $(STEPS1), --steps1 $(STEPS1))
 
 experiments: $(STAMP) ## the paper's tables on simulated touch, run by run: [QUICK=1 ONLY="q1 q2" RENDER=1 PLAN=1 WORK= OUT=]
 	$(PY) -m experiments.tables.run$(if $(filter-out 0,$(QUICK)), --quick)$(if $(ONLY), --only $(ONLY))$(if $(filter-out 0,$(RENDER)), --render)$(if $(filter-out 0,$(PLAN)), --plan)$(if $(WORK), --work $(WORK))$(if $(OUT), --out $(OUT))
@@ -153,14 +155,15 @@ notebooks: $(STAMP) ## run the notebooks of experiments/notebooks again, in plac
 	$(if $(findstring file,$(origin SCENES)),,SCENES=$(abspath $(SCENES)) )$(PY) -m experiments.notebooks.execute $(PAGES)
 
 corpus: $(STAMP) ## simulated touches on disk, of which the encoders are asked for look-alikes: [CORPUS=data/corpus]
-	$(PY) -m experiments.encoders.corpus $(CORPUS)
+	$(ANYTOUCH) data simulate --out $(CORPUS)/fine $(TOUCHES)
+	$(ANYTOUCH) data simulate --out $(CORPUS)/coarse $(TOUCHES) --grade coarse --first 1700
 
 weights: $(STAMP) ## train an encoder on endless touches for a time, and go on later: [MINUTES=12 REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
 	$(PY) -m experiments.encoders.train --minutes $(MINUTES) --real $(REAL) --out $(WEIGHTS)
 
 figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
 	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
-	$(PY) -m experiments.real.run anytouch-tiny --backgrounds$(if $(TOUCH), --data $(TOUCH))
+	$(PY) -m experiments.real.run anytouch-tiny --untouched median$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png
 	$(PY) -m experiments.pages
 	$(PY) -m experiments.notebooks.execute 01 02 03 04

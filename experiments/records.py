@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,21 @@ def _parsed(path: Path, *state: int) -> dict[str, Record]:
                 f"{path}, line {number}: not a result ({error!r}). Remove the line and run again."
             ) from None
     return records
+
+
+def check_alike(path: Path, several: Iterable[Mapping[str, Any]]) -> None:
+    """Raise UserError for records of `path` whose values of one name differ: they make no table together."""
+    if wrong := differences(several):
+        raise UserError(f"{path}: runs differ ({wrong}). Make them again in one file.")
+
+
+def differences(several: Iterable[Mapping[str, Any]]) -> str:
+    """Return in words the values that differ under one name, empty for none. A name that is missing is no value."""
+    values: dict[str, set[str]] = {}
+    for one in several:
+        for name, value in one.items():
+            values.setdefault(name, set()).add(str(value))
+    return "; ".join(f"{name} {' and '.join(sorted(some))}" for name, some in values.items() if len(some) > 1)
 
 
 def write_record(path: Path, key: str, record: Mapping[str, Any]) -> None:

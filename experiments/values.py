@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import t
 
+Seeds = dict[int, float]  # a score of each seed
 CLAIM = 3  # seeds from which a sign is claimed
 
 
@@ -45,7 +46,7 @@ def over_seeds(values: Sequence[float]) -> Value:
     return Value(mean, mean - half, mean + half, count)
 
 
-def shared_difference(first: dict[Any, float], second: dict[Any, float]) -> Value | None:
+def shared_difference(first: Seeds, second: Seeds) -> Value | None:
     """Return `first` minus `second` over the seeds that both have, None without any."""
     shared = sorted(first.keys() & second.keys())
     return over_seeds([first[seed] - second[seed] for seed in shared]) if shared else None

@@ -1,6 +1,6 @@
 """One encoder by XLA, onnxruntime and OpenVINO: the time of one touch, and the error of its features.
 
-    python -m experiments.benchmarks.engines anytouch-tiny --corpus data/corpus/00000/manifest.parquet
+    python -m experiments.benchmarks.engines anytouch-tiny --corpus data/corpus/fine/manifest.parquet
 
 Engines take turns, a touch each, so quiet the machine first. int8 is calibrated on touches of the training split. A
 line an encoder and engine goes to `experiments/results/engines.jsonl`. The page of speed shows it.

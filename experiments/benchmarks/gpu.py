@@ -24,14 +24,12 @@ import jax
 import jax.numpy as jnp
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import plain
 from anytouch_jax.train.step import merge
-from experiments.benchmarks import machine, speed
-from experiments.benchmarks.run import log, table_of
+from experiments.benchmarks import speed
+from experiments.benchmarks.run import log, store
 from experiments.benchmarks.variants import BASELINE, BFLOAT16, Variant
 from experiments.benchmarks.workloads import Workload, first_state, workloads
 from experiments.command import with_status
-from experiments.records import read_records, write_record
 
 CUDNN = Variant("bfloat16, cuDNN attention", BFLOAT16 | {"attention": "cudnn"}, precision=None)
 BATCHES = {"large": 32, "tiny": 256}  # samples a step, the preset of the paper first
@@ -95,26 +93,15 @@ def measured(options: argparse.Namespace, end: float) -> Iterator[tuple[str, str
                 log(f"{title}: {str(error).splitlines()[0]}")
 
 
-def run(options: argparse.Namespace) -> int:
-    """Measure, and print and store each workload at once."""
-    end, here = time.monotonic() + 60 * options.minutes, machine.describe()
-    log(here.sentence())
-    for preset, title, rows in measured(options, end):
-        key = f"{preset}, {here.vectors if here.device == 'cpu' else here.device}{', quick' * options.quick}"
-        about = {"machine": plain(here), "preset": preset, "quick": options.quick}
-        before = read_records(options.out).get(key, {}).get("results", {})
-        write_record(options.out, key, about | {"results": before | {title: rows}})
-        print(f"### {title}\n\n{table_of(rows)}\n", flush=True)
-    return 0
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line `args` and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=4, help="after which nothing is started")
     parser.add_argument("--quick", action="store_true", help="preset tiny in tiny batches, to see that it works")
     parser.add_argument("--out", type=Path, default=Path("runs/bench/gpu.jsonl"), help="file of results")
-    return with_status(lambda: run(parser.parse_args(args)))
+    options = parser.parse_args(args)
+    end = time.monotonic() + 60 * options.minutes
+    return with_status(lambda: store(measured(options, end), options) or 0)
 
 
 if __name__ == "__main__":

@@ -51,17 +51,12 @@ def describe() -> Machine:
     first = jax.devices()[0]
     pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return Machine(
-        device=first.device_kind,
-        devices=jax.device_count(),
-        processor=_cpuinfo("model name") or platform.machine(),
+        device=first.device_kind, devices=jax.device_count(), processor=_cpuinfo("model name") or platform.machine(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        memory_gib=pages / 2**30,
-        load=os.getloadavg()[0],
-        python=platform.python_version(),
-        jax=jax.__version__,
+        memory_gib=pages / 2**30, load=os.getloadavg()[0], python=platform.python_version(), jax=jax.__version__,
         system=platform.system(),
         vectors=next((name for flag, name in VECTORS.items() if flag in _cpuinfo("flags").split()), ""),
-    )
+    )  # fmt: skip
 
 
 def _cpuinfo(field: str) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import jax
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown_table, plain
+from anytouch_jax.train.progress import to_stderr as log
 from experiments.benchmarks import machine, speed
 from experiments.benchmarks.variants import variants_of
 from experiments.benchmarks.workloads import workloads
@@ -34,11 +35,6 @@ SHOWN = (
     "output", "peak_bytes", "note",
 )  # fmt: skip
 Rows = Sequence[Any]
-
-
-def log(sentence: str) -> None:
-    """Print progress to standard error."""
-    print(sentence, file=sys.stderr, flush=True)
 
 
 def parse(args: Sequence[str] | None) -> argparse.Namespace:
@@ -82,18 +78,23 @@ def network(options: argparse.Namespace, what: str) -> Iterator[tuple[str, Rows]
 
 def run(options: argparse.Namespace) -> int:
     """Measure, store each section at once and print its table."""
+    parts = chain(*(network(options, what) for what in dict.fromkeys(options.what) or WHAT))
+    store(((options.preset, title, [speed.record_of(row) for row in rows]) for title, rows in parts), options,
+          rounds=options.rounds)  # fmt: skip
+    return 0
+
+
+def store(sections: Iterable[tuple[str, str, list[Any]]], options: argparse.Namespace, **about: Any) -> None:
+    """Store each section (preset, title, records) as it comes, and print its table."""
     here = machine.describe()
     log(here.sentence())
-    about = {"machine": plain(here), "preset": options.preset, "rounds": options.rounds, "quick": options.quick}
-    key = f"{options.preset}, {here.vectors if here.device == 'cpu' else here.device}{', quick' * options.quick}"
-    parts = [network(options, what) for what in dict.fromkeys(options.what) or WHAT]
-    for title, rows in chain(*parts):
-        records = [speed.record_of(row) for row in rows]
+    about |= {"machine": plain(here), "quick": options.quick}
+    for preset, title, records in sections:
+        key = f"{preset}, {here.vectors if here.device == 'cpu' else here.device}{', quick' * options.quick}"
         before = read_records(options.out).get(key, {}).get("results", {})
-        write_record(options.out, key, about | {"results": before | {title: records}})
+        write_record(options.out, key, about | {"preset": preset, "results": before | {title: records}})
         print(f"### {title}\n\n{table_of(records)}\n", flush=True)
-    log(f"{options.out}, {key}")
-    return 0
+        log(f"{options.out}, {key}")
 
 
 def table_of(records: Sequence[Mapping[str, Any]]) -> str:

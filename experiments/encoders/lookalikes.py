@@ -1,6 +1,6 @@
 """Which of 50 look-alikes is the same touch, by another sensor? Encoders and raw pixels on objects never trained on.
 
-    python -m experiments.encoders.lookalikes anytouch-tiny --fine data/corpus/00000 --coarse data/corpus/01700
+    python -m experiments.encoders.lookalikes anytouch-tiny --fine data/corpus/fine --coarse data/corpus/coarse
 
 Queries and galleries are the deepest frames of the test split. The other 49 resemble the touch most in place, depth and
 force.
@@ -9,7 +9,6 @@ force.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.feature_cache import background_difference
+from anytouch_jax.evaluate.statistics import plain
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
 from experiments.real.run import UNTRAINED, load
@@ -49,7 +49,7 @@ def main() -> None:
     marks = {name: one.fingerprint for name, one in encoders.items() if not name.startswith(UNTRAINED)}
     for grade in ("fine", "coarse"):
         if folder := getattr(options, grade):
-            about = {"encoders": marks, "machine": dataclasses.asdict(machine.describe())}
+            about = {"encoders": marks, "machine": plain(machine.describe())}
             record = about | recall(encoders, folder / "manifest.parquet")
             write_record(options.out, grade, record)
             print(grade, record["scores"], flush=True)

@@ -11,7 +11,6 @@ about the touched place, a slide is their mean.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import run_in_batches
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.evaluate import heads
-from anytouch_jax.evaluate.statistics import mean_interval
+from anytouch_jax.evaluate.statistics import mean_interval, plain
 from anytouch_jax.objectives import normalise_touch
 from experiments.benchmarks import machine
 from experiments.real.run import load
@@ -34,6 +33,7 @@ from experiments.records import write_record
 Array = np.ndarray
 TURNS, SLIDES = ("clockwise", "counterclockwise"), ("left", "right", "up", "down")
 HIDDEN, EPOCHS, BATCH, RATE = 48, 30, 64, 2e-3
+TOUCHED = 0.08  # mm of the deepest point that count as contact
 
 
 class Clips(NamedTuple):
@@ -52,7 +52,7 @@ def read(encoder: Encoder, paths: list[Path], most: int) -> Clips:
     manifest = manifests.read(paths)
     names = ("label.twist", "label.slide", "sensor", "split", "touch")
     columns = {name: manifest.text_column(name) for name in names}
-    touched = np.array(manifest.column("label.contact").to_pylist(), object) == 1
+    touched = manifest.number_column("label.depth") > TOUCHED
     moves = np.isin(columns["label.twist"], TURNS) | np.isin(columns["label.slide"], SLIDES)
     sequence = manifest.codes("sequence", own=True)
     frame = np.asarray(manifest.table["frame_index"])
@@ -164,13 +164,10 @@ def pooled_score(clips: Clips, splits: dict[str, Array]) -> float:
     """Return the share of test turns that a linear probe names right on the change of the mean token."""
     change = (clips.tokens[:, 1].astype(np.float32) - clips.tokens[:, 0]).mean(1)
     rows = {split: one[clips.turn[one] != "none"] for split, one in splits.items()}
-    y = (clips.turn == TURNS[0]).astype(int)
-    scale = change[rows["train"]].std(0) + 1e-6
-    models = heads.logistic_path(change[rows["train"]] / scale, y[rows["train"]], 2, (1.0, 0.1, 0.01), None, None)
+    models = heads.linear_path(change[rows["train"]], clips.turn[rows["train"]], (1.0, 0.1, 0.01))
 
-    def share(model: Any, split: str) -> float:
-        logit = change[rows[split]] / scale @ model.weights + model.bias
-        return float(np.mean((logit[:, -1] > 0) == y[rows[split]]))
+    def share(model: heads.LinearModel, split: str) -> float:
+        return float(np.mean(model(change[rows[split]]) == clips.turn[rows[split]]))
 
     return share(max(models, key=lambda model: share(model, "val")), "test")
 
@@ -190,14 +187,9 @@ def main() -> None:
             parts = {split: rows[(clips.sensor[rows] != sensor)] for split, rows in splits.items()}
             own = splits["test"][clips.sensor[splits["test"]] == sensor]
             record[f"without {sensor}"] = score(fit(clips, parts["train"], parts["val"]), clips, own)
-        pooled = pooled_score(clips, splits)
-        about = {"clips": len(clips.turn), "machine": dataclasses.asdict(machine.describe())}
-        write_record(options.out, name, about | {"pooled": pooled, "scores": record})
-        print(name, f"mean token, turn {pooled:.3f}", flush=True)
-        for row, found in record.items():
-            print(
-                name, row, *(f"{what} {one['share']:.3f} of {one['clips']}" for what, one in found.items()), flush=True
-            )
+        about = {"clips": len(clips.turn), "machine": plain(machine.describe()), "pooled": pooled_score(clips, splits)}
+        write_record(options.out, name, about | {"scores": record})
+        print(name, about["pooled"], record, flush=True)
 
 
 if __name__ == "__main__":

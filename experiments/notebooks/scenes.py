@@ -35,13 +35,9 @@ def small(config: at.Config, steps: int, batch: int) -> at.Config:
     tower, model = {"width": 64, "depth": 2, "heads": 4, "mlp": 128}, config.model
     image, text = model.image, model.text
     model = replace(
-        model,
-        image_size=56,
-        touch=replace(model.touch, **tower),
-        decoder=replace(model.decoder, **tower),
-        image=image and replace(image, **tower),
-        text=text and replace(text, stack=replace(text.stack, **tower)),
-    )
+        model, image_size=56, touch=replace(model.touch, **tower), decoder=replace(model.decoder, **tower),
+        image=image and replace(image, **tower), text=text and replace(text, stack=replace(text.stack, **tower)),
+    )  # fmt: skip
     return replace(config, model=model).with_settings({
         "data.batch_size": batch, "optim.learning_rate": 1e-3, "run.steps": steps, "run.save_every": steps,
         "run.figure_every": steps,

@@ -28,7 +28,6 @@ PAGES: Mapping[str, tuple[str, Callable[[Path], Page]]] = {
     "new_sensor": ("new_sensor.jsonl", encoders.new_sensor),
     "motion": ("motion.jsonl", encoders.motion),
     "measure": ("measure.jsonl", encoders.measure),
-    "backgrounds": ("backgrounds.jsonl", encoders.backgrounds),
     "trust": ("trust.jsonl", encoders.trust),
     "sensors": ("matrix.jsonl/q1", paper.sensors),
     "space": ("matrix.jsonl/q2", paper.space),

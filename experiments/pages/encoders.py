@@ -1,4 +1,4 @@
-"""Rows and findings of the encoders in the package: real recordings, look-alikes, motion, backgrounds and trust."""
+"""Rows and findings of the encoders in the package: real recordings, look-alikes, motion and trust."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.weights.registry import DEFAULT
 from experiments.pages.page import Finding, Page
 from experiments.real.scores import HEADS, TASKS, TRAINED, Score
-from experiments.records import Record, read_records
+from experiments.records import Record, check_alike, read_records
 from experiments.values import Value, percent
 
 UNTRAINED, FINGER = "untrained:", "object, other finger"
@@ -32,12 +32,10 @@ def _share(score: Score | None) -> Value | None:
 
 
 def real(folder: Path) -> Page:
-    """Encoders on real recordings."""
+    """Encoders on real recordings, with and without pictures of the untouched gel."""
     path = folder / "real.jsonl"
     records = read_records(path)
-    if len({record["data"] for record in records.values()}) > 1:
-        raise UserError(f"The records of {path} are of different data. Run all of them again.")
-    encoders = [name for name, one in records.items() if one.get("kind") == "encoder" and UNTRAINED not in name]
+    check_alike(path, [{"data": one["data"]} for one in records.values()])
     rows: list[Any] = []
     findings: list[Finding] = []
     readme: dict[str, Value] = {}
@@ -45,52 +43,20 @@ def real(folder: Path) -> Page:
         scores = {name: [_score(one, f"{task}, {head}") for head in (*HEADS, TRAINED)] for name, one in records.items()}
         found = []
         for name, (linear, near, trained) in scores.items():
-            fresh = scores.get(f"{UNTRAINED}{name}", scores.get(f"{UNTRAINED}{DEFAULT}", [None]))[0]
-            changes = [
-                _minus(linear, other) if UNTRAINED not in name else None for other in (scores["pixels"][0], fresh)
-            ]
+            end = name.removeprefix(plain := name.removesuffix(f", {records[name].get('untouched')}"))
+            fresh = scores.get(f"{UNTRAINED}{plain}", scores.get(f"{UNTRAINED}{DEFAULT}", [None]))[0]
+            learned = UNTRAINED not in name
+            against = (scores[f"pixels{end}"][0] if learned else None, fresh if learned and not end else None,
+                       scores[plain][0] if end else None)  # fmt: skip
+            changes = [_minus(linear, other) for other in against]
             found.append((task, name, _share(linear or trained), _share(near), *changes))
-            names = ("pixels", "an untrained encoder") if name in encoders else ()
-            findings += [Finding(f"`{name}`", other, changes[i], task) for i, other in enumerate(names)]
+            if records[name]["kind"] == "encoder" and learned:
+                others = (f"pixels{end}", "an untrained encoder", f"`{plain}` by the rule")
+                findings += [Finding(f"`{name}`", *pair, task) for pair in zip(others, changes, strict=True) if pair[1]]
         rows += sorted((row for row in found if row[2] is not None), key=lambda row: -row[2].mean)
         readme |= {row[1].removesuffix(f":{DEFAULT}"): row[2] for row in found if task == FINGER and row[2] is not None}
     findings.sort(key=lambda one: one.first != f"`{DEFAULT}`")
-    curves = [(name, *(100 * one["label_curve"][count] for count in ("1", "2", "5")))
-              for name, one in records.items() if "label_curve" in one]  # fmt: skip
-    return Page("real", [rows, sorted(curves, key=lambda row: -row[1])], findings, readme=readme)
-
-
-BACKGROUNDS = {
-    "own": "the unit's own picture", "rule": "the rule (its own picture, else a median)",
-    "median": "the median of a hundred training frames", "all": "the median of all training frames",
-    "ten": "the median of 10 training frames", "half": "the median of the flattest half of a hundred",
-    "recordings": "the median of the medians of recordings", "estimated": "an estimate by `anytouch data contact`",
-    "first": "the first frame of the recording", "pixels": "raw pixels, minus the median of a hundred frames",
-}  # fmt: skip
-
-
-def backgrounds(folder: Path) -> Page:
-    """An encoder on real recordings, by what is subtracted."""
-    records, rows = read_records(folder / "backgrounds.jsonl"), []
-    findings: list[Finding | str] = []
-    for task in reversed(TASKS):
-        scores = {kind: [_score(records[kind], f"{task}, {head}") for head in HEADS] for kind in BACKGROUNDS
-                  if kind in records}  # fmt: skip
-        for kind, (linear, near) in scores.items():
-            change = _minus(linear, scores["own"][0])
-            rows.append((task, BACKGROUNDS[kind], _share(linear), _share(near), change))
-            if kind in ("rule", "median", "first"):
-                findings.append(Finding(BACKGROUNDS[kind], BACKGROUNDS["own"], change, task))
-        if "pixels" in scores and "median" in scores:
-            change = _minus(scores["median"][0], scores["pixels"][0])
-            findings.append(Finding("the encoder, minus the median of a hundred frames,", "raw pixels", change, task))
-    if alone := read_records(folder / "tried.jsonl").get("untouched_gel"):
-        findings.insert(0, f"Of simulated recordings without such a picture, {alone['figure']}.")
-    answer = Finding(BACKGROUNDS["rule"], BACKGROUNDS["own"], rows[1][-1], rows[1][0])
-    return Page(
-        "backgrounds", [rows], findings, (f"{answer.words}.", answer.figure),
-        words={"encoder": next(iter(records.values()))["encoder"]},
-    )  # fmt: skip
+    return Page("real", [rows], findings, readme=readme)
 
 
 def motion(folder: Path) -> Page:

@@ -10,11 +10,12 @@ import numpy as np
 
 from experiments.pages.page import RECORDS, Finding, Page
 from experiments.pouring import table as pours
+from experiments.records import check_alike, read_records
 from experiments.tables import paper, pictures
 from experiments.tables.columns import FORM, FOUR, MOVING, SIX, title
-from experiments.tables.results import Column, Matrix, Seeds
-from experiments.translation.settings import OURS, PIXELS, TRANSLATIONS, TRANSLATORS, TUNES, one_table, runs_of
-from experiments.values import over_seeds, shared_difference
+from experiments.tables.results import Column, Matrix
+from experiments.translation.settings import PIXELS, TRANSLATIONS, TRANSLATORS, TUNES, shared
+from experiments.values import Seeds, over_seeds, shared_difference
 
 NAMES = {[*paper.TABLE1][-1]: "an encoder of all four sensors", "gelsight": "an encoder of GelSight alone"}
 
@@ -88,8 +89,8 @@ def translation(folder: Path) -> Page:
     """Table 7: one sensor's touch as another would feel it."""
     rows, findings = [], []
     for file, steps in zip(RECORDS["translation"]["data"], ("3000 steps", "400 steps"), strict=True):
-        runs = [*runs_of(folder / file).values()]
-        one_table([one["settings"] for one in runs], folder / file)
+        runs = [*read_records(folder / file).values()]
+        check_alike(folder / file, [shared(one["settings"]) for one in runs])
         errors: dict[tuple[str, str], dict[str, Seeds]] = {}
         for one in runs:
             about = one["settings"]
@@ -100,7 +101,7 @@ def translation(folder: Path) -> Page:
         for (encoder, tune), tasks in sorted(errors.items()):
             each = (over_seeds([*tasks[task].values()]) if task in tasks else None for task in TRANSLATIONS)
             rows.append((steps, TRANSLATORS.get(encoder, encoder), TUNES[tune], *each))
-            for task, words in TRANSLATIONS.items() if encoder in OURS[:1] else ():
+            for task, words in TRANSLATIONS.items() if encoder == "anytouch" else ():
                 change = shared_difference(tasks.get(task, {}), errors.get(("t3", tune), {}).get(task, {}))
                 what = f"error, {words}, {TUNES[tune]}, {steps}"
                 findings.append(Finding("AnyTouch", "T3-style", change, what, "", ".4f"))

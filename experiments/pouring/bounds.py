@@ -11,21 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from experiments.pouring import physics
+from experiments.pouring import physics, policy
 from experiments.pouring.physics import ACTIONS, WAIT, Setup, State, Task
-from experiments.pouring.policy import (
-    LAG,
-    LIFTED,
-    Head,
-    Learning,
-    demonstrate,
-    imitate,
-    input_table,
-    inputs,
-    late_hands,
-    log_probabilities,
-    moments,
-)
 from experiments.pouring.trials import FRAMES, START, Controller, Expert, Trials, draw_runs, run
 
 Array = npt.NDArray[Any]
@@ -44,7 +31,7 @@ class Blind:
 
     looks = False
 
-    def __init__(self, head: Head) -> None:
+    def __init__(self, head: policy.Head) -> None:
         self._head = head
 
     def begin(self, count: int) -> None:
@@ -53,26 +40,26 @@ class Blind:
 
     def act(self, frames: Array | None, state: State) -> Array:
         """Actions (B,) from the time and the counts of its actions."""
-        chosen = log_probabilities(self._head, self._x).argmax(-1)
+        chosen = policy.log_probabilities(self._head, self._x).argmax(-1)
         chosen = np.where(self._x[:, 0] * 100 < START - 0.5, WAIT, chosen)
         self._x = self._x + np.concatenate([np.ones((len(chosen), 1)), np.eye(len(ACTIONS))[chosen]], 1) / 100
         self._x = self._x.astype(np.float32)
         return chosen
 
 
-def learn_blind(task: Task, seed: int, count: int, learning: Learning) -> Blind:
+def learn_blind(task: Task, seed: int, count: int, learning: policy.Learning) -> Blind:
     """A blind policy from `count` demonstrations of an expert that never waits.
 
     To wait is to answer what is seen: a blind policy would learn that it has poured too early to stop, as it never
     waited.
     """
-    trials = demonstrate(task, seed, count, side=None, patient=False, chunk=count)
+    trials = policy.demonstrate(task, seed, count, side=None, patient=False, chunk=count)
     return Blind(imitate_plainly(trials, blind_inputs(trials.actions)[START:], learning))
 
 
-def imitate_plainly(trials: Trials, x: Array, learning: Learning) -> Head:
+def imitate_plainly(trials: Trials, x: Array, learning: policy.Learning) -> policy.Head:
     """Return the MLP over inputs x (S - START, B, d), trained without dropout: they are few and without noise."""
-    return imitate(*moments(trials, x), replace(learning, dropout=0.0))[0]
+    return policy.imitate(*policy.moments(trials, x), replace(learning, dropout=0.0))[0]
 
 
 @partial(jax.jit, static_argnames=("task",))
@@ -94,13 +81,13 @@ class Scales:
 
     looks = False
 
-    def __init__(self, task: Task, setups: Setup, inner: Controller | Head) -> None:
+    def __init__(self, task: Task, setups: Setup, inner: Controller | policy.Head) -> None:
         self._task, self._setups, self._inner = task, setups, inner
 
     def begin(self, count: int) -> None:
         """Forget the loads of the last runs."""
         self.loads: list[Array] = []
-        if not isinstance(self._inner, Head):
+        if not isinstance(self._inner, policy.Head):
             self._inner.begin(count)
 
     def segments(self) -> Array:
@@ -110,18 +97,18 @@ class Scales:
     def act(self, frames: Array | None, state: State) -> Array:
         """Actions (B,) of this moment."""
         self.loads.append(np.asarray(_loads(state, self._setups, task=self._task)))
-        if not isinstance(self._inner, Head):
+        if not isinstance(self._inner, policy.Head):
             return self._inner.act(frames, state)
         if len(self.loads) <= START:
             return np.full(len(state.mass), WAIT)
         z = self.segments()
-        x = inputs(z[-1], z[max(len(z) - 1 - LAG, LIFTED)], z[LIFTED], z[0])
-        return log_probabilities(self._inner, x).argmax(-1)
+        x = policy.inputs(z[-1], z[max(len(z) - 1 - policy.LAG, policy.LIFTED)], z[policy.LIFTED], z[0])
+        return policy.log_probabilities(self._inner, x).argmax(-1)
 
 
-def learn_loads(task: Task, seed: int, count: int, learning: Learning) -> Head:
-    """The MLP over the loads themselves, from the demonstrations that `demonstrate` gives for the same seed."""
+def learn_loads(task: Task, seed: int, count: int, learning: policy.Learning) -> policy.Head:
+    """The MLP over the loads themselves, from the demonstrations that `policy.demonstrate` gives for the same seed."""
     setups, keys = draw_runs(task, seed, count)
     noting = Scales(task, setups, Expert(task))
-    trials = run(task, setups, keys, noting, late=late_hands(seed, count))
-    return imitate_plainly(trials, input_table(noting.segments()), learning)
+    trials = run(task, setups, keys, noting, late=policy.late_hands(seed, count))
+    return imitate_plainly(trials, policy.input_table(noting.segments()), learning)

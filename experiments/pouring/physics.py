@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from anytouch_jax.config.parsing import Above0, Count, Range, check
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.sensing.sensors import SENSORS, Unit, draw_unit
 
@@ -40,25 +41,19 @@ class Task:
     degrees. `markers`: of the gel. Raises UserError for a task that cannot be done.
     """
 
-    beads: float = 100.0
-    target: float = 60.0
-    step: float = 0.25
-    rate: float = 5.0
-    back: float = 3.0
-    limit: int = 400
-    most: float = 125.0
+    beads: Above0[float] = 100.0
+    target: Above0[float] = 60.0
+    step: Above0[float] = 0.25
+    rate: Above0[float] = 5.0
+    back: Above0[float] = 3.0
+    limit: Count[int] = 400
+    most: Annotated[float, Range(1, 180, "1 to 180")] = 125.0
     markers: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("beads", "target", "step", "rate", "back", "most"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise UserError(f"{name} of a pouring task must be above 0, not {getattr(self, name)}")
+        check(self)
         if self.target >= self.beads:
             raise UserError(f"the target of {self.target:g} g must be below the {self.beads:g} g in the cylinder")
-        if self.most > 180:
-            raise UserError(f"most, the steepest tilt of a pouring task, is at most 180 degrees, not {self.most:g}")
-        if self.limit < 1:
-            raise UserError(f"limit, the most actions of a run, must be at least 1, not {self.limit}")
 
 
 class Setup(NamedTuple):
@@ -126,25 +121,14 @@ def draw_setup(task: Task, rng: np.random.Generator) -> Setup:
     height, repose = fill * rng.uniform(1.3, 1.7), math.radians(rng.uniform(21, 31))
     full = math.atan((height - fill) / radius)  # of the surface that reaches the lip
     values = {
-        "radius": radius,
-        "height": height,
-        "empty": rng.uniform(30, 60),
-        "bead": rng.uniform(2, 6),
-        "bulk": bulk,
-        "repose": repose,
-        "tilt": max(full + repose - math.radians(rng.uniform(3, 20)), 0.0),
-        "mount": math.radians(rng.uniform(20, 40)),
-        "grip_height": fill * rng.uniform(0.6, 0.9),
-        "grip": rng.uniform(5, 10),
-        "relax": rng.uniform(0.02, 0.1),
-        "relax_time": rng.uniform(5, 30),
-        "share": rng.uniform(0.5, 0.65),
-        "friction": rng.uniform(0.5, 0.9),
-        "jolt": rng.uniform(0.002, 0.01),
-        "place": rng.normal(0, 0.6, 2),
-        "yaw": math.radians(rng.normal(0, 3)),
+        "radius": radius, "height": height, "empty": rng.uniform(30, 60), "bead": rng.uniform(2, 6), "bulk": bulk,
+        "repose": repose, "tilt": max(full + repose - math.radians(rng.uniform(3, 20)), 0.0),
+        "mount": math.radians(rng.uniform(20, 40)), "grip_height": fill * rng.uniform(0.6, 0.9),
+        "grip": rng.uniform(5, 10), "relax": rng.uniform(0.02, 0.1), "relax_time": rng.uniform(5, 30),
+        "share": rng.uniform(0.5, 0.65), "friction": rng.uniform(0.5, 0.9), "jolt": rng.uniform(0.002, 0.01),
+        "place": rng.normal(0, 0.6, 2), "yaw": math.radians(rng.normal(0, 3)),
         "lean": math.tan(math.radians(rng.normal(0, 0.7))),
-    }
+    }  # fmt: skip
     return Setup(**{name: np.asarray(value, np.float32) for name, value in values.items()}, unit=unit)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import optax
 
+from anytouch_jax.config.parsing import Below1, Count, check
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder.embed import Pooling, run_in_batches
 from anytouch_jax.encoder.encoder import Encoder, touch_features
@@ -46,28 +47,24 @@ class Learning:
     `tune_rate` (the encoder's; the MLP's is twice `rate`), which rises for a tenth of the steps and then falls.
     """
 
-    steps: int = 3000
+    steps: Count[int] = 3000
     rate: float = 1e-3
-    batch: int = 1024
-    width: int = 128
+    batch: Count[int] = 1024
+    width: Count[int] = 128
     decay: float = 1e-2
-    components: int = 128
-    dropout: float = 0.3
-    votes: int = 5
+    components: Count[int] = 128
+    dropout: Below1 = 0.3
+    votes: Count[int] = 5
     pooling: Pooling = "both"
     held_out: float = 0.2
-    tune_steps: int = 400
-    tune_runs: int = 16
-    tune_moments: int = 4
+    tune_steps: Count[int] = 400
+    tune_runs: Count[int] = 16
+    tune_moments: Count[int] = 4
     tune_rate: float = 5e-4
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "width", "components", "votes", "tune_steps", "tune_runs", "tune_moments"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} of the policy's learning must be at least 1, not {getattr(self, name)}")
-        if not 0 <= self.dropout < 1:
-            raise UserError(f"dropout of the policy's learning must be from 0 to below 1, not {self.dropout:g}")
+        check(self)
 
 
 class Head(NamedTuple):
@@ -111,16 +108,9 @@ def demonstrate(
 
 
 def features(
-    encoder: Encoder,
-    trials: Trials,
-    *,
-    stills: bool,
-    pooling: Pooling = "both",
-    sensor: str = SENSOR,
-    batch: int = 64,
-    sides: Array | None = None,
-    learned: Array | None = None,
-) -> Array:
+    encoder: Encoder, trials: Trials, *, stills: bool, pooling: Pooling = "both", sensor: str = SENSOR, batch: int = 64,
+    sides: Array | None = None, learned: Array | None = None,
+) -> Array:  # fmt: skip
     """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end.
 
     `sides` (B, 2): in which mirrors the runs are shown (`segments`). `learned` (S - START, B): embed the segments of
@@ -287,16 +277,9 @@ class Touch:
     looks = True
 
     def __init__(
-        self,
-        encoder: Encoder,
-        head: Head,
-        *,
-        stills: bool,
-        pooling: Pooling = "both",
-        sensor: str = SENSOR,
-        votes: int = 1,
-        loss: float = math.nan,
-    ) -> None:
+        self, encoder: Encoder, head: Head, *, stills: bool, pooling: Pooling = "both", sensor: str = SENSOR,
+        votes: int = 1, loss: float = math.nan,
+    ) -> None:  # fmt: skip
         self.encoder, self.head, self.sensor, self.loss = encoder, head, sensor, loss
         self.stills, self.pooling, self.votes = stills, pooling, votes
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from anytouch_jax.config import parse_json
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
@@ -113,30 +113,24 @@ def read(path: Path, side: int) -> Recordings:
 
 
 def _runs(table: Manifest, path: Path) -> list[Array]:
-    """The rows of each run in time. Raises UserError for a run on both sides of a split, or without a run."""
-    split = table.text_column("split")
-    sequences = np.where(np.isin(split, LEARNING), table.text_column("sequence"), "")
-    names = np.unique(sequences[sequences != ""])
-    if not names.size:
+    """The rows of each run in time. Raises UserError for runs that are of two splits or have gaps, and short ones."""
+    split, sequence = table.text_column("split"), table.text_column("sequence")
+    number = table.number_column("frame_index")
+    rows = np.flatnonzero(np.isin(split, LEARNING))
+    if not len(rows):
         raise UserError(f"{path}: no row is of split {', '.join(LEARNING)}")
-    for name in names:
-        sides = np.unique(split[sequences == name])
+    runs = group_rows(rows, sequence[rows], number[rows])
+    for run in runs:
+        name, sides = f"{path}: run {sequence[run[0]]}", np.unique(split[run])
         if len(sides) > 1:
-            raise UserError(f"{path}: run {name} is in the splits {' and '.join(sides)}; a run is of one")
-    return [_ordered(table, np.flatnonzero(sequences == name), name) for name in names]
-
-
-def _ordered(table: Manifest, rows: Array, name: str) -> Array:
-    """The rows of a run in time. Raises UserError for a gap or a run without a moment of choice."""
-    number = np.array([table.value(int(row), "frame_index") for row in rows])
-    rows, number = rows[np.argsort(number)], np.sort(number)
-    stride = np.array([table.value(int(row), "stride") or 1 for row in rows])
-    gaps = np.flatnonzero(np.diff(number) != stride[1:])
-    if len(gaps):
-        raise UserError(f"run {name}: frame {number[gaps[0]]} is followed by {number[gaps[0] + 1]}, a gap or a repeat")
-    if len(rows) <= START:
-        raise UserError(f"run {name} has {len(rows)} frames; {STAND} standing ones, and more than {START} in all")
-    return rows
+            raise UserError(f"{name} is in the splits {' and '.join(sides)}; a run is of one")
+        stride = np.array([table.value(int(row), "stride") or 1 for row in run[1:]])
+        if len(gaps := np.flatnonzero(np.diff(number[run]) != stride)):
+            first, second = number[run][gaps[0] : gaps[0] + 2]
+            raise UserError(f"{name}: frame {first:g} is followed by {second:g}, a gap or a repeat")
+        if len(run) <= START:
+            raise UserError(f"{name} has {len(run)} frames; {STAND} standing ones, and more than {START} in all")
+    return runs
 
 
 def _numbers(table: Manifest, column: str) -> Array:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from anytouch_jax.config.parsing import Count, Range, Seed
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.statistics import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.progress import to_stderr as log
 from experiments.command import run_script
 from experiments.pouring import bounds, policy, recordings, trials
 from experiments.pouring.physics import Task
@@ -25,7 +28,7 @@ class Pour:
 
     Example: python -m experiments.pouring.run --model runs/stage2 --trials 10
 
-    Prints the mass of each trial and the mean error, compared with a blind policy and the expert. OUT gets a film, the
+    Prints the mass of each trial and the mean error, compared with a blind policy and the expert. OUT gets the
     numbers and the policy. With --recordings it learns from your runs and is compared with the hand on split test.
     """
 
@@ -35,33 +38,28 @@ class Pour:
     """Manifest of recorded runs to learn from: a row a moment (five a second), label.action pour, wait or retract."""
     record: Path | None = None
     """Only write the expert's demonstrations to this folder, in the form of --recordings."""
-    size: int = 112
+    size: Annotated[int, Range(14, 1024, "14 to 1024")] = 112
     """Side of the recorded frames in pixels."""
-    trials: int = 10
+    trials: Count[int] = 10
     """Runs of the learned policy, with cylinders, beads, grips and sensors that are new to it."""
     out: Path | None = None
-    """Folder for pour.gif (the first trial), pour.json and the policy (default: pour in the run's folder)."""
-    demos: int = 120
+    """Folder for pour.json and the policy (default: pour in the run's folder)."""
+    demos: Count[int] = 120
     """Demonstrations of the expert, who sees the scales. A thousand are better (5 GB of memory at 84 pixels)."""
     stills: bool = False
     """Use features of single frames, not of segments of three."""
     fine_tune: bool = False
     """Train the encoder too: minutes, for a third to a half less error in our table."""
-    steps: int | None = None
+    steps: Count[int | None] = None
     """Steps of the policy's training (default 3000)."""
     markers: bool = True
     """Give the gel markers. Without them shear hardly shows."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of demonstrations, learning and trials."""
 
 
 def run(options: Pour) -> int:
     """Record demonstrations, or learn a policy and try it."""
-    least = {"trials": 1, "demos": 2 if options.record else 1, "steps": 1, "size": 14, "seed": 0}
-    for name, value in least.items():
-        given = getattr(options, name)
-        if given is not None and given < value:
-            raise UserError(f"--{name} must be {value} or more, not {given}.")
     enable_compilation_cache()
     if options.record is not None:
         return _record(options, options.record)
@@ -77,8 +75,10 @@ def run(options: Pour) -> int:
 def _record(options: Pour, folder: Path) -> int:
     if (folder / "manifest.parquet").exists():
         raise UserError(f"{folder} holds a recording already. Choose another folder with --record.")
+    if options.demos < 2:
+        raise UserError("--demos must be 2 or more with --record: some are kept for the test.")
     task = Task(markers=options.markers)
-    _log(f"the expert pours {options.demos} times")
+    log(f"the expert pours {options.demos} times")
     demonstrations = policy.demonstrate(task, options.seed, options.demos, side=options.size)
     print(recordings.write(folder, demonstrations, task))
     return 0
@@ -91,7 +91,7 @@ def _learn(
     learning = policy.Learning(seed=options.seed)
     tune_steps = max(learning.tune_steps, len(demonstrations.steps))
     learning = replace(learning, steps=options.steps or learning.steps, tune_steps=tune_steps)
-    _log("learning from it")
+    log("learning from it")
     learned = policy.learn_frozen(encoder, demonstrations, learning, stills=options.stills, sensor=sensor)
     return (policy.fine_tune(learned, demonstrations, learning) if options.fine_tune else learned), learning
 
@@ -103,7 +103,7 @@ def _recorded(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any])
     about |= {"recordings": str(options.recordings), "data": data.data}
     _check_unused(out, about)
     learned_from, test = data.part(False), data.part(True)
-    _log(f"{len(learned_from.steps)} runs of {data.sensor} to learn from, {len(test.steps)} of split test")
+    log(f"{len(learned_from.steps)} runs of {data.sensor} to learn from, {len(test.steps)} of split test")
     learned, learning = _learn(options, encoder, learned_from, data.sensor)
     rate = Task().rate
     rows = {
@@ -122,17 +122,16 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
     side, task = encoder.config.model.image_size, Task(markers=options.markers)
     about |= {"target": task.target, "demonstrations": options.demos, "markers": options.markers}
     _check_unused(out, about)
-    _log(f"the expert pours {options.demos} times")
+    log(f"the expert pours {options.demos} times")
     demonstrations = policy.demonstrate(task, options.seed, options.demos, side=side)
     learned, learning = _learn(options, encoder, demonstrations, trials.SENSOR)
     rivals: dict[str, trials.Controller] = {
         "blind": bounds.learn_blind(task, options.seed, options.demos, learning),
-        "count": trials.best_counter(task, *trials.draw_runs(task, options.seed, options.demos)),
         "expert": trials.Expert(task),
     }
-    _log(f"the policy pours {options.trials} times")
+    log(f"the policy pours {options.trials} times")
     setups, keys = trials.draw_runs(task, options.seed + policy.UNSEEN, options.trials)
-    tried = trials.run(task, setups, keys, learned, side=side, film=1)
+    tried = trials.run(task, setups, keys, learned, side=side)
     cells = [(str(i + 1), f"{g:.1f}", f"{abs(g - task.target):.1f}") for i, g in enumerate(tried.poured)]
     print(markdown_table(("trial", "poured, g", "error, g"), cells))
     results = {"touch": tried} | {k: trials.run(task, setups, keys, rival) for k, rival in rivals.items()}
@@ -140,7 +139,6 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
         result = trials.error(one.poured, task.target)
         interval = "" if result.low is None else f" (95 %: {result.low:.1f} to {result.high:.1f})"
         print(f"{name}: mean error {result.mean:.1f} g{interval}")
-    trials.write_film(out / "pour.gif", tried, task)
     poured = {name: [round(float(g), 3) for g in one.poured] for name, one in results.items()}
     return _write(out, learned, about | {"poured": poured})
 
@@ -159,18 +157,11 @@ def _check_unused(out: Path, about: Mapping[str, Any]) -> None:
 def _write(out: Path, learned: policy.Touch, results: Mapping[str, Any]) -> int:
     recordings.save_policy(out, learned)
     atomic_write(out / "pour.json", json.dumps(results, indent=2) + "\n")
-    _log(f"policy and results in {out}")
+    log(f"policy and results in {out}")
     return 0
 
 
-def _log(sentence: str) -> None:
-    print(sentence, file=sys.stderr, flush=True)
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line `args` and return the exit status."""
-    return run_script(Pour, run, args)
-
+main = partial(run_script, Pour, run)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,10 +1,8 @@
-"""Runs of the pouring task in batches: who chooses the actions, demonstrations of an expert, errors and a film."""
+"""Runs of the pouring task in batches: who chooses the actions, demonstrations of an expert, and errors."""
 
 from __future__ import annotations
 
-import io
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -13,10 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.evaluate.statistics import mean_interval
-from anytouch_jax.files import atomic_write
 from anytouch_jax.sim.recorder import stack_trees
 from experiments.pouring import physics, render
-from experiments.pouring.physics import ACTIONS, POUR, RETRACT, STAND, WAIT, Setup, State, Task
+from experiments.pouring.physics import POUR, RETRACT, STAND, WAIT, Setup, State, Task
 from experiments.values import Value
 
 Array = npt.NDArray[Any]
@@ -94,42 +91,6 @@ class Replay:
         return self._actions[min(self._step, len(self._actions) - 1)]
 
 
-class Counter:
-    """Blind: pours a fixed number of times and goes back."""
-
-    looks = False
-
-    def __init__(self, pours: int) -> None:
-        self.pours = pours
-
-    def begin(self, count: int) -> None:
-        """Time is 0 again."""
-        self._step = 0
-
-    def act(self, frames: Array | None, state: State) -> Array:
-        """Actions (B,): all the same."""
-        self._step += 1
-        now = WAIT if self._step <= START else POUR if self._step <= START + self.pours else RETRACT
-        return np.full(len(state.mass), now)
-
-
-def best_counter(task: Task, setups: Setup, keys: jax.Array) -> Counter:
-    """The number of pours whose mean error over these runs is the least: the best that counting alone can do."""
-    counts = jnp.arange(0, task.limit, 4)
-
-    def end(setup: Setup, key: jax.Array, pours: jax.Array) -> jax.Array:
-        def step(state: State, number: jax.Array) -> tuple[State, None]:
-            action = jnp.where(number < START, WAIT, jnp.where(number < START + pours, POUR, RETRACT))
-            return physics.advance(state, action, setup, task), None
-
-        state, _ = jax.lax.scan(step, physics.begin(setup, task, key), jnp.arange(task.limit))
-        return physics.poured(state, task)
-
-    over_runs = jax.vmap(end, in_axes=(0, 0, None))
-    poured = jax.jit(jax.vmap(over_runs, in_axes=(None, None, 0)))(setups, keys, counts)  # (counts, runs)
-    return Counter(int(counts[np.abs(np.asarray(poured) - task.target).mean(1).argmin()]))
-
-
 def draw_runs(task: Task, seed: int, count: int) -> tuple[Setup, jax.Array]:
     """`count` runs drawn from `seed`: their stacked parameters and keys (count,). No run depends on the others."""
     setups = [physics.draw_setup(task, np.random.default_rng([seed % 2**63, number])) for number in range(count)]
@@ -170,16 +131,9 @@ def look(state: State, setups: Setup, grasps: render.Grasp, *, task: Task, side:
 
 
 def run(
-    task: Task,
-    setups: Setup,
-    keys: jax.Array,
-    controller: Controller,
-    *,
-    side: int = 112,
-    film: int = 0,
-    late: Array | None = None,
-    grasps: render.Grasp | None = None,
-) -> Trials:
+    task: Task, setups: Setup, keys: jax.Array, controller: Controller, *, side: int = 112, film: int = 0,
+    late: Array | None = None, grasps: render.Grasp | None = None,
+) -> Trials:  # fmt: skip
     """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or to `film` runs.
 
     `film`: of so many runs, the first ones, the frames are kept.
@@ -221,42 +175,3 @@ def error(poured: Array, target: float) -> Value:
     """The mean of |poured - target| over runs `poured` (n,) g, with a bootstrap interval (None for a single run)."""
     wrong = np.abs(np.asarray(poured, np.float64) - target)
     return Value(float(wrong.mean()), *mean_interval(wrong, np.arange(len(wrong))))
-
-
-def write_film(path: Path, trials: Trials, task: Task, *, every: int = 4) -> None:
-    """Write the first run as a GIF: the frame, and next to it the mass left over time and the action.
-
-    Every `every`-th moment is shown, ten a second. Raises OSError.
-    """
-    from PIL import Image  # matplotlib cannot be had without it
-
-    if trials.frames is None:
-        raise ValueError("these trials kept no frames; run them with film=1")
-    last = int(trials.steps[0])
-    pages = [Image.fromarray(_page(trials, task, step)).quantize(64) for step in [*range(0, last - 1, every), last - 1]]
-    data = io.BytesIO()
-    pages[0].save(data, "gif", save_all=True, append_images=pages[1:], duration=100, loop=0)
-    atomic_write(path, data.getvalue())
-
-
-def _page(trials: Trials, task: Task, step: int) -> Array:
-    """One page of the film, u8 RGB: drawn with OpenCV, since a figure a page would take minutes."""
-    import cv2
-
-    side, wide = 180, 260
-    assert trials.frames is not None
-    frame = cv2.resize(trials.frames[step, 0], (side, side), interpolation=cv2.INTER_CUBIC)
-    chart = np.full((side, wide, 3), 255, np.uint8)
-    last, top = int(trials.steps[0]), task.beads
-    x = 34 + np.arange(last) * (wide - 44) / max(last - 1, 1)
-    y = 30 + (side - 60) * (1 - trials.mass[:last, 0] / top)
-    goal = int(30 + (side - 60) * (task.target / top))
-    cv2.line(chart, (34, goal), (wide - 10, goal), (200, 60, 60), 1)
-    cv2.rectangle(chart, (34, 30), (wide - 10, side - 30), (160, 160, 160), 1)
-    points = np.stack([x, y], 1)[: step + 1].round().astype(np.int32)
-    cv2.polylines(chart, [points], False, (40, 90, 170), 2, cv2.LINE_AA)
-    out = task.beads - trials.mass[step, 0]
-    words = f"{ACTIONS[trials.actions[step, 0]]}   {out:.1f} g out   {trials.tilt[step, 0]:.1f} deg"
-    for text, place in ((words, (34, 20)), (f"{step / task.rate:.1f} s", (34, side - 10)), ("g left", (wide - 60, 46))):
-        cv2.putText(chart, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
-    return np.concatenate([frame, chart], 1)

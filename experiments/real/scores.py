@@ -5,7 +5,7 @@ Every choice (the penalty, the number of neighbours) is made on validation recor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,21 +43,14 @@ class Score(NamedTuple):
 
 
 def linear_scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) -> list[tuple[float, Array]]:
-    """Return (penalty, probabilities (n, classes)) of logistic regression for every penalty."""
-    return _fitted(x, y, classes, fit, weights, PENALTIES)
-
-
-def _fitted(
-    x: Array, y: Array, classes: int, fit: Array, weights: Array, penalties: Sequence[float]
-) -> list[tuple[float, Array]]:
-    """Return (penalty, probabilities (n, classes)) of logistic regression fitted on the rows `fit`.
+    """Return (penalty, probabilities (n, classes)) of logistic regression on the rows `fit` for every penalty.
 
     All columns are divided by one number, which keeps the ranking of principal components.
     """
     mean, scale = x[fit].mean(0), np.sqrt(x[fit].var(0).mean())
     scaled = ((x - mean) / scale).astype(np.float32)
-    path, results = heads.logistic_path(scaled[fit], y[fit], classes, penalties, None, weights), []
-    for penalty, model in zip(penalties, path, strict=True):
+    path, results = heads.logistic_path(scaled[fit], y[fit], classes, PENALTIES, None, weights), []
+    for penalty, model in zip(PENALTIES, path, strict=True):
         logits = scaled @ model.weights + model.bias
         if logits.shape[1] == 1:
             logits = np.concatenate([np.zeros_like(logits), logits], 1)
@@ -72,9 +65,8 @@ def neighbour_scores(x: Array, y: Array, classes: int, fit: Array, weights: Arra
     near, cosine = nearest(unit[fit], unit, max(NEIGHBOURS))
     results = []
     for k in NEIGHBOURS:
-        votes = np.zeros((len(x), classes))
-        for place in range(min(k, near.shape[1])):
-            np.add.at(votes, (np.arange(len(x)), y[fit][near[:, place]]), np.exp(cosine[:, place] / 0.1))
+        votes, some = np.zeros((len(x), classes)), y[fit][near[:, :k]]
+        np.add.at(votes, (np.arange(len(x))[:, None], some), np.exp(cosine[:, :k] / 0.1))
         results.append((float(k), votes / votes.sum(1, keepdims=True)))
     return results
 
@@ -133,32 +125,10 @@ def slip_score(x: Array, data: Recordings, score: Callable[..., Any] = linear_sc
     )  # fmt: skip
 
 
-def label_curve(x: Array, data: Recordings, count: int, draws: int = 5, penalty: float = 0.01) -> float:
-    """Return the share of test recordings named right with `count` train recordings of each object, mean of draws."""
-    y, shares = np.searchsorted(data.names, data.object), []
-    train = data.split == "train"
-    for draw in range(draws):
-        rng, chosen = np.random.default_rng(draw), []
-        for name in data.names:
-            own = np.unique(data.recording[train & (data.object == name)])
-            chosen += list(rng.permutation(own)[:count])
-        fit = np.flatnonzero(train & np.isin(data.recording, chosen))
-        values = _fitted(x, y, len(data.names), fit, _share_weights(data.recording[fit]), (penalty,))[0][1]
-        names = np.unique(data.recording[data.split == "test"])
-        right = [values[data.recording == name].mean(0).argmax() == y[data.recording == name][0] for name in names]
-        shares.append(float(np.mean(right)))
-    return float(np.mean(shares))
-
-
 TASKS = {"object": object_score, "object, other finger": other_finger_score, "slip, objects left out": slip_score}
 HEADS = {"linear": linear_scores, "kNN": neighbour_scores}
 
 
-def table(
-    features: dict[str, Array], data: Recordings, tasks: Sequence[str] = tuple(TASKS)
-) -> dict[str, dict[str, Score]]:
-    """Return {task and head: {encoder: score}}."""
-    return {
-        f"{task}, {head}": {name: TASKS[task](x, data, score) for name, x in features.items()}
-        for task in tasks for head, score in HEADS.items()
-    }  # fmt: skip
+def table(x: Array, data: Recordings) -> dict[str, Score]:
+    """Return {task and head: score} of features (n, d)."""
+    return {f"{task}, {head}": of(x, data, score) for task, of in TASKS.items() for head, score in HEADS.items()}

@@ -1,11 +1,9 @@
-"""Networks trained with labels: a small CNN from scratch, and an encoder whose weights are trained with its head.
-
-Both give the scores of `scores.HEADS`: an option (here the number of epochs) and the probabilities of all frames.
-"""
+"""A small CNN that is trained with labels from scratch, as a head of `scores.HEADS` whose option is the epochs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import cv2
@@ -16,13 +14,12 @@ import optax
 from flax import nnx
 
 from anytouch_jax.data.transforms import subtract_background
-from anytouch_jax.encoder.encoder import Encoder
-from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.encoder.embed import run_in_batches
 from experiments.real.recordings import Recordings
 
 Array = np.ndarray
-Logits = Callable[[Any, jax.Array], jax.Array]
-SIDE, EPOCHS, BATCH, SHIFT = 64, (4, 8, 16), 32, 0.06  # pixels; passes over the frames; frames; share of a side
+SIDE, EPOCHS, BATCH, RATE = 64, (4, 8, 16), 32, 1e-3  # pixels; passes over the frames; frames
+SHIFT = 0.06  # of a side
 
 
 class SmallCnn(nnx.Module):
@@ -46,52 +43,23 @@ class SmallCnn(nnx.Module):
 
 
 def cnn_pictures(data: Recordings) -> Array:
-    """Return frames and their differences from the background, u8 (n, SIDE, SIDE, 6)."""
-    pictures = np.empty((len(data.frames), SIDE, SIDE, 6), np.uint8)
-    for picture, frame, place in zip(pictures, data.frames, data.background, strict=True):
-        change = subtract_background([frame], data.backgrounds[place])[0]
-        for at, part in ((0, frame), (3, change)):
-            picture[..., at : at + 3] = cv2.resize(part, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-    return pictures
+    """Return frames and their differences from the untouched gel, u8 (n, SIDE, SIDE, 6)."""
+    both = (np.concatenate([frame, subtract_background([frame], gel)[0]], -1) for frame, gel in data.pairs())
+    return np.stack([cv2.resize(pair, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for pair in both])
 
 
 def cnn_scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) -> list[tuple[float, Array]]:
-    """Train a `SmallCnn` on the rows `fit` of `cnn_pictures` from scratch."""
+    """Train a `SmallCnn` on the rows `fit` of `cnn_pictures`, drawn by `weights`.
+
+    Return (epochs, probabilities (n, classes)) after each number of EPOCHS.
+    """
     graph, params = nnx.split(SmallCnn(classes))
+    steps = max(1, len(fit) // BATCH)
+    schedule = optax.warmup_cosine_decay_schedule(0.0, RATE, steps, steps * EPOCHS[-1], 0.1 * RATE)
+    optimiser = optax.adamw(schedule, weight_decay=0.05)
 
     def logits(params: Any, pictures: jax.Array) -> jax.Array:
         return nnx.merge(graph, params)((pictures.astype(jnp.float32) - 128) / 64)
-
-    return _train(logits, params, 1e-3, x, y, fit, weights)
-
-
-def fine_tuned_scores(encoder: Encoder, sensor: str = "gelsight_mini") -> Callable[..., list[tuple[float, Array]]]:
-    """Return a function like `cnn_scores` that trains the encoder and a linear head on preprocessed touches."""
-    net, row = encoder.net, encoder.sensor_row(sensor)
-
-    def scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) -> list[tuple[float, Array]]:
-        width = 2 * net.model.embed
-        params = {"touch": encoder.params, "scale": jnp.ones(width), "head": jnp.zeros((width, classes))}
-
-        def logits(params: Any, touches: jax.Array) -> jax.Array:
-            rows = jnp.full(len(touches), row)
-            token, mean = net.encode_poolings(params["touch"], normalise_touch(touches[:, None]), rows)
-            z = jnp.concatenate([token, mean], -1)
-            z = (z - z.mean(-1, keepdims=True)) / (z.std(-1, keepdims=True) + 1e-6)
-            return jnp.asarray((z * params["scale"][None]) @ params["head"])
-
-        return _train(logits, params, 2e-4, x, y, fit, weights)
-
-    return scores
-
-
-def _train(
-    logits: Logits, params: Any, rate: float, x: Array, y: Array, fit: Array, weights: Array
-) -> list[tuple[float, Array]]:
-    """Return (epochs, probabilities (n, classes)) after each number of EPOCHS. Frames are drawn by `weights`."""
-    steps = max(1, len(fit) // BATCH)
-    schedule = optax.warmup_cosine_decay_schedule(0.0, rate, steps, steps * EPOCHS[-1], 0.1 * rate)
-    optimiser = optax.adamw(schedule, weight_decay=0.05)
 
     @jax.jit
     def step(params: Any, state: Any, pictures: jax.Array, labels: jax.Array) -> tuple[Any, Any]:
@@ -108,8 +76,7 @@ def _train(
             rows = rng.choice(fit, BATCH, p=weights / weights.sum())
             params, state = step(params, state, _shifted(x[rows], rng), y[rows])
         if epoch in EPOCHS:
-            parts = [predict(params, x[np.arange(at, at + 128) % len(x)]) for at in range(0, len(x), 128)]
-            results.append((float(epoch), np.concatenate(parts)[: len(x)]))
+            results.append((float(epoch), run_in_batches(partial(predict, params), x, 128)))
     return results
 
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder import health, novelty
+from anytouch_jax.encoder import health
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, probing, splits
@@ -135,10 +135,9 @@ def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
         counts.append(head.calibration.recordings)
         rows = np.flatnonzero(test & np.isin(data.y, head.classes))
         seen, y = head.assess(data.x[rows]), data.y[rows]
-        plain = novelty.probabilities(head.scaled(data.x[rows]) @ head.weights + head.bias)
         several = {
-            "groups": data.groups[rows], "right": seen.label == y, "p": seen.p.max(1), "plain": plain.max(1),
-            "novel": seen.novel, "size": seen.in_set.sum(1), "sure": ~seen.abstains,
+            "groups": data.groups[rows], "right": seen.label == y, "p": seen.p.max(1), "novel": seen.novel,
+            "size": seen.in_set.sum(1), "sure": ~seen.abstains,
             "covered": seen.in_set[np.arange(len(rows)), np.searchsorted(head.classes, y)],
         }  # fmt: skip
         for name, values in several.items():
@@ -152,7 +151,6 @@ def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
 
     return {
         "accuracy": share("right"), "coverage": share("covered"), "novel": share("novel"), "decided": share("sure"),
-        "ece_before": over_groups(lambda i: error(whole["plain"][i], right[i]), groups),
         "ece": over_groups(lambda i: error(whole["p"][i], right[i]), groups),
         "size": float(whole["size"].mean()), "classes": len(np.unique(data.y)), "groups": len(np.unique(data.groups)),
         "calibration_groups": float(np.mean(counts)),

@@ -8,36 +8,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from anytouch_jax.errors import UserError
-from experiments.records import read_records, write_record
+from experiments.records import differences, read_records, write_record
 from experiments.tables import plan
-from experiments.tables.plan import Leaf, Scenes, Size, Training
-from experiments.tables.results import differences, simulated
+from experiments.tables.plan import Leaf, Scenes, Training
+from experiments.tables.results import compared, simulated
+
+if TYPE_CHECKING:
+    from experiments.tables.work import Work
 
 PAUSE = 5.0  # s between two looks at what others work on
-
-
-class Work(Protocol):
-    """What a run is made of (`work.Work`). Data sets and trainings leave their results on disk."""
-
-    def ready(self, leaf: Leaf) -> set[str]:
-        """Return names of the finished data sets and keys of the finished trainings."""
-
-    def claim(self, name: str) -> AbstractContextManager[bool]:
-        """Keep other processes from `name`; False where one of them works on it."""
-
-    def make(self, one: Scenes, size: Size) -> None:
-        """Make a data set."""
-
-    def train(self, one: Training) -> None:
-        """Train a stage, or finish it."""
-
-    def score(self, leaf: Leaf) -> dict[str, Any]:
-        """Return the record of a run whose model is trained."""
 
 
 class Outcome(NamedTuple):
@@ -58,13 +41,13 @@ def check_results(leaves: Sequence[Leaf], out: Path) -> None:
     if not leaves:
         return
     size, questions = leaves[0].size, {leaf.question for leaf in leaves}
-    ours = {"simulator": plan.simulator(), "settings": plan.settings(size), "size": size.name}
+    ours = {"simulator": plan.simulator(), "settings": plan.settings(size)}
     for theirs in read_records(out).values():
         if theirs.get("question") not in questions:
             continue
         if simulated(theirs) != ours["simulator"]:
             what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"
-        elif wrong := differences([theirs, ours | {"scoring": plan.scoring(theirs["question"])}]):
+        elif wrong := differences(compared([theirs, ours | {"scoring": plan.scoring(theirs["question"])}])):
             what = f"other settings than these runs ({wrong})"
         else:
             continue
@@ -75,13 +58,9 @@ def check_results(leaves: Sequence[Leaf], out: Path) -> None:
 
 
 def execute(
-    leaves: Sequence[Leaf],
-    work: Work,
-    out: Path,
-    *,
-    log: Callable[[str], None] = print,
+    leaves: Sequence[Leaf], work: Work, out: Path, *, log: Callable[[str], None] = print,
     pause: Callable[[float], None] = time.sleep,
-) -> Outcome:
+) -> Outcome:  # fmt: skip
     """Make the missing runs in order, a record each. A run that fails is logged, and the others go on."""
     result, waiting = Outcome([], [], {}), list(leaves)
     while waiting:

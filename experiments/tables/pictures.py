@@ -18,20 +18,17 @@ MARKS = ("o", "s", "^", "D", "v")
 COLOURED = 12  # touches that get a colour and their lines; the others are grey
 
 
-def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | None:
+def q2(runs: Sequence[Run], path: Path) -> None:
     """Touches by three sensors in four spaces (Figure 4): a mark a sensor, a colour and dashed lines a touch.
 
-    All panels are of one `seed`: the smallest that every stage there has, else (no common one) nothing is drawn.
+    All panels are of one seed, the smallest that every stage has. Without such a seed nothing is drawn.
     """
     every = {(run.name, run.seed): run.about["points"] for run in runs if run.question == "q2"}
     stages = [(name, text) for name, text in STAGES if any(name == one for one, _ in every)]
-    common = [{number for one, number in every if one == name} for name, _ in stages]
-    seeds = set.intersection(*common) if common else set()
-    if seed is None and seeds:
-        seed = min(seeds)
-    if seed is None or seed not in seeds:
-        return None
-    of = {name: every[name, seed] for name, _ in stages}
+    seeds = [seed for _, seed in sorted(every) if all((name, seed) in every for name, _ in stages)]
+    if not seeds:
+        return
+    of = {name: every[name, min(seeds)] for name, _ in stages}
     figure, (axes,) = panels(1, len(stages), 3.6, 3.8)
     sensors = sorted({point["sensor"] for name, _ in stages for point in of[name]})
     touches = sorted({point["touch"] for name, _ in stages for point in of[name]})
@@ -48,13 +45,10 @@ def q2(runs: Sequence[Run], path: Path, *, seed: int | None = None) -> Path | No
             if touch in colours:
                 axis.plot([p["x"] for p in ring], [p["y"] for p in ring], "--", color=colour, linewidth=0.7, zorder=1)
             for point in mine:
-                mark = MARKS[sensors.index(point["sensor"])]
-                axis.scatter(
-                    point["x"], point["y"], s=26, color=colour, marker=mark, linewidths=0, zorder=2 + (touch in colours)
-                )
+                style = {"color": colour, "marker": MARKS[sensors.index(point["sensor"])], "linewidths": 0}
+                axis.scatter(point["x"], point["y"], s=26, zorder=2 + (touch in colours), **style)
         axis.set(title=text, xticks=[], yticks=[])
     marks = [axes[-1].scatter([], [], s=30, color="#555555", marker=MARKS[i]) for i in range(len(sensors))]
-    title = f"seed {seed}"
-    figure.legend(marks, sensors, loc="outside lower center", ncols=len(sensors), frameon=False, title=title)
+    legend = {"ncols": len(sensors), "frameon": False, "title": f"seed {min(seeds)}"}
+    figure.legend(marks, sensors, loc="outside lower center", **legend)
     write_figure(path, figure)
-    return path

@@ -20,6 +20,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 from anytouch_jax.config import UNIVERSAL, Config, Stack, preset, presets
+from anytouch_jax.config.parsing import Count
 
 SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")  # in the order in which Table 1 adds them
 UNSEEN = "duragel"
@@ -49,18 +50,18 @@ class Size:
     """
 
     name: str = "full"
-    own: int = 400
-    fine: int = 300
-    coarse: int = 400
-    other: int = 300
-    objects: int = 250
-    frames: int = 10
-    pixels: int = 96
-    image: int = 84
-    steps1: int = 400
-    batch1: int = 48
-    steps2: int = 260
-    batch2: int = 64
+    own: Count[int] = 400
+    fine: Count[int] = 300
+    coarse: Count[int] = 400
+    other: Count[int] = 300
+    objects: Count[int] = 250
+    frames: Count[int] = 10
+    pixels: Count[int] = 96
+    image: Count[int] = 84
+    steps1: Count[int] = 400
+    batch1: Count[int] = 48
+    steps2: Count[int] = 260
+    batch2: Count[int] = 64
     rate1: float = 1e-3
     rate2: float = 1e-3
     temperature: float = 0.2
@@ -71,9 +72,9 @@ class Size:
     contact: float = 0.6
     background: Literal["keep", "subtract"] = "subtract"
     seeds: tuple[int, ...] = (0, 1, 2)
-    refits: int = 5
-    max_rows: int = 1500
-    embed: int = 128
+    refits: Count[int] = 5
+    max_rows: Count[int] = 1500
+    embed: Count[int] = 128
     stack: Stack = STACK
     decoder: Stack = DECODER
 
@@ -100,7 +101,7 @@ class Scenes:
 
 @dataclass(frozen=True)
 class Training:
-    """One stage of one model. `config.data.manifests` are names (see `work.Places`), not files."""
+    """One stage of one model. `config.data.manifests` are names (see `Work.manifest`), not files."""
 
     config: Config
     init: Training | None = None
@@ -226,13 +227,9 @@ def _config(size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests
         contact_only=True, negatives=size.negatives if stage == 2 else "any",
     )  # fmt: skip
     return replace(
-        config,
-        model=model,
-        objective=objective,
-        data=data,
-        optim=replace(config.optim, learning_rate=rate),
+        config, model=model, objective=objective, data=data, optim=replace(config.optim, learning_rate=rate),
         run=replace(config.run, seed=seed, steps=steps, save_every=100, keep=1, figure_every=0),
-    )
+    )  # fmt: skip
 
 
 def leaves(size: Size) -> list[Leaf]:

@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from experiments.records import read_records
+from experiments.records import check_alike, read_records
 from experiments.tables.plan import LABELS
-from experiments.values import Value, over_seeds, shared_difference
+from experiments.values import Seeds, Value, over_seeds, shared_difference
 
 UNSEEDED = ("pixels", "contact")  # models that nothing is drawn for
 NOT_NOTED = "not noted"
-Seeds = dict[int, float]
 
 
 @dataclass(frozen=True)
@@ -72,26 +71,19 @@ def simulated(about: Mapping[str, Any]) -> int:
     return int(about.get("simulator", 1))
 
 
-def differences(records: Sequence[Mapping[str, Any]]) -> str:
-    """What records of one table must share and do not, in words; empty where they can be compared.
+def compared(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return what records of one table must share, by name.
 
-    Simulator, scoring, settings, and, within a seed, the content of every data set by its name: signs are taken seed by
-    seed. The data of another seed may be of another processor, where the same scenes gave another content hash. Records
-    without settings are distinguished by the name of their size.
+    That is simulator, scoring, settings, and, within a seed, the content of every data set by its name: signs are taken
+    seed by seed. The data of another seed may be of another processor, where the same scenes gave another content hash.
     """
-    result: dict[str, set[str]] = {}
-    names = {name for about in records for name in about.get("settings") or {} if name not in LABELS}
-    untold = any(not about.get("settings") for about in records)
-    for about in records:
-        result.setdefault("simulator version", set()).add(str(simulated(about)))
-        result.setdefault("scoring version", set()).add(str(about.get("scoring", 1)))
-        for name in names if about.get("settings") else ():  # a setting that one does not know is another value
-            result.setdefault(name, set()).add(str(about["settings"].get(name, NOT_NOTED)))
-        for name, value in about.get("data", {}).items():
-            result.setdefault(f"data set {name} of seed {about.get('seed')}", set()).add(value[:8])
-        if untold:
-            result.setdefault("size", set()).add(str(about.get("size")))
-    return "; ".join(f"{name} {' and '.join(sorted(several))}" for name, several in result.items() if len(several) > 1)
+    names = {name for about in records for name in about["settings"] if name not in LABELS}
+    return [
+        {"simulator version": simulated(about), "scoring version": about.get("scoring", 1)}
+        | {name: about["settings"].get(name, NOT_NOTED) for name in names}
+        | {f"data set {name} of seed {about.get('seed')}": value[:8] for name, value in about.get("data", {}).items()}
+        for about in records
+    ]
 
 
 class Matrix:
@@ -99,8 +91,7 @@ class Matrix:
 
     def __init__(self, path: Path, question: str) -> None:
         self.runs = [run for run in read(path) if run.question == question]
-        if wrong := differences([run.about for run in self.runs]):
-            raise UserError(f"{path}: runs of {question} differ ({wrong}). Make them again in one folder.")
+        check_alike(path, compared([run.about for run in self.runs]))
 
     def seeds(self, name: str, columns: Sequence[Column]) -> Seeds:
         """Return {seed: mean over columns of one unit}, for seeds that have all of them."""

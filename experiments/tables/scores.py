@@ -7,8 +7,7 @@ A view says of which data and how: `seen` (the sensors trained on), `seen, other
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,7 +26,10 @@ from anytouch_jax.evaluate.probing import probe_tasks
 from anytouch_jax.evaluate.retrieval import contact_vector
 from experiments.image_tower import image_tower_encoder
 from experiments.tables import cuts, plan
-from experiments.tables.plan import Leaf, Training
+from experiments.tables.plan import Leaf
+
+if TYPE_CHECKING:
+    from experiments.tables.work import Work
 
 Row = dict[str, Any]
 STATIC = ("material", "roughness", "hardness")
@@ -39,24 +41,12 @@ SHOWN = ("gelsight", "digit", "gelsight_mini")  # of the t-SNE, as the paper sho
 TOUCHES = 30
 
 
-class Places(Protocol):
-    """Where data sets and runs are on disk (`work.Work`)."""
-
-    folder: Path
-
-    def run_of(self, one: Training) -> Path:
-        """Return the run folder of a training."""
-
-    def manifest(self, name: str) -> Path:
-        """Return the file of a manifest by its name in a plan."""
-
-
-def score(leaf: Leaf, work: Places) -> dict[str, Any]:
+def score(leaf: Leaf, work: Work) -> dict[str, Any]:
     """The results of a run: `rows`, `data` (names of the manifests read), and what else the question wants."""
     return _OF[leaf.question](leaf, work)
 
 
-def encoder_of(leaf: Leaf, work: Places) -> Encoder:
+def encoder_of(leaf: Leaf, work: Work) -> Encoder:
     """The encoder of a run: trained, the image tower of a trained model, or untrained."""
     if leaf.model is None:
         return random_encoder(untrained(leaf), leaf.seed)
@@ -74,7 +64,7 @@ def quiet(_: str) -> None:
 
 
 def _probes(
-    leaf: Leaf, work: Places, name: str, tasks: Sequence[str], view: str, encoder: Encoder | None, **options: Any
+    leaf: Leaf, work: Work, name: str, tasks: Sequence[str], view: str, encoder: Encoder | None, **options: Any
 ) -> list[Row]:
     """Results of `probe_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
@@ -89,7 +79,7 @@ def _probes(
     return [{"view": view} | {key: value for key, value in one.items() if key != "features"} for one in results]
 
 
-def _four_columns(leaf: Leaf, work: Places, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
+def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
     """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor (OF 1.0, OF 2.0).
 
     Of each the material and the form of the indenter; of the first also `tasks`.
@@ -108,27 +98,27 @@ def _four_columns(leaf: Leaf, work: Places, seen: Sequence[str], tasks: Sequence
     return rows
 
 
-def _q1(leaf: Leaf, work: Places) -> dict[str, Any]:
+def _q1(leaf: Leaf, work: Work) -> dict[str, Any]:
     return {"rows": _four_columns(leaf, work, plan.SENSORS[:1]), "data": ["own", "other"]}
 
 
-def _q3(leaf: Leaf, work: Places) -> dict[str, Any]:
+def _q3(leaf: Leaf, work: Work) -> dict[str, Any]:
     rows = _four_columns(leaf, work, plan.SENSORS, STATIC) + _dynamic(leaf, work)
     return {"rows": rows, "data": ["own", "other"]}
 
 
-def _ablations(leaf: Leaf, work: Places) -> dict[str, Any]:
+def _ablations(leaf: Leaf, work: Work) -> dict[str, Any]:
     return {"rows": _four_columns(leaf, work, plan.SENSORS), "data": ["own", "other"]}
 
 
-def _dynamic(leaf: Leaf, work: Places) -> list[Row]:
+def _dynamic(leaf: Leaf, work: Work) -> list[Row]:
     """The dynamic tasks, from clips."""
     encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
     options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH, "frames": 3}
     return _probes(leaf, work, f"own/{cuts.WHOLE}", DYNAMIC, "clips", encoder, **options)
 
 
-def _q2(leaf: Leaf, work: Places) -> dict[str, Any]:
+def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
     """The space of the test touches by the sensors trained on: numbers, and the t-SNE of some touches."""
     table = manifests.read(work.folder / "own" / cuts.STATIC)
     sensors = table.text_column("sensor")
@@ -151,13 +141,9 @@ def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: 
     about = geometry.describe(values, sensors, table.text_column("object")[rows], touch)
     fewest = min(len(np.unique(touch[sensors == one])) for one in np.unique(sensors))
     pooled = retrieval.cross_sensor_retrieval(
-        table,
-        {view: values},
-        rows,
-        gallery_size=min(retrieval.GALLERY, fewest),
-        centre=(False,),
+        table, {view: values}, rows, gallery_size=min(retrieval.GALLERY, fewest), centre=(False,),
         metrics={view: metric},
-    )[-1]
+    )[-1]  # fmt: skip
     plain = {
         "alignment": about.alignment, "uniformity": about.uniformity,
         "silhouette by sensor": about.silhouette_sensor, "silhouette by object": about.silhouette_object,
@@ -186,6 +172,6 @@ def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list
     ]
 
 
-_OF: Mapping[str, Callable[[Leaf, Places], dict[str, Any]]] = {
+_OF: Mapping[str, Callable[[Leaf, Work], dict[str, Any]]] = {
     "q1": _q1, "q2": _q2, "q3": _q3, "ablations": _ablations,
 }  # fmt: skip

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import hashlib
 import json
 import shutil
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +38,13 @@ DONE, BEGUN = "done.json", "begun.json"
 
 
 class Work:
-    """`execute.Work` in the folder `folder`."""
+    """Data sets and runs in `folder`."""
 
     def __init__(self, folder: Path, *, log: Log = print) -> None:
         self.folder, self.log = folder, log
 
     def ready(self, leaf: Leaf) -> set[str]:
+        """Return names of the finished data sets and keys of the finished trainings."""
         sets = {one.name for one in plan.scenes(leaf.size) if self.made(one, leaf.size)}
         return sets | {one.key for one in leaf.trainings if self._trained(one, sets)}
 
@@ -140,17 +139,11 @@ class Work:
             of = {"key": one.key, "stage": one.config.stage, "config": json.loads(to_json(one.config))}
             trained.append(of | about)
         return {
-            "size": leaf.size.name,
-            "settings": dataclasses.asdict(leaf.size),
-            "steps": [leaf.size.steps1, leaf.size.steps2],
-            "trained": trained,
+            "size": leaf.size.name, "settings": dataclasses.asdict(leaf.size), "trained": trained,
             "untrained": None if trained or leaf.name == scores.PIXELS else json.loads(to_json(scores.untrained(leaf))),
-            "data": dict(sorted(data.items())),
-            "version": anytouch_jax.__version__,
-            "source": source_hash(),
-            "machine": machine.describe().sentence(),
-            "seconds": round(time.perf_counter() - start, 1),
-        } | outcome
+            "data": dict(sorted(data.items())), "version": anytouch_jax.__version__,
+            "machine": machine.describe().sentence(), "seconds": round(time.perf_counter() - start, 1),
+        } | outcome  # fmt: skip
 
     def _finish(self, folder: Path, about: dict[str, Any]) -> None:
         atomic_write(folder / DONE, json.dumps(about) + "\n")
@@ -190,13 +183,3 @@ def _simulated(one: Scenes, size: Size) -> Simulated:
 
 def _of(one: Scenes, size: Size) -> str:
     return repr((one, size.frames, size.objects, size.pixels, size.contact, VERSION))
-
-
-@cache
-def source_hash() -> str:
-    """A hash of the package's source: which code made a result, with or without a version control."""
-    root = Path(anytouch_jax.__file__).parent
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]

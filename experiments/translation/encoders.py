@@ -11,16 +11,12 @@ from pathlib import Path
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.encoder import Encoder, load_encoder
-from anytouch_jax.weights.tree import interpolate
 from experiments.tables import cuts, plan
 from experiments.tables.plan import Size, Training
 from experiments.tables.work import Work
 from experiments.translation import pairs
 
 LESS = "_remaining"
-SHARE = 0.5  # of the way from stage 1 to stage 2, of the encoder between them
-LAYER_DECAY = 0.1  # by the error of images of the third split, seed 0: 0.0347, with 0.3 0.0363, with 1 0.0365
 NOT_TUNED = (("stage1", "fine"),)  # it explains a frozen row
 
 
@@ -35,12 +31,10 @@ def write_remaining(path: Path, taken: Manifest) -> Path:
 
 
 def trainings(size: Size, seed: int) -> dict[str, Training]:
-    """Return AnyTouch, its stage 1, its stage 2 with layer decay, and T3-style, by name."""
+    """Return AnyTouch, its stage 1, and T3-style, by name."""
     whole, t3 = (plan.training(size, recipe, seed) for recipe in ("anytouch", "t3"))
     assert whole.init is not None
-    kept = replace(whole.config, optim=replace(whole.config.optim, layer_decay=LAYER_DECAY))
-    result = {"anytouch": whole, "anytouch_layer_decay": Training(kept, whole.init), "stage1": whole.init, "t3": t3}
-    return {name: reduced(one) for name, one in result.items()}
+    return {name: reduced(one) for name, one in (("anytouch", whole), ("stage1", whole.init), ("t3", t3))}
 
 
 def reduced(one: Training) -> Training:
@@ -61,11 +55,3 @@ def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]
     for name in names:
         write_remaining(work.manifest(name.removesuffix(LESS)), taken)
     return work.runs(wanted, size)
-
-
-def encoders(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Encoder]:
-    """Return the encoders of `train`, and the weights half-way from AnyTouch's stage 1 to its stage 2."""
-    result = {name: load_encoder(run) for name, run in train(work, size, seed, taken).items()}
-    first, second = result["stage1"], result["anytouch"]
-    params = interpolate(first.params, second.params, SHARE)
-    return result | {"anytouch_between": replace(second, params=params, source=f"{second.source}-between")}

@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, from_json, to_json
+from anytouch_jax.config.parsing import Above0, Count, NotNegative, check
 from anytouch_jax.encoder.embed import run_in_batches
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part, build
@@ -34,7 +35,7 @@ from experiments.translation.networks import (
     UNet,
     halved,
     thumbnail_side,
-)
+)  # fmt: skip
 
 GENERATOR = "generator.safetensors"
 
@@ -50,19 +51,16 @@ class Fit:
     encoders, at a tenth of the rate.
     """
 
-    steps: int = 800
-    batch: int = 32
-    learning_rate: float = 1e-3
+    steps: Count[int] = 800
+    batch: Count[int] = 32
+    learning_rate: Above0[float] = 1e-3
     tune: Literal["frozen", "fine"] = "frozen"
-    adversarial: float = 0.02
-    penalty: float = 1.0
+    adversarial: NotNegative[float] = 0.02
+    penalty: NotNegative[float] = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.batch < 1:
-            raise UserError(f"steps and batch are at least 1, not {self.steps} and {self.batch}")
-        if not (0 <= self.adversarial < np.inf and 0 <= self.penalty < np.inf and 0 < self.learning_rate < np.inf):
-            raise UserError("the adversarial weight and the penalty are 0 or more, and the learning rate is above 0")
+        check(self)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -15,6 +14,7 @@ from anytouch_jax.data.loading.samples import SampleReader
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest, select_rows
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_array
 
 FIELD = (20, 20, 6)  # points of a Tac3D; displacement x, y, z mm, force x, y, z N
 _THREADS = 2
@@ -69,18 +69,14 @@ def _pairs(manifest: Manifest, source: str, target: str, split: str) -> Pairs:
 
 def _frames(manifest: Manifest, sensor: str, split: str) -> dict[tuple[int, int], int]:
     """(touch, frame index) -> row of a sensor."""
-    names = manifest.column("sensor").to_pylist()
+    names, touch = manifest.text_column("sensor"), manifest.codes("touch", own=True)
     if sensor not in names:
-        raise UserError(f"the manifest has no rows of sensor {sensor!r}; it has {', '.join(sorted(set(names)))}")
-    touch = manifest.codes("touch", own=True)
-    graded = "grade" in manifest.table.column_names
-    grade = manifest.column("grade").to_pylist() if graded else ["fine"] * len(manifest)
-    frame = np.asarray(manifest.column("frame_index"))
-    result: dict[tuple[int, int], int] = {}
-    splits = manifest.column("split").to_pylist()
-    for row in (row for row, name in enumerate(splits) if name == split):
-        if names[row] != sensor or touch[row] < 0 or grade[row] not in (None, "fine"):
-            continue
+        raise UserError(f"the manifest has no rows of sensor {sensor!r}; it has {', '.join(np.unique(names))}")
+    usable = (names == sensor) & (manifest.text_column("split") == split) & (touch >= 0)
+    if "grade" in manifest.table.column_names:
+        usable &= np.isin(manifest.text_column("grade"), ("", "fine"))
+    frame, result = np.asarray(manifest.column("frame_index")), dict[tuple[int, int], int]()
+    for row in np.flatnonzero(usable).tolist():
         key = (int(touch[row]), int(frame[row]))
         if key in result:
             raise UserError(
@@ -105,11 +101,11 @@ def without_objects(manifest: Manifest, pairs: Manifest) -> Manifest:
     The paper takes the coarse rows that overlap with the fine data out of training (App. "Cross-sensor generation");
     here that is every row of such an object. Rows without an object stay. Raises UserError when nothing is left.
     """
-    taken = set(pairs.column("object").to_pylist()) - {None}
-    kept = [row for row, name in enumerate(manifest.column("object").to_pylist()) if name not in taken]
-    if not any(manifest.value(row, "split") == "train" for row in kept):
+    names = manifest.text_column("object")
+    kept = ~np.isin(names, list(set(pairs.text_column("object")) - {""}))
+    if not (manifest.text_column("split")[kept] == "train").any():
         raise UserError("every object to train on is in the pairs too; simulate pairs of fewer or other objects")
-    return select_rows(manifest, np.array(kept))
+    return select_rows(manifest, np.flatnonzero(kept))
 
 
 def read_pairs(manifest: Manifest, pairs: Pairs, size: int, *, subtract: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -144,7 +140,7 @@ def read_fields(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
             raise UserError(f"{manifest.where(row)} has no field_path; regression needs its field (.npy)")
         file = manifest.file(row, "field_path")
         try:
-            field = np.load(io.BytesIO(read_file(file)), allow_pickle=False)
+            field = read_array(read_file(file))
         except (OSError, ValueError) as error:
             raise UserError(f"{manifest.where(row)}, column 'field_path': {file} cannot be read: {error}") from None
         if field.shape != FIELD or not np.isfinite(field).all():

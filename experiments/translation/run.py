@@ -5,8 +5,8 @@ from __future__ import annotations
 import io
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
+from anytouch_jax.train.progress import to_stderr as log
 from experiments.command import run_script
 from experiments.translation import generator, pairs, training
 
@@ -95,12 +96,12 @@ def _fit(options: Translate) -> int:
     encoder = load_encoder(options.model)
     table = manifests.read(options.data)
     split = pairs.find_pairs(table, options.source, options.target)
-    encoder.sensor_row(options.source, _log)
-    _log(f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of held-out objects to test on")
+    encoder.sensor_row(options.source, log)
+    log(f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of held-out objects to test on")
     size = encoder.config.model.image_size
     (x, y), val, (test_x, test_y) = (pairs.read_pairs(table, part, size, subtract=encoder.subtracts) for part in split)
     made, losses = training.fit(
-        encoder, x, y, source=options.source, target=options.target, val=val, options=fit, log=_log
+        encoder, x, y, source=options.source, target=options.target, val=val, options=fit, log=log
     )
     error, mean = training.errors(made, test_x, test_y).mean(), training.mean_errors(made, test_y).mean()
     report = {"error": error, "mean target": mean, "test pairs": len(test_x), "losses": losses}
@@ -156,14 +157,7 @@ def _write(path: Path, result: Any) -> None:
     atomic_write(path, data.getvalue())
 
 
-def _log(sentence: str) -> None:
-    print(sentence, file=sys.stderr, flush=True)
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line `args` and return the exit status."""
-    return run_script(Translate, run, args)
-
+main = partial(run_script, Translate, run)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -4,60 +4,72 @@ Images of a DuraGel are painted from those of a GelSight Mini. The 20 x 20 field
 Mini or a DIGIT. The pairs are simulated: one device of each sensor and one motion for all, frame by frame. A quarter of
 the objects, by whole pairs of primitive and texture, is tested on. Training stops where the error on a third split is
 smallest. Each translation is compared with copying the mean target, and with a network on pixels from scratch.
-
-`make translation` trains the encoders too, one of each a seed, on the scenes of `make experiments` without the objects
-of the pairs (`encoders.py`). In the environment: `RUNS="anytouch=runs/stage2 t3=a,b,c"` takes encoders of yours (a
-path, or one a seed). `STEPS1=3000` gives stage 1 so many steps, and its table a separate page. `STUDY=`, `WORK=`
-and `OUT=` are folders of the scenes, the pairs and the results. `TOUCHES=`, `STEPS=`, `SEEDS=` and `TUNE=` change the
-size, and `QUICK=1` is a trial of minutes.
 """
 
 from __future__ import annotations
 
 import re
+import sys
 import time
-from dataclasses import asdict, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from anytouch_jax.config import preset
+from anytouch_jax.config.parsing import Count
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.manifest import select_rows
+from anytouch_jax.data.manifest.manifest import Manifest, select_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.dataset import simulate, version
+from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
-from experiments.records import write_record
-from experiments.tables import env, plan
+from experiments.command import run_script, runs_by_name
+from experiments.records import check_alike, read_records, write_record
+from experiments.tables import plan
 from experiments.tables.work import Work
 from experiments.translation import encoders as own_encoders
 from experiments.translation import pairs, training
 from experiments.translation.generator import Fit
 from experiments.translation.networks import Translation
-from experiments.translation.settings import PIXELS, TASKS, one_table, runs_of
+from experiments.translation.settings import PIXELS, TASKS, shared
 
-QUICK = env.switch("QUICK")
-USUAL = plan.QUICK if QUICK else plan.FULL
-SIZE = replace(USUAL, steps1=env.number("STEPS1", USUAL.steps1))
-LONGER = {} if SIZE == USUAL else {"steps1": SIZE.steps1}
-NAME = "_".join(["translation", *(["quick"] if QUICK else []), *map(str, LONGER.values())])
-WORK, OUT = env.path("WORK", "runs/translation"), env.path("OUT", "experiments/results")
-RUNS, STUDY = env.runs(), env.path("STUDY", f"runs/matrix{'-quick' if QUICK else ''}")
-TOUCHES, STEPS = env.number("TOUCHES", 24 if QUICK else 400), env.number("STEPS", 40 if QUICK else 600)
-SEEDS = env.numbers("SEEDS", "0" if QUICK else "0,1,2")
-TUNE = env.names("TUNE", "frozen", ("frozen", "fine"))
-RESULTS = OUT / f"{NAME}.jsonl"
+Known = dict[str, dict[int, Encoder]]  # encoders by name and seed
 
-# Names of objects say texture, material and primitive.
-SCENES = Scenes(
-    touches=TOUCHES, objects=24 if QUICK else 60, sensors=("gelsight_mini", "digit", "duragel", "tac3d"),
-    seed=7, grade="fine", units="one", frames=6, size=128, vision=0.0, text=0.0,
-)  # fmt: skip
-PAIRS = WORK / f"pairs-{TOUCHES}-{version(SCENES.sensors)}"
+
+@dataclass(frozen=True)
+class Options:
+    """Run what is missing of the translation study. It trains the encoders too, on the scenes of `make experiments`
+    without the objects of the pairs.
+
+    Example: python -m experiments.translation.study --runs anytouch=runs/stage2 t3=a,b,c
+    """
+
+    runs: tuple[str, ...] = ()
+    """Encoders of yours: NAME=PATH, or NAME=A,B,C for one a seed."""
+    study: Path | None = None
+    """Folder of `make experiments` (default: runs/matrix)."""
+    work: Path = Path("runs/translation")
+    """Folder of the pairs."""
+    out: Path | None = None
+    """File of results (default: translation.jsonl in experiments/results, with the steps of --steps1 in its name)."""
+    steps1: Count[int | None] = None
+    """Steps of stage 1 of the encoders that the study trains."""
+    touches: Count[int] = 400
+    """Simulated touches of the pairs."""
+    steps: Count[int] = 600
+    """Steps of each translation."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds."""
+    tune: tuple[Literal["frozen", "fine"], ...] = ("frozen",)
+    """What is done with the encoder."""
+    quick: bool = False
+    """A trial of minutes, at toy size."""
 
 
 def view_of(encoder: Encoder) -> tuple[int, bool]:
@@ -65,26 +77,8 @@ def view_of(encoder: Encoder) -> tuple[int, bool]:
     return encoder.config.model.image_size, encoder.subtracts
 
 
-def source_of(encoder: Encoder | None) -> str:
-    """Return the source of an encoder and the fingerprint of its weights."""
-    if encoder is None:
-        return PIXELS
-    return f"{Path(encoder.source).name} (weights {encoder.fingerprint})"
-
-
-def settings(
-    task: tuple[str, str], name: str, encoder: Encoder | None, view: tuple[int, bool], tune: str, seed: int, data: str
-) -> dict[str, Any]:
-    return {
-        "from": task[0], "to": task[1], "name": name, "encoder": source_of(encoder),
-        "size": view[0], "subtracts": view[1],
-        "fit": asdict(Fit(steps=STEPS, tune="fine" if tune == "fine" else "frozen", seed=seed)), "touches": TOUCHES,
-        "pairs": data, "version": training.VERSION, "simulator": version(task), **LONGER,
-    }  # fmt: skip
-
-
-def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, key: str) -> None:
-    """Train, score on held-out objects and write the record of a run."""
+def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any) -> dict[str, Any]:
+    """Train, score on held-out objects and return the record of a run."""
     (x, y), val, (test_x, test_y) = data
     begun = time.perf_counter()
     field = () if y.dtype == np.uint8 else y.shape[1:]
@@ -92,76 +86,90 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any, key: str)
     made, losses = training.fit(
         encoder, x, y, source=about["from"], target=about["to"], val=val, options=Fit(**about["fit"]), shape=shape
     )
-    seconds = time.perf_counter() - begun
+    seconds = round(time.perf_counter() - begun, 1)
     away = made(test_x).astype(np.float64) - test_y
     each = training.errors(made, test_x, test_y)
-    record = {
-        "settings": about,
-        "error": float(each.mean()),
-        "each": [round(float(value), 5) for value in each],
-        "mean_target": float(training.mean_errors(made, test_y).mean()),
-        "train_error": losses[-1]["error"],
+    return {
+        "settings": about, "error": float(each.mean()), "each": [round(float(value), 5) for value in each],
+        "mean_target": float(training.mean_errors(made, test_y).mean()), "train_error": losses[-1]["error"],
         "rms": [float(value) for value in np.sqrt((away**2).mean(axis=tuple(range(away.ndim - 1))))],
-        "pairs": [len(x), len(val[0]), len(test_x)],
-        "seconds": round(seconds, 1),
-        "critic": made.design.has_critic,
-    }
-    write_record(RESULTS, key, record)
-    print(f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {seconds:.0f} s")
+        "pairs": [len(x), len(val[0]), len(test_x)], "seconds": seconds, "critic": made.design.has_critic,
+    }  # fmt: skip
 
 
-def of_sensors(table: manifests.Manifest, names: tuple[str, str]) -> str:
-    """The hash of the rows of two sensors: what a translation from the one to the other is of."""
-    rows = np.flatnonzero(np.isin(table.column("sensor").to_pylist(), names))
-    return select_rows(table, rows).content_hash[:16]
+def encoders_of(options: Options, size: plan.Size, table: Manifest) -> Known:
+    """Return encoders by name and seed: those of --runs, else those that the study trains."""
+    if runs := runs_by_name(options.runs):
+        loaded = {path: load_encoder(path) for paths in runs.values() for path in paths}
+        return {name: {seed: loaded[paths[seed % len(paths)]] for seed in options.seeds}
+                for name, paths in runs.items()}  # fmt: skip
+    work = Work(options.study or Path(f"runs/matrix{'-quick' * options.quick}"))
+    by_seed = {seed: own_encoders.train(work, size, seed, table) for seed in options.seeds}
+    names = by_seed[options.seeds[0]]
+    return {name: {seed: load_encoder(by_seed[seed][name]) for seed in options.seeds} for name in names}
 
 
-def encoders(table: manifests.Manifest) -> dict[str, dict[int, Encoder]]:
-    """By the name that they have in the table, and by seed: those of RUNS, else those that this page trains."""
-    if RUNS:
-        loaded = {path: load_encoder(path) for paths in RUNS.values() for path in paths}
-        return {name: {seed: loaded[paths[seed % len(paths)]] for seed in SEEDS} for name, paths in RUNS.items()}
-    by_seed = {seed: own_encoders.encoders(Work(STUDY), SIZE, seed, table) for seed in SEEDS}
-    return {name: {seed: by_seed[seed][name] for seed in SEEDS} for name in by_seed[SEEDS[0]]}
-
-
-def make_all() -> None:
-    """Make every missing run, task by task: frames are read once a task."""
-    simulate(SCENES, PAIRS, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
-    table = manifests.read(PAIRS / "manifest.parquet")
-    known = encoders(table)
-    plain = view_of(known[next(iter(known))][SEEDS[0]])  # one view for all, the references too
-    content = {task: of_sensors(table, task) for task in TASKS}
-    wanted = [(name, tune) for name, tune in product(known, TUNE) if RUNS or (name, tune) not in own_encoders.NOT_TUNED]
-    plans = [*wanted, (PIXELS, "scratch")]
-    every = {}
-    for (task, seed), (name, tune) in product(product(TASKS, SEEDS), plans):
+def wanted_runs(
+    options: Options, table: Manifest, known: Known, plain: tuple[int, bool], longer: dict[str, int]
+) -> Iterator[tuple[str, tuple[dict[str, Any], Encoder | None]]]:
+    """Yield the key of each run, its settings and its encoder, None for the network on pixels."""
+    sensors = table.text_column("sensor")
+    data_of = {task: select_rows(table, np.flatnonzero(np.isin(sensors, task))).content_hash[:16] for task in TASKS}
+    plans = [(name, tune) for name, tune in product(known, options.tune)
+             if options.runs or (name, tune) not in own_encoders.NOT_TUNED]  # fmt: skip
+    for task, seed, (name, tune) in product(TASKS, options.seeds, [*plans, (PIXELS, "scratch")]):
         encoder = known[name][seed] if name in known else None
-        about = settings(task, name, encoder, view_of(encoder) if encoder else plain, tune, seed, content[task])
-        stem = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
-        every[stem] = (about, encoder)
-    others = [record["settings"] for key, record in runs_of(RESULTS).items() if key not in every]
-    one_table([*(about for about, _ in every.values()), *others], RESULTS)
+        side, subtracts = view_of(encoder) if encoder else plain
+        key = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
+        about = {
+            "from": task[0], "to": task[1], "name": name, "size": side, "subtracts": subtracts,
+            "encoder": f"{Path(encoder.source).name} (weights {encoder.fingerprint})" if encoder else PIXELS,
+            "fit": asdict(Fit(steps=options.steps, tune="fine" if tune == "fine" else "frozen", seed=seed)),
+            "touches": options.touches, "version": training.VERSION, "simulator": VERSION, **longer,
+            "pairs": data_of[task],
+        }  # fmt: skip
+        yield key, (about, encoder)
+
+
+def run(options: Options) -> int:
+    """Make every missing run, task by task: frames are read once a task."""
+    if options.runs and options.steps1:
+        raise UserError("--steps1 is for encoders that the study trains. Leave it out with --runs.")
+    enable_compilation_cache()
+    usual = {"touches": 24, "steps": 40, "seeds": (0,)} if options.quick else {}
+    options = replace(options, **{k: v for k, v in usual.items() if getattr(options, k) == getattr(Options(), k)})
+    longer = {"steps1": options.steps1} if options.steps1 else {}
+    size = replace(plan.QUICK if options.quick else plan.FULL, **longer)
+    name = "_".join(["translation", *["quick"] * options.quick, *map(str, longer.values())])
+    out = options.out or Path("runs" if options.quick else "experiments/results") / f"{name}.jsonl"
+    scenes = Scenes(
+        touches=options.touches, objects=24 if options.quick else 60, seed=7, grade="fine", units="one", frames=6,
+        sensors=("gelsight_mini", "digit", "duragel", "tac3d"), size=128, vision=0.0, text=0.0,
+    )  # fmt: skip
+    folder = options.work / f"pairs-{options.touches}-{VERSION}"
+    simulate(scenes, folder, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
+    table = manifests.read(folder / "manifest.parquet")
+    known = encoders_of(options, size, table)
+    plain = view_of(known[next(iter(known))][options.seeds[0]])  # one view for all, the references too
+    wanted = dict(wanted_runs(options, table, known, plain, longer))
+    done = read_records(out)
+    others = [record["settings"] for key, record in done.items() if key not in wanted]
+    check_alike(out, [shared(about) for about in (*(about for about, _ in wanted.values()), *others)])
     for source, target in TASKS:
-        mine = [(*one, key) for key, one in every.items() if (one[0]["from"], one[0]["to"]) == (source, target)]
-        done = runs_of(RESULTS)
-        todo = [one for one in mine if done.get(one[2], {}).get("settings") != one[0]]
+        todo = [(key, *one) for key, one in wanted.items() if (one[0]["from"], one[0]["to"]) == (source, target)
+                and done.get(key, {}).get("settings") != one[0]]  # fmt: skip
         if not todo:
             continue
         split = pairs.find_pairs(table, source, target)
         data = [pairs.read_pairs(table, part, plain[0], subtract=plain[1]) for part in split]
-        for about, encoder, key in todo:
-            one_run(about, encoder, data, key)
+        for key, about, encoder in todo:
+            record = one_run(about, encoder, data)
+            write_record(out, key, record)
+            print(f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {record['seconds']} s")
+    return 0
 
 
-def main() -> None:
-    if RUNS and LONGER:
-        raise UserError(
-            "STEPS1 is for encoders that this study trains; leave it out with RUNS, whose encoders are trained"
-        )
-    enable_compilation_cache()
-    make_all()
-
+main = partial(run_script, Options, run)
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -22,17 +22,7 @@ from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.train.optim import learning_rate
-from experiments.translation.generator import (
-    Design,
-    Fit,
-    Generator,
-    Params,
-    features,
-    judged,
-    nameless,
-    predict,
-    units,
-)
+from experiments.translation.generator import Design, Fit, Generator, Params, features, judged, nameless, predict, units
 from experiments.translation.networks import STATES, Translation
 
 Log = Callable[[str], None]
@@ -69,17 +59,10 @@ class State(NamedTuple):
 
 
 def fit(
-    encoder: Encoder | None,
-    images: np.ndarray,
-    targets: np.ndarray,
-    *,
-    source: str,
-    target: str,
-    val: tuple[np.ndarray, np.ndarray] | None = None,
-    options: Fit | None = None,
-    shape: Translation | None = None,
+    encoder: Encoder | None, images: np.ndarray, targets: np.ndarray, *, source: str, target: str,
+    val: tuple[np.ndarray, np.ndarray] | None = None, options: Fit | None = None, shape: Translation | None = None,
     log: Log | None = None,
-) -> tuple[Generator, list[dict[str, float]]]:
+) -> tuple[Generator, list[dict[str, float]]]:  # fmt: skip
     """Train a translation on pairs: source `images` u8 (n, H, W, 3), `targets` images u8 alike or fields f32.
 
     `encoder` None trains the reference that reads pixels; it needs a `shape`. `val`: pairs of other objects; of the

@@ -1,9 +1,9 @@
-import csv
-
 import cv2
 import numpy as np
 import pytest
+from checked_world import columns
 
+from anytouch_jax.data.manifest import manifest as manifests
 from experiments.real import balls, recordings, scores
 from experiments.real.recordings import Recordings
 
@@ -43,12 +43,9 @@ def data() -> Recordings:
     recording = np.array([r for r, _, _ in rows])
     objects = recording % 6
     split = np.array(["train", "train", "val", "test"])[recording // 6 % 4]
-    frames = RNG.integers(0, 256, (len(rows), 48, 64, 3), np.uint8)
-    return Recordings(
-        frames, frames[:2], np.zeros(len(rows), int), np.array([f"r{r:02d}" for r in recording]),
-        np.array([f"cam{f}" for _, f, _ in rows]), split, objects % 5, np.array([f"o{o}" for o in objects]),
-        (objects > 2).astype(int), "hash",
-    )  # fmt: skip
+    finger, names = np.array([f"cam{f}" for _, f, _ in rows]), np.array([f"o{o}" for o in objects])
+    takes = np.array([f"r{r:02d}" for r in recording])
+    return Recordings(None, takes, finger, split, objects % 5, names, (objects > 2).astype(int))
 
 
 def planted(data: Recordings, noise: float) -> np.ndarray:
@@ -81,46 +78,22 @@ def test_slip_is_scored_on_objects_that_the_head_never_saw(data):
     assert scores.slip_score(slipping.astype(np.float32), data).share == 1.0
 
 
-@pytest.fixture(scope="module")
-def pack(tmp_path_factory):
-    """Two recordings of one finger: eight free frames, then a dent. The rows of the table are shuffled."""
-    root, rng = tmp_path_factory.mktemp("pack"), np.random.default_rng(0)
-    gel = rng.integers(80, 160, (96, 128, 3)).astype(np.uint8)
-    gel = cv2.GaussianBlur(gel, (0, 0), 8)
-    rows = []
-    for take in ("a", "b"):
-        for number in range(12):
-            frame = gel.astype(int) + rng.integers(-1, 2, gel.shape)
-            if number >= 8:
-                cv2.circle(dent := np.zeros(gel.shape, np.uint8), (64, 48), 14, (60, 20, 40), -1)
-                frame = frame + dent
-            name = f"{take}{number}.png"
-            cv2.imwrite(str(root / name), np.clip(frame, 0, 255).astype(np.uint8))
-            rows.append((name, take, number))
-    cv2.imwrite(str(root / "gel.png"), gel)
-    fixed = {"sensor": "gelsight_mini", "unit": "cam0_a", "dataset": recordings.SET, "split": "train", "stride": 1,
-             "object_fold": 0, "label.object": "o", "label.slip": 0}  # fmt: skip
-    own = {"a": "gel.png", "b": ""}
-    with (root / "manifest.csv").open("w", newline="") as file:
-        names = ["path", "sequence", "recording", "frame_index", "background_path", *fixed]
-        table = csv.DictWriter(file, names)
-        table.writeheader()
-        for place in rng.permutation(len(rows)):
-            name, take, number = rows[place]
-            line = {"path": name, "sequence": take, "recording": take, "frame_index": number} | fixed
-            table.writerow(line | {"background_path": own[take]})
-    return root
-
-
-def subtracted(data, take):
-    return [data.backgrounds[place] for place in data.background[data.recording == take]]
-
-
-def test_a_recording_without_a_picture_gets_its_first_frame(pack):
-    data = recordings.read(pack / "manifest.csv")
-    gel, first = (cv2.imread(str(pack / name))[..., ::-1] for name in ("gel.png", "b0.png"))
-    assert len(data.frames) == 24 and all((each == gel).all() for each in subtracted(data, "a"))
-    assert all((each == first).all() for each in subtracted(data, "b"))
-    data = recordings.read(pack / "manifest.csv", "first")
-    first = cv2.imread(str(pack / "a0.png"))[..., ::-1]
-    assert all((each == first).all() for each in subtracted(data, "a"))
+def test_the_untouched_gel_is_the_units_picture_a_median_or_the_first_frame(tmp_path):
+    rng, names = np.random.default_rng(0), ("gel", *(f"{take}{number}" for take in "ab" for number in range(3)))
+    pictures = {name: rng.integers(0, 256, (48, 64, 3), np.uint8) for name in names}
+    for name, picture in pictures.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), picture[..., ::-1])
+    order = ("b1", "a0", "b2", "b0", "a1", "a2")
+    given = columns(6, path=[f"{name}.png" for name in order], frame_index=[int(name[1]) for name in order])
+    given |= {name: [one[0] for one in order] for name in ("sequence", "recording")}
+    given |= {"background_path": [{"a": "gel.png"}.get(one[0]) for one in order], "dataset": [recordings.SET] * 6}
+    given |= {"unit": ["cam0_a"] * 6, "object_fold": [0] * 6, "label.object": ["o"] * 6, "label.slip": [0] * 6}
+    path = tmp_path / "m.parquet"
+    manifests.write(manifests.from_columns(given, path), path)
+    middle = np.partition(np.stack([pictures[name] for name in order]), 2, axis=0)[2]
+    for word, wanted in (("rule", (pictures["gel"], middle)), ("median", (middle, middle)),
+                         ("first frame", (pictures["a0"], pictures["b0"]))):  # fmt: skip
+        data = recordings.read(path, word)
+        for name, take, (frame, gel) in zip(order, data.recording, data.pairs(), strict=True):
+            np.testing.assert_array_equal(frame, pictures[name])
+            np.testing.assert_array_equal(gel, wanted["ab".index(take)])

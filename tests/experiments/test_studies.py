@@ -1,46 +1,46 @@
 import json
 
 import pytest
-from scripts import visit
 
+from experiments.pouring import study as pouring
 from experiments.records import read_records
-from experiments.translation.settings import runs_of
+from experiments.translation import study as translation
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_pouring(tmp_path, tiny_run, monkeypatch, capsys):
-    size = {"QUICK": 1, "TRIALS": 2, "DEMOS": 2, "TUNE": 1, "MODES": "frozen,fine-tuned", "OUT": tmp_path}
-    visit(monkeypatch, "pouring/study.py", RUNS=f"anytouch={tiny_run}", **size)
-    out = capsys.readouterr().out
-    assert "no run is given for row t3: it is left out" in out
-    results = tmp_path / "pouring-quick.jsonl"
-    learned = {f"{name}-{mode}-0" for name in ("none", "static", "anytouch") for mode in ("frozen", "fine-tuned")}
-    assert {*read_records(results)} == learned | {"blind-bound-0", "count-bound-0", "load-bound-0", "expert-bound-0"}
-    before = results.stat().st_mtime_ns
-    visit(monkeypatch, "pouring/study.py")
-    assert results.stat().st_mtime_ns == before
+def test_pouring(script, tmp_path, tiny_run):
+    out = tmp_path / "pouring.jsonl"
+    words = ["--quick", "--trials", 2, "--demos", 2, "--tune", 1, "--runs", f"anytouch={tiny_run}", "--out", out]
+    first = script(pouring, *words)
+    assert first.status == 0 and "no run is given for row t3: it is left out" in first.out, first.err
+    learned = {f"{name}-frozen-0" for name in ("none", "static", "anytouch")}
+    assert {*read_records(out)} == learned | {"blind-bound-0", "load-bound-0", "expert-bound-0"}
+    assert script(pouring, *words).out.splitlines() == ["no run is given for row t3: it is left out"]
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_translation(tmp_path, tiny_run, monkeypatch):
-    size = {"QUICK": 1, "TOUCHES": 24, "STEPS": 2, "WORK": tmp_path / "work", "OUT": tmp_path}
-    visit(monkeypatch, "translation/study.py", RUNS=f"anytouch={tiny_run} t3={tiny_run}", **size)
-    result = list(runs_of(tmp_path / "translation_quick.jsonl").values())
-    assert len(result) == 9 and all(one["error"] > 0 for one in result)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(tmp_path, monkeypatch):
-    size = {"QUICK": 1, "TOUCHES": 24, "STEPS": 2, "STEPS1": 5, "TUNE": "frozen,fine", "OUT": tmp_path}
-    visit(monkeypatch, "translation/study.py", WORK=tmp_path / "work", STUDY=tmp_path / "study", **size)
-    results = tmp_path / "translation_quick_5.jsonl"
-    names = {key.removeprefix("digit-tac3d-") for key in runs_of(results) if key.startswith("digit-tac3d-")}
-    kinds = ("anytouch", "anytouch_between", "anytouch_layer_decay", "t3")
-    both = {f"{name}-{tune}-0" for name in kinds for tune in ("frozen", "fine")}
+def test_translation_trains_encoders_that_never_met_the_objects_of_the_pairs(script, tmp_path):
+    out, study = tmp_path / "out.jsonl", tmp_path / "study"
+    words = ["--quick", "--touches", 24, "--steps", 2, "--steps1", 5, "--tune", "frozen", "fine"]
+    assert script(translation, *words, "--work", tmp_path / "work", "--study", study, "--out", out).status == 0
+    records = read_records(out)
+    assert all(one["error"] > 0 for one in records.values())
+    names = {key.removeprefix("digit-tac3d-") for key in records if key.startswith("digit-tac3d-")}
+    both = {f"{name}-{tune}-0" for name in ("anytouch", "t3") for tune in ("frozen", "fine")}
     assert names == both | {"stage1-frozen-0", "pixels-scratch-0"}
-    stages = [path.name for path in (tmp_path / "study" / "trained").glob("stage1-*")]
-    configs = [json.loads((tmp_path / "study" / "trained" / name / "config.json").read_text()) for name in stages]
+    stages = [path.name for path in (study / "trained").glob("stage1-*")]
+    configs = [json.loads((study / "trained" / name / "config.json").read_text()) for name in stages]
     assert len(stages) == 2 and {one["run"]["steps"] for one in configs} == {5}  # AnyTouch's and T3-style
+
+
+def test_mistakes_are_one_sentence(script, tmp_path):
+    for study, words, named in (
+        (pouring, ["--runs", f"mine={tmp_path}"], "--runs names none, t3, static, anytouch, not mine"),
+        (pouring, ["--runs", "t3=gone"], "no run gone"),
+        (pouring, ["--demos", "0"], "--demos must be 1 or more, not 0"),
+        (translation, ["--runs", f"t3={tmp_path}", "--steps1", "5"], "--steps1"),
+    ):
+        found = script(study, *words)
+        assert found.status == 2 and named in found.err and len(found.err.splitlines()) == 1

@@ -12,7 +12,7 @@ A unit is the column `unit` of one dataset and sensor, or else the sensor. A fol
 
 The median is over frames of split train, if these are enough. Pressed or not, they may all take part, as presses are at
 changing places. A unit of few sequences may have one press only, as if it was named after an object. Its median is that
-of its sensor, if these look alike. `experiments/results/backgrounds.md` compares medians with stored pictures.
+of its sensor, if these look alike. `experiments/results/real.md` compares it with stored pictures.
 """
 
 from __future__ import annotations

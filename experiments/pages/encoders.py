@@ -46,8 +46,9 @@ def real(folder: Path) -> Page:
             end = name.removeprefix(plain := name.removesuffix(f", {records[name].get('untouched')}"))
             fresh = scores.get(f"{UNTRAINED}{plain}", scores.get(f"{UNTRAINED}{DEFAULT}", [None]))[0]
             learned = UNTRAINED not in name
-            against = (scores[f"pixels{end}"][0] if learned else None, fresh if learned and not end else None,
-                       scores[plain][0] if end else None)  # fmt: skip
+            pixels = scores.get(f"pixels{end}", [None])[0]
+            against = (pixels, None if end else fresh) if learned else (None, None)
+            against = (*against, scores[plain][0] if end else None)
             changes = [_minus(linear, other) for other in against]
             found.append((task, name, _share(linear or trained), _share(near), *changes))
             if records[name]["kind"] == "encoder" and learned:
@@ -74,23 +75,20 @@ def motion(folder: Path) -> Page:
 
 
 def measure(folder: Path) -> Page:
-    """Errors of depth, contact and force, simulated and on real balls."""
+    """Errors of depth, shear and force, simulated and on real balls."""
     sensors = read_records(folder / "measure.jsonl")
     names = ("depth", "iou", "force", "shear", "inside")
     rows = [(name, one["depth"], *(100 * one[part] for part in names[1:])) for name, one in sensors.items()]
     balls = {name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one}
     real = [(name, *(percent(one["radius"]) if part == "radius" else Value(*one[part]) for part in
                      ("radius", "centre", "profile"))) for name, one in balls.items()]  # fmt: skip
-    contact = [(*key.split(", ", 1), *(percent(one[part]) for part in ("auroc", "hits", "alarms", "decided")))
-               for key, one in read_records(folder / "contact.jsonl").items()]  # fmt: skip
     low, high = (bound(row[1] for row in rows) for bound in (min, max))
     findings = [
         f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
         "Real balls: a calibration of the unit is better. The network reads less than the depth.",
-        "Contact: the network calls most untouched real frames contact. The commands keep the difference of pictures.",
     ]
     answer = "On new simulated units the depth in contact is off by this much."
-    return Page("measure", [real, rows, contact], findings, (answer, f"{low:.2f} to {high:.2f} mm"))
+    return Page("measure", [real, rows], findings, (answer, f"{low:.2f} to {high:.2f} mm"))
 
 
 def lookalikes(folder: Path) -> Page:
@@ -139,7 +137,9 @@ def trust(folder: Path) -> Page:
         both = (None if value is None else percent(value) for value in (one["never_met"].get("novelty"), hardest))
         figures = (percent(one[key]) for key in ("accuracy", "ece", "coverage", "decided", "novel"))
         rows.append((name, *figures, one["size"], *both))
-        findings.append(f"{name}: sets hold the class in {rows[-1][3].mean:.1f} %, and {one['asked']:.0%} was asked.")
+        findings.append(
+            f"{name}: sets hold the class in {rows[-1][3].mean:.1f} %, and {100 * one['asked']:.0f} % were asked for."
+        )
     counts = {fault: np.sum([one["faults"][fault] for one in units.values()], 0)
               for fault in next(iter(units.values()))["faults"]}  # fmt: skip
     faults = [(fault, f"{one[0]} of {one[1]}", f"{one[2]}") for fault, one in counts.items()]
@@ -149,5 +149,9 @@ def trust(folder: Path) -> Page:
     findings.append(f"{alarmed} of {sum(one['units'] for one in units.values())} good units raise an alarm.")
     answer = f"Of sets that should hold the class in 90 %, this share does. {findings[-2]}"
     return Page(
-        "trust", [rows, faults], findings, (answer, f"{rows[0][3].shown()} %"), words={"units": ", ".join(units)}
+        "trust",
+        [rows, faults],
+        findings,
+        (answer, f"{rows[0][3].shown()} %"),
+        words={"units": ", ".join(name.replace(",", "") for name in units)},
     )

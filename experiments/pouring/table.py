@@ -27,9 +27,9 @@ DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the othe
 
 def record(trials: Trials, task: Task, **about: Any) -> dict[str, Any]:
     """Return the record of a row's trials with one seed; `about` has its row, mode, seed, source and settings."""
-    poured, result = trials.poured.round(3).tolist(), error(trials.poured, task.target)
-    about |= {"target": task.target, "limit": task.limit, "mean_error": round(result.mean, 3)}
-    return about | {"poured": poured, "steps": trials.steps.tolist()}
+    poured = np.asarray(trials.poured, np.float64)
+    about |= {"target": task.target, "limit": task.limit, "mean_error": round(error(poured, task.target).mean, 3)}
+    return about | {"poured": poured.round(3).tolist(), "steps": trials.steps.tolist()}
 
 
 def errors_of(path: Path) -> dict[tuple[str, str], Seeds]:

@@ -1,21 +1,15 @@
-import sys
-
-import cv2
 import numpy as np
 import pytest
-from measuring import measuring_weights
-from press_films import SENSORS, gel_frame, press_film
 from touch_world import make_touches
 
 from anytouch_jax.config import from_json, to_json
-from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.nn.functional import build
 from anytouch_jax.simulated import SIMULATED
 from anytouch_jax.weights.tree import flatten
-from experiments.encoders import contact, lookalikes, motion
+from experiments.encoders import lookalikes, motion
 from experiments.encoders.train import configure
 from experiments.pages.encoders import lookalikes as page
-from experiments.records import read_records, write_record
+from experiments.records import write_record
 
 
 @pytest.mark.parametrize("stage", [1, 2])
@@ -72,27 +66,3 @@ def test_a_perfect_encoder_finds_every_touch_and_noise_finds_chance(tmp_path, mo
     made = page(tmp_path)
     assert made.tables[0][0][:2] == ("fine alignment", "a") and made.readme["a"].mean == pytest.approx(100)
     assert made.findings == [f"fine alignment: `a` finds 100 %, and pixels {100 * scores['pixels']:.0f} %."]
-
-
-def test_readers_are_compared_on_the_frames_of_films(tmp_path, monkeypatch):
-    rows = {name: [] for name in ("path", "sensor", "sequence", "frame_index", "split", "background_path")}
-    rows["label.force"] = []
-    cv2.imwrite(str(tmp_path / "gel.png"), gel_frame("coloured", 0.0)[..., ::-1])
-    for film, shape in enumerate(("ball", "bar")):
-        for number, (frame, touched) in enumerate(zip(*press_film("coloured", 0.5, shape, 12), strict=True)):
-            path = f"{film}_{number}.png"
-            cv2.imwrite(str(tmp_path / path), frame[..., ::-1])
-            values = (path, SENSORS["coloured"], f"film {film}", number, "test", "gel.png", float(touched))
-            for name, value in zip(rows, values, strict=True):
-                rows[name].append(value)
-    manifests.write(manifests.from_columns(rows, tmp_path / "m.csv"), tmp_path / "m.csv")
-    model, out = measuring_weights(tmp_path / "w.safetensors"), tmp_path / "contact.jsonl"
-    monkeypatch.setattr(sys, "argv", ["", "films", str(tmp_path / "m.csv"), f"--model={model}", f"--out={out}"])
-    contact.main()
-    records = read_records(out)
-    assert len(records) == 5 and all(one["frames"] == 24 for one in records.values())
-    own = records["films, difference, own picture"]
-    assert own["auroc"][0] == own["hits"][0] == own["decided"][0] == 1 and own["alarms"][0] == 0
-    assert all(0 <= one["auroc"][0] <= 1 for one in records.values())
-    undecided = contact.figures(np.array([np.nan, 1, 9, 9]), np.full(4, 5.0), np.array([0, 0, 1, 1]), np.arange(4))
-    assert undecided["decided"][0] == 0.75 and undecided["hits"][0] == undecided["auroc"][0] == 1

@@ -11,10 +11,11 @@ from experiments.translation import study as translation
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_pouring(script, tmp_path, tiny_run):
     out = tmp_path / "pouring.jsonl"
-    words = ["--quick", "--trials", 2, "--demos", 2, "--tune", 1, "--runs", f"anytouch={tiny_run}", "--out", out]
+    sizes = ["--seeds", 0, "--trials", 2, "--demos", 2, "--tune", 1]
+    words = [*sizes, "--runs", f"anytouch={tiny_run}", "--out", out]
     first = script(pouring, *words)
     assert first.status == 0 and "no run is given for row t3: it is left out" in first.out, first.err
-    learned = {f"{name}-frozen-0" for name in ("none", "static", "anytouch")}
+    learned = {f"{name}-{mode}-0" for name in ("none", "static", "anytouch") for mode in ("frozen", "fine-tuned")}
     assert {*read_records(out)} == learned | {"blind-bound-0", "load-bound-0", "expert-bound-0"}
     assert script(pouring, *words).out.splitlines() == ["no run is given for row t3: it is left out"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder
-from anytouch_jax.evaluate.feature_cache import principal_components, raw_pixels
+from anytouch_jax.evaluate.feature_cache import principal_components
 from anytouch_jax.train.progress import silent
 from experiments.real.recordings import Recordings
 
@@ -23,7 +23,12 @@ def encoder_features(encoder: Encoder, data: Recordings) -> np.ndarray:
 
 def pixel_values(data: Recordings) -> np.ndarray:
     """Return 200 principal components of 32 x 24 pixels and of their difference from the untouched gel."""
-    return components([raw_pixels(frame, gel) for frame, gel in data.pairs()], data)
+
+    def small(picture: np.ndarray) -> np.ndarray:
+        return cv2.resize(picture, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+
+    pairs = ((small(frame), small(gel)) for frame, gel in data.pairs())
+    return components([np.concatenate([frame, frame - gel], -1).ravel() for frame, gel in pairs], data)
 
 
 def components(values: list[np.ndarray], data: Recordings, count: int = 200) -> np.ndarray:

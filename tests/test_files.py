@@ -14,7 +14,6 @@ import pytest
 
 import anytouch_jax as at
 from anytouch_jax import bars, files
-from anytouch_jax.cli.app import main
 from anytouch_jax.encoder.embed import Features, save_npz
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.search import load_index
@@ -56,25 +55,6 @@ def test_a_leftover_of_a_killed_process_is_overwritten(tmp_path):
     part.write_bytes(b"much longer than what follows")
     atomic_write(path, b"short", part=part)
     assert path.read_bytes() == b"short" and list(tmp_path.iterdir()) == [path]
-
-
-def test_a_folder_that_is_a_file_is_an_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    for place in ("file/a", "file/deep/a"):
-        with pytest.raises(OSError, match="file"):
-            atomic_write(tmp_path / place, b"new")
-    assert (tmp_path / "file").read_text() == "" and len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_full_disk_is_one_sentence_of_the_command(tmp_path, monkeypatch, capsys):
-    def full(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    picture = tmp_path / "a.csv"
-    picture.write_text("path,sensor,sequence,frame,split\nx.png,digit,0,0,train\n")
-    assert main(["data", "contact", str(picture), "--out", str(tmp_path / "b.csv")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_a_lock_is_exclusive_and_ends_with_its_block(tmp_path):

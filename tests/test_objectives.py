@@ -202,14 +202,6 @@ def test_touches_of_one_shape_share_a_pass_and_keep_their_rows():
     assert scans(touches) == 2 * scans(touches[:3]) == 2 * scans(touches[:1]) > 0
 
 
-def test_the_matching_loss_is_that_of_the_logits():
-    z = embed(PARAMS2, list(zip(MATCH[:6:2], MATCH[1::2], strict=True)))
-    logits = [np.asarray(COMPILED2.match(PARAMS2, z[0], other)) for other in z[1:]]
-    loss = np.log1p(np.exp(-logits[0])).mean() + np.log1p(np.exp(logits[1])).mean()
-    (_, metrics), _ = terms2()
-    np.testing.assert_allclose(metrics["match"], loss, rtol=1e-5)
-
-
 def test_cosine_matching_has_the_other_places_of_the_batch_as_negatives():
     config = replace(CONFIG2, model=replace(CONFIG2.model, match_head="cosine"))
     net, nothing = compiled(config.model), np.full((4, 1, 28, 28, 3), np.nan, "f4")  # never looked at

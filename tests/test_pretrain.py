@@ -125,15 +125,6 @@ def refused(config, run, **options):
     return message
 
 
-def test_another_preset_in_the_same_folder_is_refused(straight, world):
-    run, _ = straight
-    before = (run / "config.json").read_bytes(), saved_steps(run)
-    message = refused(run_config(world, model={"embed": 16}), run)
-    assert "model.embed was 12 and is now 16" in message and str(run) in message
-    assert "stage" in refused(run_config(world, 2), run)
-    assert ((run / "config.json").read_bytes(), saved_steps(run)) == before
-
-
 def parts(params, *names):
     return flatten({name: params[name] for name in names})
 

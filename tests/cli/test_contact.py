@@ -2,20 +2,13 @@ from pathlib import Path
 
 import cv2
 import pytest
+from checked_world import edit
 
 from anytouch_jax.data.manifest import manifest as manifests
 
 
 def contacts(path):
     return manifests.read(path).column("label.contact").to_pylist()
-
-
-def edit(file, source, rows=slice(None), drop=(), **columns):
-    """Write rows of a manifest with other columns."""
-    table = manifests.read(source).table
-    full = {name: table[name].to_pylist()[rows] for name in table.column_names if name not in drop} | columns
-    manifests.write(manifests.from_columns(full, file), file)
-    return file
 
 
 def test_frames_are_marked_next_to_the_manifest_or_dropped(anytouch, pressed, tmp_path):

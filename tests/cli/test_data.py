@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from blank_recorder import BlankRecorder
+from checked_world import edit
 from gel_pictures import press
 from reader_world import fill
 
@@ -97,9 +98,7 @@ def _no_physics(monkeypatch):
     ("words", "named"),
     [
         (["--sensors", "nose"], "no simulated sensor 'nose'"), (["--depth", "1", "0.5"], "depth is a range of mm"),
-        (["--threads", "0"], "--threads must be 1 to 1024"),
         (["--sensors", "tac3d", "--fields", "pressure"], "no sensor has a camera"),
-        (["--size", "8"], "size is 16 to 4096"), (["--size", "20000"], "size is 16 to 4096"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_sentence_and_leaves_nothing(mistake, tmp_path, words, named):
@@ -142,13 +141,6 @@ def test_frames_that_did_not_converge_are_counted(anytouch, tmp_path, monkeypatc
     words = ["--touches", 3, "--sensors", "digit", "--fidelity", "exact", *SMALL]
     outcome = anytouch("data", "simulate", "--out", tmp_path, *words)
     assert outcome.status == 0 and "3 of 6 frames did not converge" in outcome.err
-
-
-def edit(path, **columns):
-    """The manifest with other columns."""
-    table = manifests.read(path).table
-    full = {name: table[name].to_pylist() for name in table.column_names} | columns
-    manifests.write(manifests.from_columns(full, path), path)
 
 
 @pytest.fixture

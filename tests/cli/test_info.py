@@ -55,17 +55,8 @@ def test_weights_report_whose_names_they_have(anytouch, tmp_path):
         other = touch_model(patch_encoder=kind)
         export_safetensors(theirs, build(other).init(jax.random.key(0)), {safetensors.MODEL_KEY: to_json(other)})
         assert f"{kind} patches of 7" in anytouch("info", theirs).out
-    whole = {safetensors.MODEL_KEY: to_json(model), safetensors.BACKGROUND_KEY: "either"}
-    export_safetensors(ours, params, whole)
+    export_safetensors(ours, params, {safetensors.MODEL_KEY: to_json(model), safetensors.BACKGROUND_KEY: "either"})
     assert "background: either" in anytouch("info", ours).out
-    export_safetensors(ours, params, whole | {safetensors.BACKGROUND_KEY: "no"})
-    assert "cannot be used: --data.background must be one of" in anytouch("info", ours).out
-    safetensors.write_safetensors(theirs, convert.to_release(params, model), {safetensors.MODEL_KEY: ""})
-    done = anytouch("info", theirs)  # an empty description is a damaged one
-    assert done.status == 2 and "not JSON" in done.err
-    params["touch"]["class_token"] = params["touch"]["class_token"] * np.nan
-    export_safetensors(ours, params, {safetensors.MODEL_KEY: to_json(model)})
-    assert "not finite" in anytouch("info", ours).out
 
 
 def test_a_folder_is_the_run_in_it_else_its_manifest(mistake, tmp_path, anytouch, tiny_run, world):
@@ -98,11 +89,6 @@ def test_an_adapted_run_and_an_export(anytouch, tiny_run, world, tmp_path):
     about |= dict.fromkeys(("jax", "background", "pooling", "join", "dtype"), "x")
     (tmp_path / "encoder.bin.json").write_text(json.dumps(about))
     assert "an exported encoder" in anytouch("info", tmp_path / "encoder.bin").out
-    for wrong in ({"frames": "3"}, {"sensors": {"digit": 5}}, {"bytes": 10**1000}, {"bytes": 2}):
-        (tmp_path / "encoder.bin.json").write_text(json.dumps(about | wrong))
-        done = anytouch("info", tmp_path / "encoder.bin")
-        assert done.status == 2 and "encoder.bin" in done.err and done.err.count("\n") == 1
-    (tmp_path / "encoder.bin.json").write_text(json.dumps(about))
     (tmp_path / "encoder.bin").write_bytes(b"y")  # flipped
     assert "is damaged" in anytouch("info", tmp_path / "encoder.bin").err
 

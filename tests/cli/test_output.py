@@ -78,13 +78,8 @@ def test_the_folder_of_an_output_is_made_where_it_can_be(tmp_path, monkeypatch):
         ("probe label --model run --data touch.parquet --out run/config.json", ["config.json", "--out"]),
         ("retrieve --data touch.parquet --out afile/r.json", ["afile", "--out"]),
         ("retrieve --data touch.parquet --out touch.parquet", ["touch.parquet", "--out"]),
-        ("retrieve --data touch.parquet --gallery 1", ["--gallery"]),
         ("report --data touch.parquet --stage1 a --stage2 b --out afile/r", ["afile", "--out"]),
-        ("report --data touch.parquet --stage1 a --stage2 b --out r --touches 0", ["--touches"]),
         ("adapt --model a --data touch.parquet --sensor digit --out afile/r", ["afile", "--out"]),
-        ("adapt --model a --data touch.parquet --sensor digit --out r --seed -1", ["--seed"]),
-        ("adapt --model a --data touch.parquet --sensor digit --out r --seed 100000000000000000000", ["--seed"]),
-        ("adapt --model a --data touch.parquet --sensor digit --out r --steps 0", ["--steps"]),
         ("adapt --model a --data touch.parquet --sensor digit --out r --frames 0 --labels x", ["--labels"]),
     ],
 )

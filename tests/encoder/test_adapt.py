@@ -149,12 +149,3 @@ def test_the_command(run, data, tmp_path, capsys):
         assert said in "".join(capsys.readouterr())
     assert app.main(f"{words.replace('/o ', '/none ')} 0".split()) == 0
     assert "gelslim has the universal tokens" in capsys.readouterr().out
-
-
-def test_the_fit_does_not_depend_on_the_precision_of_jax(fitted, run, table):
-    with jax.enable_x64(True):
-        again = adapt(run, table, "gelslim", frames=8, labels="hardness", steps=40, log=lambda _: None)
-    assert again.losses == fitted[0].losses and (again.before, again.after) == (fitted[0].before, fitted[0].after)
-    tokens = [np.asarray(one.params["touch"]["sensor_tokens"]) for one in (again, fitted[0])]
-    np.testing.assert_array_equal(*tokens)
-    assert tokens[0].dtype == np.float32

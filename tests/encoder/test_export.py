@@ -105,12 +105,10 @@ def test_a_damaged_artefact_is_refused(copied):
             load(copied)
 
 
-def test_a_damaged_or_missing_description_is_refused(copied):
+def test_a_wrong_or_missing_description_is_refused(copied):
     about = json.loads(describes(copied).read_text())
-    changes = {"format": "other.2"}, {"frames": -1}, {"features": 1 << 80}, {"sensors": {}}, {"platforms": []}
-    wrong = (json.dumps(about | change) for change in changes)
-    for text in ("{", "[1]", "{}", '{"format": 3}', *wrong):
-        describes(copied).write_text(text)
+    for change in ({"format": "other.2"}, {"frames": -1}, {"sensors": {}}, {"platforms": []}):
+        describes(copied).write_text(json.dumps(about | change))
         with pytest.raises(UserError, match=r"model\.bin\.json"):
             load(copied)
     describes(copied).unlink()

@@ -6,7 +6,7 @@ from itertools import pairwise
 import jax
 import numpy as np
 import pytest
-from faulty_camera import KINDS, FaultyCamera, Film, write_uneven_video
+from faulty_camera import KINDS, FaultyCamera, Film
 from films import write_film
 
 from anytouch_jax.data.images import frames_from_video
@@ -181,13 +181,6 @@ def test_a_camera_that_does_not_answer_is_not_waited_for(encoder, monkeypatch):
     with pytest.raises(streams.CameraError, match="not answered"):
         next(embedded)
     camera.end()
-
-
-def test_times_of_a_video_are_those_of_its_frames(encoder, tmp_path):
-    stamps = [0, 30, 60, 500, 510, 1500]
-    source, live = streams.open_source(write_uneven_video(tmp_path / "uneven.mkv", stamps))
-    outcome = list(streams.stream(encoder, source, live=live, sensor=DIGIT))
-    np.testing.assert_allclose([one.time for one in outcome], np.array(stamps) / 1000, atol=1e-6)
 
 
 @pytest.fixture

@@ -1,8 +1,6 @@
 from dataclasses import replace
 
-import jax
 import numpy as np
-import optax
 import pytest
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss
@@ -62,15 +60,6 @@ def test_scaling_of_the_features_does_not_matter_to_the_linear_head():
 
     assert np.mean(predicted(1, 0) == predicted(factor, 3)) > 0.99
     assert np.mean(predicted(7, 0, scaling="common") == predicted(1, 0, scaling="common")) > 0.99
-
-
-@pytest.mark.parametrize("power", [66, -66])  # 7e19, 1e-20
-@pytest.mark.parametrize("scaling", ["column", "common"])
-@pytest.mark.parametrize(("name", "classes"), [("linear", 4), ("linear", 0), ("knn", 4)])
-def test_features_of_any_magnitude_give_the_same_predictions(name, classes, scaling, power):
-    (x, y), head = data(classes), ProbeHead(name, scaling)
-    plain, scaled = (fit_head(head, rows[FIT], y[FIT], classes).predict(rows[TEST]) for rows in (x, np.ldexp(x, power)))
-    np.testing.assert_array_equal(plain, scaled)
 
 
 def test_ridge_equals_its_normal_equations():
@@ -137,25 +126,6 @@ def test_the_gradient_head_is_drawn_from_its_seed_and_its_rate_falls_to_zero(mon
     assert np.all(np.diff(rates[:15]) < 0)
 
 
-def test_the_gradient_head_equals_a_run_of_optax():
-    x, y = data(2)
-    recipe = GradientRecipe(epochs=2, batch=50, rate=0.01, decay=0.1)
-    predicted = fit_head(ProbeHead("gradient", recipe=recipe), x[FIT], y[FIT], 2).predict(x[TEST])[-1]
-    rng = np.random.default_rng(0)
-    w, b = 0.01 * rng.standard_normal((24, 1)), rng.uniform(-1, 1, 1) / np.sqrt(24)
-    tx = optax.adamw(optax.cosine_decay_schedule(0.01, 20), b1=0.9, b2=0.99, weight_decay=0.1)
-    params = (w.astype("f4"), b.astype("f4"))
-    state, update = tx.init(params), jax.jit(tx.update)
-    for _ in range(2):
-        for rows in rng.permutation(500).reshape(10, 50):
-            p = 1 / (1 + np.exp(-(x[rows] @ np.asarray(params[0]) + np.asarray(params[1]))))
-            slope = (p - y[rows][:, None]) / 50
-            updates, state = update(((x[rows].T @ slope).astype("f4"), slope.sum(0).astype("f4")), state, params)
-            params = tuple(p + np.asarray(change) for p, change in zip(params, updates, strict=True))
-    expected = (x[TEST] @ np.asarray(params[0]) + np.asarray(params[1]))[:, 0] > 0
-    assert np.mean(predicted == expected) > 0.99
-
-
 @pytest.mark.parametrize("classes", [2, 3])
 def test_a_saved_head_gives_the_same_predictions(tmp_path, classes):
     x, y = blobs(classes=classes)
@@ -184,12 +154,7 @@ def test_heads_of_the_first_release_still_load(tmp_path):
     for name in ("other.npz", "gone.npz"):
         with pytest.raises(UserError, match=name):
             linear_head.load_head(tmp_path / name)
-    for name, value in (
-        ("weights", np.full((2, 1), np.nan)), ("weights", np.ones((3, 1))), ("scale", np.zeros(2)),
-        ("mean", np.zeros(0)), ("classes", np.zeros(2)), ("bias", np.array("0")), ("frames", np.zeros(3)),
-        ("pooling", "sum"), ("mark", 3), ("extra", 1),
-        ("label", ""), ("mark", ""), ("classes", np.array(["a", "a"])), ("frames", "1"), ("frames", 1.0),
-    ):  # fmt: skip
+    for name, value in (("scale", np.zeros(2)), ("pooling", "sum"), ("classes", np.array(["a", "a"]))):
         np.savez(tmp_path / "h.npz", **{"format": "anytouch_jax.head.1", **arrays, name: value})
         with pytest.raises(UserError, match=r"h\.npz is not the head of a probe"):
             linear_head.load_head(tmp_path / "h.npz")

@@ -69,16 +69,3 @@ def test_bars_with_intervals_and_chance(tmp_path: Path, drawn: list[Any]) -> Non
     assert left.get_xlim() == right.get_xlim() and left.yaxis_inverted()
     assert left.get_xlim()[0] == 0 and left.get_xlim()[1] >= 90  # the interval of the last panel is inside
     read(tmp_path / "b.png")
-
-
-def test_pyplot_is_never_loaded() -> None:
-    import subprocess
-    import sys
-
-    code = (
-        "import sys, pathlib, tempfile; from anytouch_jax.evaluate import plots; before = 'matplotlib' in sys.modules\n"
-        "plots.bars(pathlib.Path(tempfile.mkdtemp()) / 'a.png', {'x': {'a': plots.ShareBar(0.2)}})\n"
-        "print(before, 'matplotlib.pyplot' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "False"]

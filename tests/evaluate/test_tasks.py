@@ -1,5 +1,3 @@
-import itertools
-
 import numpy as np
 import pytest
 from task_world import row, simulated, table
@@ -8,7 +6,6 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import tasks
 from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, select
-from anytouch_jax.sim import scene
 
 WORLD = simulated()
 FRAME = np.asarray(WORLD.column("frame_index"))
@@ -160,34 +157,6 @@ def test_an_empty_label_takes_no_part(manifest, empty):
     assert len(selected.rows) == 2 and "'Wood' and 'wood' differ only by" in selected.notes[-1]
     with pytest.raises(UserError, match=r"has a label|has no label"):
         select(manifests.replace_column(full, "label.kind", empties), Task("kind", "label.kind", which="all"))
-
-
-TURNED = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
-ACROSS, DOWN = {"right": "left", "left": "right"}, {"up": "down", "down": "up"}
-
-
-def mirrored(label: str, value: str, across: bool, down: bool) -> str:
-    """A direction label after the picture is flipped left to right or upside down."""
-    if label == "label.twist":
-        return TURNED.get(value, value) if across != down else value
-    if label == "label.slide":
-        value = ACROSS.get(value, value) if across else value
-        return DOWN.get(value, value) if down else value
-    return value
-
-
-@pytest.mark.parametrize("number", range(12))
-def test_flips_are_those_of_a_mirrored_sensor(number):
-    """The simulator's own mirror, which it draws into the picture, changes the labels as `mirrored` does."""
-    scenes = scene.Scenes(touches=12, sensors=("digit",), seed=3, objects=12)
-    touch = scene.draw_touch(scenes, number, ("train",) * 12)
-    recording = scene.draw_recording(scenes, touch, "digit")
-    plain = scene.directions(recording)
-    for across, down in itertools.product((False, True), repeat=2):
-        sign = np.array([-1.0 if across else 1.0, -1.0 if down else 1.0], np.float32)
-        unit = recording.unit._replace(mirror=np.asarray(recording.unit.mirror) * sign)
-        turned = scene.directions(recording._replace(unit=unit))
-        assert turned == {name: mirrored(name, plain[name], across, down) for name in plain}
 
 
 COUNT = 24

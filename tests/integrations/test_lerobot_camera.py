@@ -3,6 +3,7 @@
 import importlib
 import sys
 import tomllib
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -58,19 +59,14 @@ def test_lerobot_finds_the_camera_and_its_pictures_are_oriented_and_subtracted(p
     assert camera.find_cameras() == [{"name": "film", "type": "anytouch", "id": 0}]
 
 
+@contextmanager
 def camera_open(camera):
     """Connect and disconnect, as LeRobot's base class does in a with statement."""
-    from contextlib import contextmanager
-
-    @contextmanager
-    def opened():
-        camera.connect()
-        try:
-            yield
-        finally:
-            camera.disconnect()
-
-    return opened()
+    camera.connect()
+    try:
+        yield
+    finally:
+        camera.disconnect()
 
 
 def test_features_are_those_of_the_encoder(plugin, film, tmp_path):

@@ -1,4 +1,3 @@
-import ast
 import importlib.util
 import json
 import socket
@@ -74,18 +73,3 @@ def test_a_dead_socket_is_replaced_and_nothing_else_is(tmp_path):
     with pytest.raises(SystemExit, match="in use"):
         serve([], str(path))
     assert path.read_text() == "of the user"
-
-
-def test_rclpy_is_imported_in_the_node_only():
-    users = set()
-    for folder in ("src", "integrations", "experiments"):
-        for file in (ROOT / folder).rglob("*.py"):
-            source = file.read_text()
-            if "rclpy" in source and any(
-                "rclpy" in ast.unparse(node) for node in ast.walk(ast.parse(source))
-                if isinstance(node, ast.Import | ast.ImportFrom)
-            ):  # fmt: skip
-                users.add(file.name)
-    assert users == {"touch_node.py"}
-    for file in (FOLDER / "ros2" / "touch_node.py", FOLDER / "unix_socket" / "touch_socket.py"):
-        assert len(file.read_text().splitlines()) <= 75

@@ -48,14 +48,6 @@ def test_the_size_of_the_groups_changes_nothing(cache, monkeypatch):
         np.testing.assert_allclose(ours, wanted, rtol=2e-6, atol=2e-6)
 
 
-def test_groups_hold_as_many_heads_as_the_cache_and_are_undone():
-    x = np.arange(2 * 262 * 16 * 2, dtype="f4").reshape(2, 262, 16, 2)
-    parts = jax.jit(module._groups)(x)
-    assert parts.shape == (8, 4, 262, 2)
-    assert module.CACHE >= 4 * 4 * 262 * 262
-    np.testing.assert_array_equal(jax.jit(module._heads, static_argnums=1)(parts, x.shape), x)
-
-
 def test_large_logits_stay_finite_and_equal_the_limit():
     """Logits of 1e8: one key takes everything; nothing overflows, forward or backward."""
     q, k, v, g = draw((2, 7, 3, 4), scale=1e4)

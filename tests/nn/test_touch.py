@@ -162,9 +162,6 @@ def test_first_values():
     a, b, c = (net.init(jax.random.key(seed)) for seed in (0, 0, 1))
     jax.tree.map(np.testing.assert_array_equal, a, b)
     assert not np.array_equal(a["touch"]["patch"]["kernel"], c["touch"]["patch"]["kernel"])
-    np.testing.assert_allclose(a["logit_scale"], np.log(1 / 0.07), rtol=1e-6)
-    assert not np.asarray(a["lora"]["query"]["b"]).any() and np.asarray(a["lora"]["query"]["a"]).any()
-    assert (np.asarray(a["touch"]["pre_norm"]["scale"]) == 1).all()
     assert abs(np.std(a["touch"]["sensor_tokens"]) - 0.02) < 0.002
     # blocks of a stack and equal layers of different names start apart
     kernel = np.asarray(a["touch"]["blocks"]["attention"]["query"]["kernel"])

@@ -12,8 +12,6 @@ RNG = np.random.default_rng(0)
 # A program for each shape, and not one for each operation.
 nce = jax.jit(info_nce, static_argnames="groups")
 nce_grad = jax.jit(jax.value_and_grad(info_nce, argnums=(0, 1)))
-align = jax.jit(losses.alignment_loss, static_argnums=6)
-reconstruct = jax.jit(losses.reconstruction_loss, static_argnames="next_frame")
 normalise, normalise_patches, centered = map(jax.jit, (losses.normalise, losses.normalise_patches, losses.centered))
 
 
@@ -87,26 +85,6 @@ def test_groups_keep_negatives_in_their_share():
     np.testing.assert_allclose(ours, loop_info_nce(a[:4], b[:4], 9.0, half[:4]) / 2, rtol=1e-5)
 
 
-def test_alignment_weighs_the_pairs_and_counts_them():
-    touch, image, text = (unit(8, seed=s) for s in (1, 2, 3))
-    has_image, has_text = PRESENCE["mixed"], np.arange(8) < 4
-    loss, metrics = jax.device_get(align(touch, image, text, has_image, has_text, 14.0, (0.5, 1.0, 0.1)))
-    both = has_image & has_text
-    parts = {
-        "touch_to_vision": loop_info_nce(touch, image, 14.0, has_image),
-        "text_to_touch": loop_info_nce(text, touch, 14.0, has_text),
-        "vision_to_text": loop_info_nce(image, text, 14.0, both),
-    }
-    for name, value in parts.items():
-        np.testing.assert_allclose(metrics[name], value, rtol=1e-5)
-    expected = sum(
-        weight * (metrics[f"{a}_to_{b}"] + metrics[f"{b}_to_{a}"])
-        for weight, a, b in ((0.5, "touch", "vision"), (1.0, "touch", "text"), (0.1, "vision", "text"))
-    )
-    np.testing.assert_allclose(loss, expected, rtol=1e-6)
-    assert (int(metrics["touch_vision_pairs"]), int(metrics["vision_text_pairs"])) == (5, both.sum())
-
-
 def test_centred_embeddings_that_are_all_one_are_nothing_not_noise():
     """Rounding is not blown up to unit length, nor is its gradient."""
     present, spread = np.arange(64) < 7, unit(64, 32, 3).astype("f4")
@@ -117,20 +95,6 @@ def test_centred_embeddings_that_are_all_one_are_nothing_not_noise():
     )(same)
     assert np.abs(grad).max() < 1e4
     np.testing.assert_allclose(np.linalg.norm(centered(spread, np.ones(64, bool)), axis=1), 1.0, atol=1e-5)
-
-
-def test_reconstruction_counts_hidden_patches_and_the_whole_next_frame():
-    pred, target = (RNG.standard_normal((2, 4, 3, 5)) for _ in range(2))
-    hidden = np.array([[1, 0, 1, 1], [0, 1, 1, 1]], bool)
-    error = ((pred - target) ** 2).mean(-1)
-    loss, metrics = reconstruct(pred, target, hidden, next_frame=False)
-    np.testing.assert_allclose(loss, error.mean(-1)[hidden].mean(), rtol=1e-6)
-    assert set(metrics) == {"reconstruction"}
-    loss, metrics = reconstruct(pred, target, hidden, next_frame=True)
-    still, future = error[..., :2].mean(-1)[hidden].mean(), error[..., 2].mean()
-    result = [metrics["reconstruction"], metrics["next_frame"], loss]
-    np.testing.assert_allclose(result, [still, future, still + future], rtol=1e-6)
-    assert reconstruct(pred, target, np.zeros((2, 4), bool), next_frame=False)[0] == 0
 
 
 def test_normalised_patches_use_the_unbiased_variance_and_survive_constants():

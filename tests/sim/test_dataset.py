@@ -172,14 +172,6 @@ def test_two_processes_do_not_simulate_into_one_folder(made):
     assert dataset.simulate(SCENES, made) == made / "manifest.parquet" and tree(made) == before
 
 
-def test_a_part_is_told_of_when_its_files_are_on_the_disk(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
-    monkeypatch.setattr("os.sync", lambda: told.append(sorted(one.name for one in (tmp_path / "parts").iterdir())))
-    dataset.simulate(SCENES, tmp_path)
-    assert told == [[], ["00000.parquet"]]
-
-
 def test_settings_are_compared_by_value(made):
     file = made / "dataset.json"
     before = file.read_bytes()

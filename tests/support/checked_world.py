@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 
+from anytouch_jax.data.manifest import manifest as manifests
+
 
 def finding_rows(report):
     """The rows of each finding by its kind."""
@@ -61,3 +63,11 @@ def image_pairs(tmp_path, make, *, swap, witness, count=24):
     if witness:
         cv2.imwrite(str(tmp_path / "ground.png"), gel)
     return loose
+
+
+def edit(file, source=None, rows=slice(None), drop=(), **columns):
+    """Write rows of the manifest `source` (or `file` itself) to `file`, with other columns."""
+    table = manifests.read(source or file).table
+    full = {name: table[name].to_pylist()[rows] for name in table.column_names if name not in drop} | columns
+    manifests.write(manifests.from_columns(full, file), file)
+    return file

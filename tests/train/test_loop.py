@@ -1,4 +1,3 @@
-import io
 import json
 import os
 import signal
@@ -20,7 +19,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.train import loop
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import make_mesh
-from anytouch_jax.train.progress import chart, progress, to_stderr
+from anytouch_jax.train.progress import chart, progress
 from anytouch_jax.weights import checkpoint
 
 
@@ -262,16 +261,6 @@ def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, mon
     assert partial == [False, False, True], "two steps against three: never the best"
 
 
-def test_a_saved_state_is_not_touched_by_the_steps_after_it(undisturbed, tmp_path):
-    run(tmp_path, stop_after=6)  # saved at 3 while 4 to 6 ran on donated buffers
-    for entry in [e for e in (tmp_path / "checkpoints").iterdir() if e.name in ("00000006", "00000008")]:
-        entry.rename(tmp_path / entry.name)
-    again = run(tmp_path)
-    assert again.resumed == 3
-    assert_same(again.state, undisturbed[1].state)
-    assert rows(tmp_path) == rows(undisturbed[0])
-
-
 def test_batches_out_of_order_or_too_few_are_refused(tmp_path):
     with pytest.raises(ValueError, match="gave step 1 instead of step 0"):
         run(tmp_path / "a", batches=lambda start, stop: toy_batches(start + 1, stop))
@@ -376,26 +365,8 @@ def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monke
     assert gone[0] == donates and (donates or not any(gone))  # jax 0.11 copies one that a NumPy view of it still holds
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
 def row(step, **more):
     return {"step": step, "loss": 0.5, "samples_per_second": 30.4, "skipped_batches": 0} | more
-
-
-def test_a_terminal_shows_a_bar_and_sentences_above_it(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "120")
-    screen = sys.stderr
-    with progress(0, 3, to_stderr) as advance:
-        to_stderr("saved at step 1")
-        for step in range(3):
-            advance(row(step))
-    shown = screen.getvalue()
-    assert "3/3" in shown and "loss 0.5000" in shown and "saved at step 1" in shown
 
 
 def test_the_curve_falls_with_the_loss():

@@ -109,12 +109,6 @@ def test_adamw_with_skipped_parameters_equals_plain_numpy():
     np.testing.assert_array_equal(got["idle"]["kernel"], params["idle"]["kernel"])
 
 
-def test_eps_is_outside_the_root():
-    config = toy_config(optim={"warmup": 0, "learning_rate": 1.0, "weight_decay": 0.0, "eps": 1e-3})
-    got, _ = run_updates(config, {"w": np.zeros(1, "f4")}, [{"w": np.full(1, 1e-3, "f4")}])
-    np.testing.assert_allclose(got["w"], -0.5, rtol=1e-5)  # sqrt(g^2 + eps) would give -0.03
-
-
 def test_clipping_counts_the_used_parameters_only():
     config = toy_config(optim={"grad_clip": 1.0, "beta1": 0.0, "weight_decay": 0.0})
     params = {"a": np.zeros(2, "f4"), "b": np.zeros(2, "f4")}
@@ -191,11 +185,3 @@ def test_unpacking_gives_the_tree_back(small):
     assert jax.tree.structure(back) == jax.tree.structure(TREE)
     jax.tree.map(np.testing.assert_array_equal, back, TREE)
     assert all(a.dtype == b.dtype for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(TREE), strict=True))
-
-
-def test_small_leaves_of_a_type_lie_together_and_large_ones_alone():
-    layout = packing(TREE, 10)
-    assert layout.groups == ((0, 1, 3), (2,), (4,))
-    vector, large, whole = layout.pack(TREE)
-    np.testing.assert_array_equal(vector, [7, 7, 7, 7, 0, 1, 2, 3, 4, 5, 3])
-    assert large is TREE["large"] and whole is TREE["whole"]

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from films import write_film
 from gel_pictures import press
 from view_world import DEPTHS, SCRIPT
 
@@ -54,9 +55,5 @@ def features(touches) -> Path:
 @pytest.fixture(scope="session")
 def film(tmp_path_factory) -> Path:
     """A film of 12 frames at 30 frames/s that grow brighter."""
-    path = tmp_path_factory.mktemp("film") / "press.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (48, 48))
-    for frame in range(12):
-        writer.write(np.full((48, 48, 3), 20 + 15 * frame, np.uint8))
-    writer.release()
-    return path
+    frames = [np.full((48, 48, 3), 20 + 15 * frame, np.uint8) for frame in range(12)]
+    return write_film(tmp_path_factory.mktemp("film") / "press.avi", frames, 30)

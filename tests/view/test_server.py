@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import re
 import shutil
 import socket
@@ -19,7 +18,6 @@ from view_world import SCRIPT
 
 from anytouch_jax.data.cameras import Camera
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.embed import Features, save_npz
 from anytouch_jax.errors import UserError
 from anytouch_jax.view import server
 from anytouch_jax.view.tables import Run, Table
@@ -210,23 +208,6 @@ def test_features_show_pictures_of_given_files_only(page, features, touches, tmp
     columns = {"path": ["a.png"] * 12, "sensor": ["digit"] * 12, "sequence": ["s"] * 12, "split": ["test"] * 12}
     manifests.write(manifests.from_columns(columns | {"frame_index": list(range(12))}, other), other)
     assert client(moved, other).get("/api/sources").json()[1]["about"]["table"] is None
-
-
-def test_pickled_arrays_are_refused(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return os.mkdir, (str(tmp_path / "sprung"),)
-
-    trap = np.array([Trap()], object)
-    np.savez(tmp_path / "a.npz", features=np.eye(2, dtype="f4"), rows=np.arange(2), **{"key/object": trap})
-    (tmp_path / "b.npz").write_bytes(pickle.dumps(Trap()))
-    for name in "ab":
-        with pytest.raises(UserError, match="features file"):
-            server.open_sources([tmp_path / f"{name}.npz"])
-    assert not (tmp_path / "sprung").exists()
-    save_npz(tmp_path / "c.npz", Features(np.eye(2, dtype="f4"), np.array([0.5, 1]), {}), {})
-    with pytest.raises(UserError, match=r"rows \(n,\)"):
-        server.open_sources([tmp_path / "c.npz"])
 
 
 def test_text_of_files_stays_text(page):

@@ -10,11 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from places import SHARED
-
-# The golden vectors lie next to the checkout, where they are present; every other test makes its own files.
-GOLDEN = SHARED / "golden"
-collect_ignore = [] if GOLDEN.is_dir() else ["test_golden_weights.py"]
 
 KINDS = {"f8": "Double", "f4": "Float", "f2": "Half", "i8": "Long", "i4": "Int", "u1": "Byte", "b1": "Bool"}
 
@@ -125,24 +120,13 @@ def legacy_bytes(content: Any) -> bytes:
     return b"".join([*head, body, keys, *raw])
 
 
-@dataclass(frozen=True)
-class TorchFiles:
-    """What the tests build torch files with."""
+@pytest.fixture
+def write_torch(tmp_path: Path) -> Callable[..., Path]:
+    """write_torch(content, name): write a file as torch.save does."""
 
-    folder: Path
-    tensor: Callable[..., Any] = tensor
-    Tensor: Any = Tensor
-    Call: Any = Call
-    Global: Any = Global
-    zip_bytes: Callable[..., bytes] = zip_bytes
-    legacy_bytes: Callable[..., bytes] = legacy_bytes
-
-    def write(self, content: Any, name: str = "weights.pth", *, legacy: bool = False, order: str = "little") -> Path:
-        path = self.folder / name
+    def write(content: Any, name: str = "weights.pth", *, legacy: bool = False, order: str = "little") -> Path:
+        path = tmp_path / name
         path.write_bytes(legacy_bytes(content) if legacy else zip_bytes(content, order=order))
         return path
 
-
-@pytest.fixture
-def torch_files(tmp_path: Path) -> TorchFiles:
-    return TorchFiles(tmp_path)
+    return write

@@ -7,7 +7,6 @@ from weights_world import DECODER_TOKENS, MLP, NO_LORA, STAGE1, STAGE2, assert_s
 
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.errors import UserError
-from anytouch_jax.weights import keymaps
 from anytouch_jax.weights.convert import detect_layout, to_params, to_release
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.safetensors import WeightsError
@@ -165,12 +164,3 @@ def test_own_names_are_read_too(model):
         to_params(flat | {"bogus/kernel": np.zeros(2), "Touch/scale": np.zeros(2)}, model)
     with pytest.raises(UserError, match=r"missing keys.*touch/class_token"):
         to_params({name: array for name, array in flat.items() if name != "touch/class_token"}, model)
-
-
-def test_the_frames_of_a_kernel_keep_their_order():
-    """(D, frame * colour, row, col) of other families, as (frames, row * col * colour, D)."""
-    weight = np.random.default_rng(0).standard_normal((5, 6, 4, 4))
-    read, write = keymaps._KINDS["frames"][0][2:4]
-    for frame, kernel in enumerate(read(weight)):
-        np.testing.assert_array_equal(kernel, weight[:, 3 * frame :][:, :3].transpose(2, 3, 1, 0).reshape(-1, 5))
-    np.testing.assert_array_equal(write(read(weight)), weight)

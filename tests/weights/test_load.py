@@ -20,10 +20,11 @@ from weights_world import (
 from anytouch_jax.config import SENSORS, UNIVERSAL, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights.compatible import match_sensors, resize_position, serve_unseen
+from anytouch_jax.weights.compatible import resize_position
 from anytouch_jax.weights.convert import to_params, to_release
 from anytouch_jax.weights.load import first_params, load_init, load_model, read_weights
 from anytouch_jax.weights.safetensors import MODEL_KEY, export_safetensors, write_safetensors
+from tests.weights.conftest import tensor
 
 TRAINED = ["digit", "gelsight_mini"]
 
@@ -229,25 +230,25 @@ def test_clip_starts_the_touch_encoder(layout, own):
     assert_same({"fresh": fresh}, {"fresh": params_of(model, seed=1)})  # the given tree is not written to
 
 
-def test_files_of_every_kind_hold_the_same(torch_files, tmp_path):
+def test_files_of_every_kind_hold_the_same(write_torch, tmp_path):
     weights = weights_of(STAGE1)
     params = to_params(weights, STAGE1)
     write_safetensors(tmp_path / "w.safetensors", {k: v.T.copy().T for k, v in weights.items()}, {"source": "test"})
     np.savez(tmp_path / "w.npz", **weights)
-    torch_files.write({"model": {key: torch_files.tensor(value) for key, value in weights.items()}}, "w.pth")
-    torch_files.write({key: torch_files.tensor(value) for key, value in weights.items()}, "w.bin", legacy=True)
+    write_torch({"model": {key: tensor(value) for key, value in weights.items()}}, "w.pth")
+    write_torch({key: tensor(value) for key, value in weights.items()}, "w.bin", legacy=True)
     for name in ("w.safetensors", "w.npz", "w.pth", "w.bin"):
         assert_same(to_params(read_weights(tmp_path / name), STAGE1), params)
     assert not list(tmp_path.glob(".*"))  # no leftovers of the atomic write
 
 
 @pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod.", "model.", "model._orig_mod."])
-def test_prefixes_are_removed_in_every_format(torch_files, tmp_path, prefix):
+def test_prefixes_are_removed_in_every_format(write_torch, tmp_path, prefix):
     weights = {f"{prefix}{key}": value for key, value in weights_of(STAGE1).items()}
     write_safetensors(tmp_path / "w.safetensors", weights, {})
     np.savez(tmp_path / "w.npz", **weights)
-    content = {"state_dict_ema": {key: torch_files.tensor(value) for key, value in weights.items()}, "epoch": 3}
-    torch_files.write(content, "w.ckpt")
+    content = {"state_dict_ema": {key: tensor(value) for key, value in weights.items()}, "epoch": 3}
+    write_torch(content, "w.ckpt")
     for name in ("w.safetensors", "w.npz"):
         assert_same(read_weights(tmp_path / name), weights_of(STAGE1))
     with pytest.warns(UserWarning, match=r"w\.ckpt has no plain weights.*state_dict_ema"):
@@ -310,20 +311,3 @@ def test_equal_to_torch(expected):
     assert resized.dtype == np.float32
     np.testing.assert_array_equal(resized[0], table[0])  # the class token's row
     np.testing.assert_allclose(resized[1:], np.stack([flat, -flat], 1), atol=1e-6)
-
-
-def test_rows_of_sensors_go_by_name():
-    table = np.arange(6.0).reshape(3, 2)
-    stored, wanted = ("digit", "gelsight", UNIVERSAL), ("gelsight", "my_gel", UNIVERSAL, "digit")
-    np.testing.assert_array_equal(match_sensors(table, stored, wanted), table[[1, 2, 2, 0]])
-
-
-@pytest.mark.parametrize("drawn", [True, False])
-def test_sensors_outside_training_get_the_universal_row_or_the_mean(drawn):
-    model = tiny_config().model
-    table = np.random.default_rng(0).normal(size=(len(model.sensors), 2, 3))
-    served = serve_unseen({"sensor_tokens": table}, model, ["digit", "gelsight"], universal_drawn=drawn)
-    rows = [model.sensors.index(name) for name in ("gelsight", "digit")]
-    expected = np.broadcast_to(table[model.universal_row] if drawn else table[rows].mean(0), table.shape).copy()
-    expected[rows] = table[rows]
-    np.testing.assert_allclose(served["sensor_tokens"], expected, atol=1e-12)

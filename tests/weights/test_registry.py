@@ -3,7 +3,6 @@ from pathlib import Path
 
 import huggingface_hub
 import jax
-import numpy as np
 import pytest
 
 import anytouch_jax as at
@@ -29,16 +28,6 @@ def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(registry, "FOLDER", tmp_path / "package")
     registry._packaged.cache_clear()
     return tmp_path / "package"
-
-
-def test_an_encoder_of_the_package_is_listed_and_loaded_by_name(packaged, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert at.list_encoders() == ["little"]
-    encoder = at.load_encoder("little")
-    assert encoder.source == "little"
-    assert {np.asarray(leaf).dtype for leaf in jax.tree.leaves(encoder.params)} == {np.dtype(np.float32)}
-    side = encoder.config.model.image_size
-    assert np.isfinite(encoder.encode_touch(np.zeros((side, side, 3), np.uint8), "digit")).all()
 
 
 def test_a_name_comes_before_a_folder_of_that_name(packaged, tmp_path, monkeypatch):

@@ -31,7 +31,7 @@ def test_equal_weights_and_metadata_are_equal_bytes(tmp_path):
     assert metadata == notes and arrays["x"].tolist() == [0, 1, 2, 3, 4]
 
 
-def test_half_precision_becomes_float32(tmp_path, torch_files):
+def test_half_precision_becomes_float32(tmp_path):
     values = np.array([1.0, -2.5, 3.140625], "f4")
     for kind in (np.float16, ml_dtypes.bfloat16):
         write_safetensors(tmp_path / "h.safetensors", {"x": values.astype(kind), "ids": np.arange(3)}, {})
@@ -77,11 +77,7 @@ def test_a_name_that_is_used_twice_is_an_error():
 
 
 def test_interpolate():
-    first, second = {"a": {"x": np.zeros(3)}}, {"a": {"x": np.full(3, 4.0)}, "b": np.ones(2)}
-    middle = interpolate(first, second, 0.25)
-    np.testing.assert_array_equal(middle["a"]["x"], np.ones(3))
-    np.testing.assert_array_equal(middle["b"], np.ones(2))  # only `second` has it
-    for share, end in ((0, first), (1, second)):
-        np.testing.assert_array_equal(interpolate(first, second, share)["a"]["x"], end["a"]["x"])
+    middle = interpolate({"a": np.zeros(3)}, {"a": np.full(3, 4.0), "b": np.ones(2)}, 0.25)
+    assert middle["a"].tolist() == [1, 1, 1] and middle["b"].tolist() == [1, 1]  # one that only the second has
     with pytest.raises(UserError, match=r"a has shape \(3,\) in one and \(2,\)"):
         interpolate({"a": np.zeros(3)}, {"a": np.zeros(2)}, 0.5)

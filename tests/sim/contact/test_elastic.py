@@ -33,31 +33,6 @@ def test_convolution_is_the_sum(shape):
     np.testing.assert_allclose(odd.ravel(), dense(mixed, shape, odd=True) @ field.ravel(), atol=1e-12)
 
 
-def test_fft_and_matrix_products_agree(monkeypatch):
-    shape = (16, 12)
-    field = jnp.asarray(np.random.default_rng(1).normal(size=shape), jnp.float32)
-    coefficients = elastic.normal_coefficients(*shape)
-
-    def convolved():
-        plan = Plan(*shape)
-        return plan.inverse(plan.even(plan.forward(field), jnp.asarray(plan.spectrum(coefficients), jnp.float32)))
-
-    product = convolved()
-    monkeypatch.setattr(elastic, "MATMUL_LIMIT", 0)
-    np.testing.assert_allclose(convolved(), product, atol=2e-5)
-
-
-def test_tangential_coefficients_are_cerrutis_in_the_far_field():
-    xx, xy, yy = elastic.tangential_coefficients(40, 40, POISSON)
-    x, y = 25, 12
-    r, ratio = np.hypot(x, y), POISSON / (1 - POISSON)
-    assert xx[y, x] == pytest.approx((1 / r + ratio * x**2 / r**3) / np.pi, rel=1e-3)
-    assert yy[y, x] == pytest.approx((1 / r + ratio * y**2 / r**3) / np.pi, rel=1e-3)
-    assert xy[y, x] == pytest.approx(ratio * x * y / r**3 / np.pi, rel=1e-3)
-    np.testing.assert_allclose(xx, yy.T, atol=1e-13)
-    np.testing.assert_allclose(xy[0], 0, atol=1e-13)
-
-
 def moved_by_a_wave(thickness, poisson):
     """(along, into the layer) that a load cos(x) moves the surface of a bonded layer of E* = 1: plane strain's ODEs in
     depth for (u, w, shear, normal stress), with shear and normal stress 0 and -1 above, and no motion below."""

@@ -5,7 +5,6 @@ import cv2
 import numpy as np
 import pytest
 
-from anytouch_jax.sim.sensing import photo
 from anytouch_jax.sim.sensing.photo import EXTENT, photograph
 from anytouch_jax.sim.world.objects import catalogue, draw_object
 
@@ -64,15 +63,3 @@ def test_textures_can_be_seen(texture):
     for seed in range(3):
         received = [fineness(photograph(t, (0.0, 0.0), np.random.default_rng(seed), 160)) for t in (plain, structured)]
         assert received[1] > 1.6 * received[0]
-
-
-@pytest.mark.parametrize("place", [(0.0, 0.0), (4.0, -3.0), (-2.0, 5.0)])
-def test_the_middle_ray_meets_the_place(place):
-    for seed in range(4):
-        view = photo._draw_view(np.random.default_rng(seed))
-        x, y, z, ray = photo._trace(BALL.shape, np.array(place), view, 65)
-        assert (x[32, 32], y[32, 32]) == pytest.approx(place, abs=0.15)
-        assert z[32, 32] == pytest.approx(math.sqrt(64 - place[0] ** 2 - place[1] ** 2) - 8, abs=0.15)
-        np.testing.assert_allclose(np.linalg.norm(ray, axis=0), 1, rtol=1e-5)
-        far = np.hypot(x[0] - x[-1], y[0] - y[-1])  # from the upper to the lower border, on the table
-        assert far.min() > 0.8 * view.extent and far.max() < 2.2 * view.extent

@@ -34,13 +34,6 @@ def test_an_untouched_gel_is_neither_black_nor_burnt_and_has_colours(name):
         assert base.reshape(-1, 3).std(0).min() > 0.01, "every channel varies over the image"
 
 
-def test_no_two_families_look_alike():
-    small = [sensors.bases(SENSORS[n])[0, ::8, ::8][:4, :4] for n in CAMERAS]
-    for i in range(len(small)):
-        for j in range(i):
-            assert np.abs(small[i] - small[j]).mean() > 0.03, (CAMERAS[i], CAMERAS[j])
-
-
 def test_a_digit_shades_as_in_real_pictures():
     """Real DIGITs show the flank that faces up orange, the one that faces down blue, the right one green."""
     model = sensors.look(DIGIT)
@@ -81,15 +74,3 @@ def test_units_stay_inside_the_field_and_carry_markers_by_share():
     assert not any(sensors.draw_unit(DIGIT, rng).marked for _ in range(20)), "a DIGIT has no markers"
     assert all(a.dtype == np.float32 for a in drawn[0])
     assert np.std([u.base.mean() for u in drawn]) > 0.005, "units are untouched gels of several real ones"
-
-
-def test_the_mounting_and_its_inverse():
-    unit = sensors.draw_unit(DIGIT, np.random.default_rng(7))
-    x, y = jnp.array([0.0, 3.0, -2.0]), jnp.array([0.0, 1.0, 5.0])
-    back = sensors.gel_to_object(unit, x, y)
-    there = np.stack(sensors.rotated(*back, unit.rotation)) + unit.offset[:, None]
-    np.testing.assert_allclose(there, np.stack([x, y]), atol=1e-5)
-    np.testing.assert_allclose(sensors.gel_to_object(unit, *unit.offset), [0, 0], atol=1e-6)
-    quarter = sensors.identity_unit(DIGIT)._replace(rotation=np.float32(np.pi / 2))
-    np.testing.assert_allclose(sensors.gel_to_object(quarter, jnp.array(0.0), jnp.array(1.0)), [1, 0], atol=1e-6)
-    np.testing.assert_array_equal(sensors.gel_to_object(sensors.identity_unit(DIGIT), x, y), [x, y])

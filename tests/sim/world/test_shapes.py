@@ -10,7 +10,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim.scene import Scenes, draw_touch
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import catalogue
-from anytouch_jax.sim.world.shapes import PRIMITIVES, Shape, base, floor, height, layers, relief, unroll
+from anytouch_jax.sim.world.shapes import PRIMITIVES, Shape, base, floor, height, relief
 from anytouch_jax.sim.world.textures import TEXTURES
 
 
@@ -59,16 +59,6 @@ def test_the_thread_winds():
     moved = pitch * math.asin(x / 4) / (2 * math.pi)
     side = height(shape, np.full(200, x), y + moved) - (math.sqrt(16 - x * x) - 4)
     np.testing.assert_allclose(side, crest, atol=1e-9)
-
-
-@pytest.mark.parametrize("primitive", ["sphere", "cylinder", "edge", "ring"])
-def test_the_texture_rides_on_the_primitive(primitive):
-    shape = Shape(primitive, "dots", 6.0, 1.4, 0.3, seed=2, grain="grit", grain_depth=0.04, texture_angle=0.4)
-    x, y = axes(40, 0.2)
-    texture, grain = layers(shape, *unroll(shape, x, y))
-    want = base(shape, x, y) - 0.3 * (1 - texture) - 0.04 * (1 - grain)
-    np.testing.assert_allclose(height(shape, x, y), want, atol=1e-12)
-    assert np.ptp(texture) > 0.9 and np.ptp(grain) > 0.8
 
 
 @pytest.mark.parametrize("primitive", PRIMITIVES)

@@ -44,12 +44,11 @@ def test_a_threshold_moves_the_border_in_marks_check_and_picture(anytouch, press
     ("words", "named"),
     [
         (["--out", "touch.parquet"], "touch.parquet"), (["--out", "m.json"], "m.json"),
-        (["--out", "mine.csv"], "mine.csv"), (["--threads", "0"], "--threads"),
-        (["--drop", "--threshold", "digit", "999"], "contact"), (["--threshold", "gelsight", "5"], "'gelsight'"),
+        (["--out", "mine.csv"], "mine.csv"),
+        (["--drop", "--threshold", "digit", "999"], "contact"),
         (["--check", "--reference", "label.depth"], "label.depth"), (["--reference", "label.force"], "--reference"),
         (["--check", "--reference", "label.force", "--above", "nan"], "--above"), (["--check", "--drop"], "--drop"),
-        (["--share", "60"], "--share"), (["--threshold", "gelsigth", "5"], "gelsigth"),
-        (["--background", "wide.png"], "wide.png"),
+        (["--threshold", "gelsigth", "5"], "gelsigth"), (["--background", "wide.png"], "wide.png"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, named):
@@ -63,14 +62,12 @@ def test_mistakes_are_one_sentence(mistake, pressed, monkeypatch, words, named):
 
 
 def test_marks_that_are_known_are_kept_reported_and_cannot_be_moved(anytouch, mistake, pressed, tmp_path, monkeypatch):
-    known = ["False", "True", None, *["0"] * 7]
+    known = ["False", "True", *["0"] * 8]
     words = edit(tmp_path / "words.csv", pressed, **{"label.contact": known})
     done = anytouch("data", "contact", words, "--out", tmp_path / "m.parquet")
-    assert done.status == 0 and contacts(tmp_path / "m.parquet") == [0, 1, 0, *[0] * 7]
-    done = anytouch("data", "contact", tmp_path / "m.parquet")
     assert done.status == 0 and "10 rows keep the label.contact that they had" in done.out
-    known[4] = "yes"
-    named = mistake("data", "contact", edit(words, pressed, **{"label.contact": known}))
+    assert contacts(tmp_path / "m.parquet") == [0, 1, *[0] * 8]
+    named = mistake("data", "contact", edit(words, pressed, **{"label.contact": [*known[:4], "yes", *known[5:]]}))
     assert "line 6 of" in named and "'yes'" in named
     scores = "anytouch_jax.data.prepare.contact.contact_scores"
     monkeypatch.setattr(scores, lambda *_, **__: pytest.fail("scored in vain"))

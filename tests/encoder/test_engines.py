@@ -96,17 +96,6 @@ def test_int8_is_calibrated_on_the_touches(exported, encoder, calibration):
     assert np.abs(engines.session(other)(*calibration) - live).max() / np.abs(live).max() > 2 * error
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of forks, by packages that OpenVINO imports
-def test_openvino_gives_the_same_features(exported, encoder):
-    pytest.importorskip("openvino")
-    for path, tolerance in zip(exported, (1e-5, 0.1), strict=True):
-        for count in (1, 5):
-            live = encoder.encode_touch(CLIPS[:count, :3], ROWS[:count])
-            run = load(path, "openvino")
-            assert np.abs(run(CLIPS[:count, :3], ROWS[:count]) - live).max() < tolerance * np.abs(live).max()
-
-
 def test_what_cannot_be_run_is_one_sentence(exported, encoder, calibration, tmp_path, monkeypatch):
     own = load_encoder(exported[0])
     clips = CLIPS[:, :3]

@@ -178,17 +178,11 @@ def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"rows": None}, "rows"), ({"rows": np.arange(12) + 1000}, "rows"), ({"rows": np.zeros(12, int)}, "rows"),
-    ({"features": np.array(["a"] * 12)}, "features"), ({"features": np.full((12, 4), np.nan)}, "not finite"),
-    ({"features": np.ones((12, 0))}, "no columns"), ({"key/path": np.array(["x.png"] * 3)}, "keys"),
-    ({"key/path": np.array(["x.png"] * 12)}, "manifest"),
-    ({"about/frames": np.array("3")}, "--frames 3"), ({}, "lacks 3 "),
+    ({"rows": np.arange(12) + 1000}, "rows"), ({"rows": np.zeros(12, int)}, "rows"), ({}, "lacks 3 "),
+    ({"key/path": np.array(["x.png"] * 12)}, "manifest"), ({"about/frames": np.array("3")}, "--frames 3"),
 ])  # fmt: skip
 def test_a_features_file_that_does_not_fit_is_refused(pictures, tmp_path, change, words):
     arrays = {"features": np.ones((12, 4)), "rows": np.arange(12)} | change
-    np.savez(tmp_path / "odd.npz", **{name: array for name, array in arrays.items() if array is not None})
+    np.savez(tmp_path / "odd.npz", **arrays)
     with pytest.raises(UserError, match=f"odd.npz.*{words}"):
         feature_cache.file_features(tmp_path / "odd.npz", pictures).get(np.arange(15)[:, None], 1)
-    (tmp_path / "odd.npz").write_bytes(b"no npz")
-    with pytest.raises(UserError, match="odd"):
-        feature_cache.file_features(tmp_path / "odd.npz", pictures)

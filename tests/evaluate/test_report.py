@@ -124,7 +124,6 @@ def test_the_demo_report_holds_everything(demo: tuple[Path, list[str]]) -> None:
         "probes.png",
     ]  # fmt: skip
     assert "| test | 360 | 30 | 10 | digit, gelsight, gelslim |" in text
-    assert re.search(r"^\| hidden patches \| \d\.\d{4} \| \d\.\d{4} \|$", text, re.MULTILINE)
     assert re.search(r"^\| next frame \| \d\.\d{4} \| \d\.\d{4} \|$", text, re.MULTILINE)
     assert str(path) in said[-1] and not any(one.name.startswith(".") for one in path.parent.rglob("*"))
     assert "roughness: the manifest has no column label.roughness" in text

@@ -44,16 +44,6 @@ class Ros:
             def destroy_node(self):
                 ros.destroyed = True
 
-        class Bool:
-            def __init__(self, *, data: bool) -> None:
-                assert type(data) is bool
-                self.data = data
-
-        class Float32MultiArray:
-            def __init__(self, *, data: list) -> None:
-                assert all(type(value) is float for value in data)
-                self.data = data
-
         def message(title: str, /, **kinds: type) -> type:
             """A message of ROS: keyword arguments alone, each of its own type."""
 
@@ -64,7 +54,11 @@ class Ros:
 
             return type(title, (), {"__init__": init, "FLOAT32": 7})
 
-        three = dict.fromkeys("xyz", float)
+        three, Bool, Float32MultiArray = (
+            dict.fromkeys("xyz", float),
+            message("Bool", data=bool),
+            message("List", data=list),
+        )
         Vector3, Header = message("Vector3", **three), message("Header", stamp=str, frame_id=str)
         Wrench = message("Wrench", force=Vector3, torque=Vector3)
         WrenchStamped = message("WrenchStamped", header=Header, wrench=Wrench)

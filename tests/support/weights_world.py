@@ -72,42 +72,23 @@ def write_heads(folder: Path, model: ModelConfig) -> None:
     (folder / "config.json").write_text(json.dumps({"model": settings}))
 
 
-def openclip_of(params, model: ModelConfig) -> dict[str, np.ndarray]:
-    """OpenCLIP's names and layouts, written down a second time."""
-    weights = {"logit_scale": params["logit_scale"], "attn_mask": np.zeros((7, 7), "f4")}
-    towers = {
-        "visual.": (
-            "image", model.image, {"class_embedding": "class_token", "positional_embedding": "position"}, "visual.proj",
-        ),
-        "": (
-            "text", model.text.stack, {"token_embedding.weight": "token", "positional_embedding": "position"},
-            "text_projection",
-        ),
-    }  # fmt: skip
-    for prefix, (part, stack, tables, projection) in towers.items():
-        tower = params[part]
-        weights |= {prefix + key: tower[name] for key, name in tables.items()}
-        weights[projection] = tower["projection"]["kernel"]
-        norms = {"ln_pre": "pre_norm", "ln_post": "post_norm"} if prefix else {"ln_final": "final_norm"}
-        for key, name in norms.items():
-            weights |= {f"{prefix}{key}.weight": tower[name]["scale"], f"{prefix}{key}.bias": tower[name]["bias"]}
-        for layer in range(stack.depth):
-            block = f"{prefix}transformer.resblocks.{layer}."
-            rows = tower["blocks"]
-            attention = rows["attention"]
-            qkv = [attention[name] for name in ("query", "key", "value")]
-            weights[f"{block}attn.in_proj_weight"] = np.concatenate([dense["kernel"][layer].T for dense in qkv])
-            weights[f"{block}attn.in_proj_bias"] = np.concatenate([dense["bias"][layer] for dense in qkv])
-            dense = {
-                "attn.out_proj": attention["out"], "mlp.c_fc": rows["mlp"]["up"], "mlp.c_proj": rows["mlp"]["down"],
-            }  # fmt: skip
-            for key, leaf in dense.items():
-                weights |= {f"{block}{key}.weight": leaf["kernel"][layer].T, f"{block}{key}.bias": leaf["bias"][layer]}
-            for key, name in {"ln_1": "norm1", "ln_2": "norm2"}.items():
-                weights |= {
-                    f"{block}{key}.weight": rows[name]["scale"][layer],
-                    f"{block}{key}.bias": rows[name]["bias"][layer],
-                }
-    kernel = params["image"]["patch"]["kernel"]
-    weights["visual.conv1.weight"] = kernel.reshape(14, 14, 3, -1).transpose(3, 2, 0, 1)
+OPENCLIP = {
+    "vision_model.": "visual.", "text_model.": "", "embeddings.": "", "encoder.layers": "transformer.resblocks",
+    "self_attn": "attn", "pre_layrnorm": "ln_pre", "post_layernorm": "ln_post", "final_layer_norm": "ln_final",
+    "layer_norm": "ln_", "mlp.fc1": "mlp.c_fc", "mlp.fc2": "mlp.c_proj", "patch_embedding": "conv1",
+    "position_embedding.weight": "positional_embedding", "visual_projection.weight": "visual.proj",
+    "text_projection.weight": "text_projection",
+}  # fmt: skip
+
+
+def openclip_of(clip: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of CLIP by Hugging Face under the names and in the layouts of OpenCLIP."""
+    weights = {"attn_mask": np.zeros((7, 7), "f4")}
+    for key, array in clip.items():
+        for theirs, ours in OPENCLIP.items():
+            key = key.replace(theirs, ours)
+        weights[key] = array.T if key in ("visual.proj", "text_projection") else array
+    for key in [key for key in weights if "q_proj." in key]:
+        thirds = [weights.pop(key.replace("q_proj", part)) for part in ("q_proj", "k_proj", "v_proj")]
+        weights[key.replace("q_proj.", "in_proj_")] = np.concatenate(thirds)
     return weights

@@ -107,7 +107,7 @@ def test_hf_and_open_clip_agree():
     weights = weights_of(STAGE2, "clip")
     params = to_params(weights, STAGE2)
     assert set(params) == {"image", "text", "logit_scale"}
-    other = openclip_of(params, STAGE2)
+    other = openclip_of(weights)
     assert detect_layout(other) == "openclip" and detect_layout(weights) == "clip"
     assert_same(to_params(other, STAGE2), params)
     no_text = replace(STAGE2, text=None)
@@ -132,7 +132,7 @@ def test_a_probe_file_gives_encoder_and_classifier():
 @pytest.mark.parametrize("layout", ["stage1", "stage2", "clip", "openclip", "probe"])
 def test_detects_the_model(layout):
     model = DECODER_TOKENS if layout == "stage1" else STAGE2
-    weights = weights_of(model, layout) if layout != "openclip" else openclip_of(params_of(model), model)
+    weights = openclip_of(weights_of(model, "clip")) if layout == "openclip" else weights_of(model, layout)
     detected = detect_model(weights, {"touch": 4, "image": 4, "decoder": 2, "text": 2})
     alone = {"decoder": Stack(512, 8, 16, 2048), "match_head": "none", "lora_rank": 0}
     expected = {"clip": replace(model, **alone), "probe": replace(STAGE1, **alone)}

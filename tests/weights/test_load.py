@@ -213,7 +213,7 @@ def test_clip_weights_of_another_activation_are_refused(tmp_path, file, content,
 def test_clip_starts_the_touch_encoder(layout, own):
     clip = weights_of(STAGE2, "clip")
     tower = to_params(clip, STAGE2)
-    weights = clip if layout == "clip" else openclip_of(tower, STAGE2)
+    weights = clip if layout == "clip" else openclip_of(clip)
     model = replace(STAGE1, patch_encoder="sensor" if own else "shared")
     fresh = params_of(model, seed=1)
     params = first_params(fresh, model, clip=weights)

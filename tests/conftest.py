@@ -55,7 +55,6 @@ def compiled_once(tmp_path_factory):
         "jax_persistent_cache_min_compile_time_secs": 0.1,
         "jax_persistent_cache_min_entry_size_bytes": -1,
     }
-    before = {name: getattr(jax.config, name) for name in settings}
     for name, value in settings.items():
         jax.config.update(name, value)
     with pytest.MonkeyPatch.context() as patch:
@@ -63,8 +62,6 @@ def compiled_once(tmp_path_factory):
         for name, value in (settings | {"jax_compilation_cache_dir": enable_compilation_cache()}).items():
             patch.setenv(name.upper(), str(value))  # for child processes
         yield
-    for name, value in before.items():
-        jax.config.update(name, value)
 
 
 @pytest.fixture(scope="module", autouse=True)

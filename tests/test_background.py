@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from checked_world import columns
 from faulty_camera import Film
-from tiny_models import tiny_config
 from touch_world import make_touches
 
 from anytouch_jax.cli.app import main
@@ -23,7 +22,6 @@ from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.encoder.novelty import ContactGate
 from anytouch_jax.encoder.stream import stream
 from anytouch_jax.errors import UserError
-from anytouch_jax.pretrain import pretrain
 from experiments.pouring import policy
 
 RNG = np.random.default_rng(0)
@@ -195,22 +193,6 @@ def test_training_leaves_out_the_rows_of_a_sensor_of_few_frames(touches):
     assert left_out in Loader(holed, config).notes
     with pytest.raises(manifests.ManifestError, match=r"row 0 of .* and 2 other rows have no picture.*Record 5 frames"):
         Loader(manifests.select_rows(holed, rows[:3]), config)
-
-
-def test_a_converted_run_still_knows_how_it_saw(touches, tmp_path):
-    config = replace(tiny_config(1), data=settings(touches).data)
-    pretrain(replace(config, run=replace(config.run, steps=2, save_every=2, figure_every=0)), tmp_path / "r", log=str)
-    names = ("r", "w.safetensors", "o.safetensors")
-    for to, model, out in zip(("release", "safetensors"), names[:2], names[1:], strict=True):
-        words = ["export", "--to", to, "--model", str(tmp_path / model), "--out", str(tmp_path / out)]
-        assert main(words) == 0
-    run, *files = (load_encoder(tmp_path / name) for name in names)
-    clips = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
-    for one in files:
-        assert one.subtracts and run.subtracts
-        rows = (config.model.sensors.index(name) for name in ("digit", "duragel", "universal"))
-        for sensor in (np.full(2, row) for row in rows):  # duragel was not trained on
-            np.testing.assert_allclose(one.encode_touch(clips, sensor), run.encode_touch(clips, sensor), atol=1e-6)
 
 
 def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):

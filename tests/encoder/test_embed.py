@@ -5,7 +5,7 @@ import anytouch_jax as at
 from anytouch_jax.config import SENSORS
 from anytouch_jax.encoder import search
 from anytouch_jax.encoder.arrays import spread_lines
-from anytouch_jax.encoder.embed import embed_frames, run_in_batches
+from anytouch_jax.encoder.embed import run_in_batches
 from anytouch_jax.encoder.search import load_index
 from anytouch_jax.errors import UserError
 
@@ -30,20 +30,6 @@ def test_results_that_are_not_finite_are_refused():
     huge = RNG.standard_normal((3, 2)).astype(np.float32) * np.float32(1e30)
     with np.errstate(over="ignore"), pytest.raises(UserError, match="the features are not finite"):
         run_in_batches(lambda batch: batch * batch, huge, 2)
-
-
-def test_no_clip_spans_a_gap_or_an_unreadable_frame(encoder):
-    frames = RNG.integers(0, 256, (8, 28, 28, 3), np.uint8)
-    named = [(number, f"{number}.png", frames[i]) for i, number in enumerate((0, 1, 2, 3, 6, 7, 8, 9))]
-    features = embed_frames(encoder, named, 1, length=3, batch=2)
-    assert features.rows.tolist() == [2, 3, 6, 7] and features.skipped == 2
-    assert features.keys["path"].tolist() == ["2.png", "3.png", "8.png", "9.png"]
-    wanted = encoder.encode_touch(np.stack([frames[i - 2 : i + 1] for i in (2, 3, 6, 7)]), "digit")
-    np.testing.assert_allclose(features.values, wanted, atol=1e-5)
-    named[1] = (1, "1.png", None)
-    assert embed_frames(encoder, named, 1, length=3).rows.tolist() == [6, 7]
-    with pytest.raises(UserError, match="too few for clips of 5"):
-        embed_frames(encoder, named, 1, length=5)
 
 
 @pytest.mark.parametrize(("noise", "is_constant"), [(0.02, True), (1.0, False)])

@@ -54,11 +54,8 @@ class Ros:
 
             return type(title, (), {"__init__": init, "FLOAT32": 7})
 
-        three, Bool, Float32MultiArray = (
-            dict.fromkeys("xyz", float),
-            message("Bool", data=bool),
-            message("List", data=list),
-        )
+        Bool, Float32MultiArray = message("Bool", data=bool), message("Float32MultiArray", data=list)
+        three = dict.fromkeys("xyz", float)
         Vector3, Header = message("Vector3", **three), message("Header", stamp=str, frame_id=str)
         Wrench = message("Wrench", force=Vector3, torque=Vector3)
         WrenchStamped = message("WrenchStamped", header=Header, wrench=Wrench)

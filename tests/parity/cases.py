@@ -1,7 +1,7 @@
 """Numerical parity with the authors' PyTorch code: run every golden case of a folder through what training runs.
 
 One runner a kind of case, found by the letter its name starts with. Nothing is assembled a second time here: losses
-come from `objectives`, gradients from `jax.grad` of them, optimiser steps from `train.step`, weights from `io.release`.
+come from `objectives`, gradients from `jax.grad` of them, steps from `train.step`, weights from `weights.convert`.
 """
 
 import re

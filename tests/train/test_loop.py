@@ -315,18 +315,6 @@ def test_a_killed_run_goes_on_and_ends_as_if_undisturbed(undisturbed, tmp_path):
     assert rows(tmp_path) == rows(undisturbed[0])
 
 
-def test_a_failed_save_is_one_sentence_and_leaves_the_checkpoint_before(tmp_path, monkeypatch):
-    run(tmp_path, stop_after=3)
-
-    def full(self, step, state, metrics):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch, pytest.raises(UserError, match=r"checkpoints: No space left on device"):
-        patch.setattr(loop.Checkpoints, "save", full)
-        run(tmp_path)
-    assert run(tmp_path, stop_after=4).resumed == 3
-
-
 def test_a_full_disk_ends_a_run_before_its_first_step(tmp_path, monkeypatch):
     def no_batches(start, stop):
         raise AssertionError("no batch was needed")

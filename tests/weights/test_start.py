@@ -16,6 +16,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.families import load_start
 from tests.support.weights_world import assert_same
+from tests.weights.test_families import MAE, made
 
 OTHERS = ROOT / "tests" / "parity" / "golden_others"
 
@@ -32,22 +33,9 @@ def no_registers(source: Path, folder: Path) -> Path:
 
 def mae(folder: Path) -> Path:
     """A ViT-MAE of Hugging Face with random arrays: 28 pixels, patches of 7, width 16."""
-    rng, arrays = np.random.default_rng(3), {"decoder.mask_token": (1, 1, 8), "vit.embeddings.cls_token": (1, 1, 16)}
-    arrays |= {
-        "vit.embeddings.position_embeddings": (1, 17, 16),
-        "vit.embeddings.patch_embeddings.projection.weight": (16, 3, 7, 7),
-        "vit.embeddings.patch_embeddings.projection.bias": (16,),
-        **{f"vit.layernorm.{end}": (16,) for end in ("weight", "bias")},
-    }
-    for layer in range(2):
-        start = f"vit.encoder.layer.{layer}"
-        sizes = {"layernorm_before": (16,), "layernorm_after": (16,), "attention.output.dense": (16, 16)}
-        sizes |= {f"attention.attention.{part}": (16, 16) for part in ("query", "key", "value")}
-        sizes |= {"intermediate.dense": (32, 16), "output.dense": (16, 32)}
-        for name, shape in sizes.items():
-            arrays |= {f"{start}.{name}.weight": shape, f"{start}.{name}.bias": shape[:1]}
+    *_, arrays = made(MAE, (16, 2, 2, 32), 7, {"grid": (1, 4, 4)}, (28, 28))
     folder.mkdir()
-    save_file({k: rng.normal(0, 0.3, s).astype("f4") for k, s in arrays.items()}, folder / "model.safetensors")
+    save_file({key: np.float32(0.3) * array for key, array in arrays.items()}, folder / "model.safetensors")
     (folder / "config.json").write_text(json.dumps({"num_attention_heads": 2}))
     return folder
 

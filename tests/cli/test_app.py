@@ -223,20 +223,19 @@ def test_a_warning_of_the_library_is_a_sentence(capsys):
     assert [warning.category for warning in others] == [FutureWarning]
 
 
-@pytest.mark.parametrize("command", ["embed", "probe label", "retrieve", "export"])
+@pytest.mark.parametrize("command", ["probe label", "retrieve", "export"])
 def test_compiled_programs_are_cached_on_disk(tmp_path, world, tiny_run, anytouch, monkeypatch, command):
     from anytouch_jax.train import mesh
 
     enabled = []
     monkeypatch.setattr(mesh, "enable_compilation_cache", lambda: enabled.append(command))
     words = {
-        "embed": ("--data", world, "--out", tmp_path / "f.npz", "--head", tmp_path / "none.npz"),
         "probe label": ("--data", world, "--label", "no_such_label"),
         "retrieve": ("--data", tmp_path / "no.csv"),
         "export": ("--out", tmp_path / "f.json"),
     }
     anytouch(*command.split(), "--model", tiny_run, *words[command])
-    assert enabled == [command] or command == "embed"
+    assert enabled == [command]
 
 
 def test_mistakes(mistake, tmp_path):

@@ -17,7 +17,7 @@ from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.encoder.linear_head import load_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache
-from anytouch_jax.evaluate.feature_cache import RAW, FeatureSource, FeatureStore
+from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore
 from anytouch_jax.evaluate.probing import probe_benchmark, probe_label, probe_table, probe_tasks
 from anytouch_jax.evaluate.tasks import BENCHMARKS, TASKS, Task, label_task, select
 
@@ -47,17 +47,14 @@ def noise(rows: Any) -> np.ndarray:
 
 
 def score_tasks(
-    of: Encoder | FeatureStore | None, world: Manifest, names: Any, *, cache: Any = None, head_names: Any = ("linear",),
+    of: Encoder | FeatureStore, world: Manifest, names: Any, *, cache: Any = None, head_names: Any = ("linear",),
     protocols: Any = ("honest",), **options: Any,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Results of one source of features: an encoder, a store, or (None) raw pixels."""
-    source = (
-        FeatureSource(RAW, feature_cache.pixel_features(world, folder=cache), None, "common")
-        if of is None
-        else FeatureSource("planted", of)
-        if isinstance(of, FeatureStore)
-        else FeatureSource("encoder", feature_cache.encoder_features(of, world, folder=cache), of)
-    )
+    """Results of one source of features: an encoder or a store."""
+    if isinstance(of, FeatureStore):
+        source = FeatureSource("planted", of)
+    else:
+        source = FeatureSource("encoder", feature_cache.encoder_features(of, world, folder=cache), of)
     protocol = "published" if "published" in protocols else protocols[0]
     report = probe_tasks(
         [source], world, names, heads=head_names, protocol=protocol, controls=False, log=str, **options

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import cv2
 import pytest
+from checked_world import columns
 from gel_pictures import press
 
 from anytouch_jax.cli.app import main
@@ -50,13 +51,10 @@ def pressed(tmp_path: Path) -> Path:
     depths = [0, 0, 0, 0, 0, 0, 30, 50, 70, 90]
     for i, depth in enumerate(depths):
         cv2.imwrite(str(tmp_path / f"{i}.png"), press(depth))
-    count = len(depths)
-    columns = {
-        "path": [f"{i}.png" for i in range(count)], "sensor": ["digit"] * count, "sequence": ["s"] * count,
-        "frame_index": list(range(count)), "split": ["background"] * 2 + ["train"] * 8, "dataset": ["mine"] * count,
-        "background_path": ["0.png"] * count, "label.force": [0.1 * depth for depth in depths],
-        "license": ["MIT"] * 6 + ["CC-BY-NC-4.0"] * 3 + [None],
+    more = {
+        "split": ["background"] * 2 + ["train"] * 8, "dataset": ["mine"] * 10, "background_path": ["0.png"] * 10,
+        "label.force": [0.1 * depth for depth in depths], "license": ["MIT"] * 6 + ["CC-BY-NC-4.0"] * 3 + [None],
     }  # fmt: skip
     file = tmp_path / "touch.parquet"
-    manifests.write(manifests.from_columns(columns, file), file)
+    manifests.write(manifests.from_columns(columns(10, **more), file), file)
     return file

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from chat_server import GOOD, KEY, serve
+from checked_world import columns
 from gel_pictures import press
 
 from anytouch_jax.data.manifest import manifest as manifests
@@ -23,13 +24,10 @@ def touches(tmp_path):
     for i in range(6):
         cv2.imwrite(str(tmp_path / f"{i}.png"), press(10 * i))
         cv2.imwrite(str(tmp_path / f"see{i}.png"), rng.integers(0, 256, (24, 24, 3), np.uint8))
-    columns = {
-        "path": [f"{i}.png" for i in range(6)], "sensor": ["digit"] * 6, "sequence": [f"s{i // 2}" for i in range(6)],
-        "frame_index": [i % 2 for i in range(6)], "split": ["train"] * 6, "dataset": ["tacquad"] * 6,
-        "image_path": [f"see{i}.png" for i in range(6)],
-    }  # fmt: skip
+    more = {"dataset": ["tacquad"] * 6, "image_path": [f"see{i}.png" for i in range(6)]}
+    more |= {"sequence": [f"s{i // 2}" for i in range(6)], "frame_index": [i % 2 for i in range(6)]}
     file = tmp_path / "touch.parquet"
-    manifests.write(manifests.from_columns(columns, file), file)
+    manifests.write(manifests.from_columns(columns(6, **more), file), file)
     return file
 
 
@@ -103,10 +101,8 @@ def test_failures_are_reported_counted_and_the_rest_is_kept(anytouch, touches, t
 
 def test_captions_of_a_table_are_attached_and_nobody_is_asked(anytouch, mistake, tmp_path):
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((32, 32, 3), np.uint8))
-    columns = {"path": ["0.png"], "sensor": ["digit"], "sequence": ["s"], "frame_index": [0], "split": ["train"],
-               "caption_id": ["octopi_3"]}  # fmt: skip
     path = tmp_path / "m.csv"
-    manifests.write(manifests.from_columns(columns, path), path)
+    manifests.write(manifests.from_columns(columns(caption_id=["octopi_3"]), path), path)
     (tmp_path / "captions.csv").write_text("caption_id,text\noctopi_3,rough and hard\n")
     done = anytouch("data", "annotate", path, "--captions", tmp_path / "captions.csv", "--key", "caption_id")
     assert done.status == 0, done.err

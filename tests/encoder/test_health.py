@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from checked_world import columns
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
@@ -130,16 +131,15 @@ def test_contact_that_features_show_is_visible():
 
 
 def test_units_of_a_manifest_are_read_with_their_gaps(tmp_path):
-    rows = {name: [] for name in ("path", "sensor", "unit", "sequence", "frame_index", "split", "background_path")}
+    frames = [0, 1, 2, 4, 0, 1, 2, 3]
+    table = columns(
+        8, unit=["a"] * 8, sequence=["s0"] * 4 + ["s1"] * 4, frame_index=frames, background_path=["gel.png"] * 8
+    )
     cv2.imwrite(str(tmp_path / "gel.png"), gel()[..., ::-1])
     for number in range(8):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((120, 160, 3), 10 * number, np.uint8))
-        frame = number % 4 + (number == 3)
-        values = (f"{number}.png", "digit", "a", f"s{number // 4}", frame, "train", "gel.png")
-        for name, value in zip(rows, values, strict=True):
-            rows[name].append(value)
     (tmp_path / "0.png").write_bytes(b"damaged")
-    (unit,) = health.read_units(manifests.from_columns(rows, tmp_path / "m.parquet"))
+    (unit,) = health.read_units(manifests.from_columns(table, tmp_path / "m.parquet"))
     assert (unit.sensor, unit.unit, unit.rows, [len(r) for r in unit.recordings]) == ("digit", "a", 8, [3, 4])
     np.testing.assert_array_equal(unit.steps, [1, 1, 2, 1, 1, 1])
     np.testing.assert_array_equal(unit.background, gel())

@@ -150,32 +150,9 @@ def test_two_fingers_of_a_grasp_stand_side_by_side():
 
 
 @pytest.mark.parametrize("empty", ["", " ", "n/a", "NaN", "None", "null", "-", "?"])
-def test_an_empty_label_takes_no_part(manifest, empty):
-    full = manifests.read(manifest)
-    some, empties = ["Wood", "wood", *[empty] * (len(full) - 2)], [empty] * len(full)
-    selected = select(manifests.replace_column(full, "label.kind", some), Task("kind", "label.kind", which="all"))
+def test_an_empty_label_takes_no_part(empty):
+    some, empties = ["Wood", "wood", *[empty] * (len(WORLD) - 2)], [empty] * len(WORLD)
+    selected = select(manifests.replace_column(WORLD, "label.kind", some), Task("kind", "label.kind", which="all"))
     assert len(selected.rows) == 2 and "'Wood' and 'wood' differ only by" in selected.notes[-1]
     with pytest.raises(UserError, match=r"has a label|has no label"):
-        select(manifests.replace_column(full, "label.kind", empties), Task("kind", "label.kind", which="all"))
-
-
-COUNT = 24
-
-
-@pytest.fixture
-def manifest(tmp_path):
-    """Six objects, of two recordings of two frames: the first two have a caption in train, the third one in test."""
-    number = np.arange(COUNT)
-    split = np.where(number % 4 < 2, "train", "test")
-    objects = np.array([f"object {n // 4}" for n in number])
-    described = np.isin(objects, ["object 0", "object 1"]) & (split == "train")
-    described |= (objects == "object 2") & (split == "test")
-    columns = {
-        "path": [f"{n}.png" for n in number], "sensor": ["digit"] * COUNT, "sequence": [f"s{n // 2}" for n in number],
-        "frame_index": (number % 2).tolist(), "split": split.tolist(), "object": objects.tolist(),
-        "text": ["rough" if one else None for one in described],
-        "label.slip": ["yes" if n % 4 == 1 else "no" for n in number], "label.score": number.tolist(),
-    }  # fmt: skip
-    path = tmp_path / "manifest.csv"
-    manifests.write(manifests.from_columns(columns, path), path)
-    return path
+        select(manifests.replace_column(WORLD, "label.kind", empties), Task("kind", "label.kind", which="all"))

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from checked_world import columns
 from starlette.testclient import TestClient
 from view_world import SCRIPT
 
@@ -98,8 +99,7 @@ def test_depth_is_measured_where_the_untouched_gel_is_known(page, tmp_path):
     assert np.ptp(surface.max(2) - surface.min(2)) <= 2 and surface.max() > 60  # grey
     assert "x-fields" not in page.get("/api/0/frame/2?layer=contact").headers
     cv2.imwrite(str(tmp_path / "0.png"), np.full((32, 48, 3), 90, np.uint8))
-    columns = {"path": ["0.png"], "sensor": ["mine"], "sequence": ["s"], "frame_index": [0], "split": ["test"]}
-    manifests.write(manifests.from_columns(columns, tmp_path / "m.csv"), tmp_path / "m.csv")
+    manifests.write(manifests.from_columns(columns(sensor=["mine"]), tmp_path / "m.csv"), tmp_path / "m.csv")
     unknown = client(tmp_path / "m.csv").get("/api/0/frame/0?layer=depth")  # one frame shows no untouched gel
     assert picture(unknown).shape == (32, 48, 3) and "x-fields" not in unknown.headers
 
@@ -163,11 +163,8 @@ def test_nothing_outside_is_served(tmp_path, touches):
     os.symlink(secret, inside / "link.png")
     os.symlink(tmp_path, inside / "up")
     paths = ["../secret.png", str(secret), "link.png", "up/secret.png"]
-    columns = {
-        "path": paths, "sensor": ["digit"] * 4, "sequence": list("abcd"), "frame_index": [0] * 4, "split": ["test"] * 4,
-        "image_path": paths, "background_path": paths,
-    }  # fmt: skip
-    manifests.write(manifests.from_columns(columns, inside / "m.csv"), inside / "m.csv")
+    table = columns(4, path=paths, sequence=list("abcd"), image_path=paths, background_path=paths)
+    manifests.write(manifests.from_columns(table, inside / "m.csv"), inside / "m.csv")
     page = client(inside / "m.csv")
     for row in range(4):
         for kind in ("frame", "photo"):
@@ -205,8 +202,7 @@ def test_features_show_pictures_of_given_files_only(page, features, touches, tmp
     assert [one["kind"] for one in client(moved).get("/api/sources").json()] == ["space"]
     assert client(moved, touches).get("/api/sources").json()[1]["about"]["table"] == 0
     other = tmp_path / "other.csv"
-    columns = {"path": ["a.png"] * 12, "sensor": ["digit"] * 12, "sequence": ["s"] * 12, "split": ["test"] * 12}
-    manifests.write(manifests.from_columns(columns | {"frame_index": list(range(12))}, other), other)
+    manifests.write(manifests.from_columns(columns(12, path=["a.png"] * 12), other), other)
     assert client(moved, other).get("/api/sources").json()[1]["about"]["table"] is None
 
 

@@ -24,10 +24,6 @@ NOISE = RNG.random((4, 16)).astype("f4")
 KEY = jax.random.key(3)
 
 
-def pixels(*shape):
-    return RNG.integers(0, 256, (*shape, 28, 28, 3), np.uint8)
-
-
 def floats(*shape):
     return RNG.standard_normal((*shape, 28, 28, 3)).astype("f4")
 
@@ -114,11 +110,7 @@ def align_batch():
     return AlignBatch(floats(4, 3), SENSOR, floats(3), rows[0], text, mask, rows[1])
 
 
-def match_batch():
-    return MatchBatch(floats(4, 1), SENSOR, floats(4, 1), SENSOR[::-1], floats(4, 1), SENSOR)
-
-
-ALIGN, MATCH = align_batch(), match_batch()
+ALIGN, MATCH = align_batch(), MatchBatch(floats(4, 1), SENSOR, floats(4, 1), SENSOR[::-1], floats(4, 1), SENSOR)
 PAPER2 = replace(CONFIG2, objective=replace(CONFIG2.objective, center_embeddings=False))  # Eq. 4 as it stands
 FUNCTION2 = partial(objectives.stage2_terms, noise=None, net=NET2, config=PAPER2)
 embed = jax.jit(partial(objectives.touch_embeddings, net=NET2))
@@ -299,7 +291,7 @@ def test_the_draw_of_universal_tokens(monkeypatch):
 
 
 def test_at_the_start_no_universal_token_is_touched():
-    batch = TouchBatch(pixels(2, 1), np.asarray([0, 3], np.int32))
+    batch = TouchBatch(RNG.integers(0, 256, (2, 1, 28, 28, 3), np.uint8), np.asarray([0, 3], np.int32))
     loss = jax.jit(jax.grad(lambda *a: objectives.stage1_loss(*a, net=NET1, config=CONFIG1), has_aux=True))
     for progress, used in ((0.0, [0, 3]), (1e6, [9])):
         grad, metrics = loss(PARAMS1, batch, KEY, np.float32(progress))

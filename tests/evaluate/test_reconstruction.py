@@ -86,17 +86,11 @@ def cells(image):
     return grid[:, :, :28, :28]
 
 
-def hidden_pixels(clip, seed=0):
-    """Which pixels (B, 28, 28) the figure hides, by the same draw."""
-    noise = jax.random.uniform(jax.random.key(seed), (len(clip), 16))
-    hidden = np.asarray(mask(noise, 4)[2]).reshape(-1, 4, 4)
-    return np.repeat(np.repeat(hidden, 7, axis=1), 7, axis=2)
-
-
 def test_a_clip_is_shown_with_its_mask_reconstruction_and_next_frame():
     grid = cells(reconstruction_panels(PARAMS, CLIP, SENSOR, net=NET, config=CONFIG))
     assert grid.shape[:2] == (2, 3 + 3 + 3 + 2)
-    hidden = hidden_pixels(CLIP)
+    patch = np.asarray(mask(jax.random.uniform(jax.random.key(0), (2, 16)), 4)[2]).reshape(2, 4, 4)  # by the same draw
+    hidden = np.repeat(np.repeat(patch, 7, axis=1), 7, axis=2)
     assert hidden.mean() == 0.75
     for sample in range(2):
         original, masked, filled = grid[sample, :3], grid[sample, 3:6], grid[sample, 6:9]

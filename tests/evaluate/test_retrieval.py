@@ -235,14 +235,10 @@ def test_the_deepest_frame_of_each_touch(touched: manifests.Manifest) -> None:
     assert [set(frames[rows[joined.source[rows] == source]]) for source in range(3)] == [{2}, {2}, {1}]
 
 
-def texture_features(manifest: manifests.Manifest, rows: Array) -> Array:
-    """A perfect encoder: noise that depends on the touch alone."""
-    return noise(1000)[manifest.codes("touch")[rows]]
-
-
 def test_a_manifest_is_scored_by_pairs_and_pooled(touched: manifests.Manifest) -> None:
     rows = touched.rows_of("test")
-    features = {"perfect": texture_features(touched, rows), "lost": noise(len(rows), seed=3)}
+    of_touch = noise(1000)[touched.codes("touch")[rows]]  # as a perfect encoder: it depends on the touch alone
+    features = {"perfect": of_touch, "lost": noise(len(rows), seed=3)}
     found = cross_sensor_retrieval(touched, features, rows, gallery_size=20)
     assert [(one.name, one.centred) for one in found[::7]] == [
         ("perfect", False), ("perfect", True), ("lost", False), ("lost", True),

@@ -12,19 +12,6 @@ BALL = draw_object("sphere", "smooth", "plastic", 5)
 BALL = dataclasses.replace(BALL, shape=dataclasses.replace(BALL.shape, size=8.0))
 
 
-def painted(thing, *colour):
-    return dataclasses.replace(thing, colour=colour)
-
-
-def outline(thing, place, seed, size=96):
-    """Where the object is in the picture: what changes with its paint alone."""
-    two = [
-        photograph(painted(thing, *c), place, np.random.default_rng(seed), size)
-        for c in ((0.8, 0.1, 0.1), (0.1, 0.1, 0.8))
-    ]
-    return np.abs(two[0].astype(int) - two[1]).max(-1) > 25
-
-
 def middle(mask):
     rows, columns = np.nonzero(mask)
     return np.array([columns.mean(), rows.mean()]) / mask.shape[0] - 0.5
@@ -41,7 +28,9 @@ def test_a_photograph_is_a_picture_that_is_neither_black_nor_burnt(thing):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_place_is_in_the_middle_and_the_scale_is_right(seed):
-    mask = outline(BALL, (0.0, 0.0), seed)
+    things = (dataclasses.replace(BALL, colour=colour) for colour in ((0.8, 0.1, 0.1), (0.1, 0.1, 0.8)))
+    red, blue = (photograph(thing, (0.0, 0.0), np.random.default_rng(seed), 96).astype(int) for thing in things)
+    mask = np.abs(red - blue).max(-1) > 25  # the object is what changes with its paint alone
     # The top of the ball is in the middle; from aside, its body leans away by at most its radius times the tilt.
     assert np.hypot(*middle(mask)) < 8 * math.sin(math.radians(38)) / EXTENT[0]
     assert mask[44:52, 44:52].all()

@@ -27,16 +27,12 @@ def drawn(thing, count, seed=0):
     return [caption(thing, rng) for _ in range(count)]
 
 
-def words(sentence):
-    return re.findall(r"[a-z]+", sentence.lower())
-
-
 @pytest.mark.parametrize("start", range(0, 300, 60))
 def test_captions_keep_what_they_must_not_tell(start):
     for thing in THINGS[start : start + 60]:
         for sentence in drawn(thing, 12, start):
             assert thing.name not in sentence.lower()
-            reported = words(sentence)
+            reported = re.findall(r"[a-z]+", sentence.lower())
             assert not SECRET & set(reported), sentence
             assert not [w for w in reported if w.startswith(SECRET_STEMS)], sentence
 

@@ -151,6 +151,13 @@ def test_nothing_is_encoded_twice(passes, encoder, pictures, tmp_path):
 # The public benchmarks, on trees laid out like the originals.
 
 
+def paint(root: Path) -> None:
+    """Give every picture under `root` bytes of its own, so that features differ."""
+    rng = np.random.default_rng(0)
+    for path in sorted(root.rglob("*.*g")):
+        cv2.imwrite(str(path), rng.integers(0, 255, (16, 16, 3), np.uint8))
+
+
 def touch_and_go(root: Path) -> None:
     lists: dict[str, list[str]] = {name: [] for name in ("train", "test", "train_rough", "test_rough")}
     for video in range(8):
@@ -198,12 +205,11 @@ SIZES = {  # (train, test) of the authors' own split
 
 @pytest.fixture(scope="module")
 def trees(tmp_path_factory) -> dict[str, Path]:
-    results, rng = dict[str, Path](), np.random.default_rng(0)
+    results: dict[str, Path] = {}
     for name, (make, options) in MAKERS.items():
         root = tmp_path_factory.mktemp(name)
         make(root)
-        for path in sorted(root.rglob("*.*g")):  # so that features differ
-            cv2.imwrite(str(path), rng.integers(0, 255, (16, 16, 3), np.uint8))
+        paint(root)
         results[name] = index(name, root, None, options=options).out
     return results
 

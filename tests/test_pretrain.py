@@ -10,14 +10,12 @@ import jax
 import numpy as np
 import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
-from touch_world import make_touches
 from weights_world import save_clip
 
-from anytouch_jax.config import SENSORS, from_json, presets
+from anytouch_jax.config import SENSORS, from_json
 from anytouch_jax.data import tokenizer as texts
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import checkpoint
@@ -125,6 +123,15 @@ def refused(config, run, **options):
     message = str(error.value)
     assert "\n" not in message
     return message
+
+
+def test_another_preset_in_the_same_folder_is_refused(straight, world):
+    run, _ = straight
+    before = (run / "config.json").read_bytes(), saved_steps(run)
+    message = refused(run_config(world, model={"embed": 16}), run)
+    assert "model.embed was 12 and is now 16" in message and str(run) in message
+    assert "stage" in refused(run_config(world, 2), run)
+    assert ((run / "config.json").read_bytes(), saved_steps(run)) == before
 
 
 def parts(params, *names):
@@ -281,39 +288,3 @@ def test_a_run_does_not_resume_on_other_rows(world, tmp_path):
     moved = shutil.copytree(world.parent, tmp_path / "moved")
     write_manifest(moved / "other.csv", rows[:-1])  # the same rows and files at another place
     assert train(run_config(moved / "other.csv"), tmp_path / "r", stop_after=2).step == 2
-
-
-STILLS = np.random.default_rng(0).integers(0, 256, (2, 28, 28, 3), np.uint8)
-BASELINES = [(name, stage) for name, one in presets.BASELINES.items() for stage in one.stages]
-
-
-@pytest.fixture(scope="module")
-def touches(tmp_path_factory):
-    """Two sensors at the same places, four frames each, some with photograph and caption."""
-    folder = tmp_path_factory.mktemp("touches")
-    return make_touches(folder, touches={"train": 8}, frames=4, each=2, sensors=("digit", "gelslim"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "stage"), BASELINES)
-def test_a_baseline_trains_and_embeds(touches, tmp_path, name, stage):
-    config = presets.apply_baseline(name, run_config(touches, stage, batch=4, steps=4))
-    # The parameters of one still and one clip step are what two steps of the alternating order move.
-    result = train(replace(config, optim=replace(config.optim, warmup=1)), tmp_path / "r", stop_after=2)
-    lines = read_metrics(tmp_path / "r")
-    assert all(np.isfinite(line["loss"]) and not line["skipped"] for line in lines) and len(lines) == 2
-    assert all(np.isfinite(array).all() for key, array in arrays_of(result).items())
-    reported = set().union(*lines)
-    assert ("match" in reported) == (stage == 2 and config.model.match_head != "none")
-    assert ("next_frame" in reported) == (stage == 1 and name not in ("t3", "static_only", "no_dynamic"))
-    if stage == 2:
-        # (Every touch of this world was felt by both sensors, so that withholding those texts leaves none.)
-        assert ("touch_to_text" in reported) == (name not in ("unitouch", "no_text", "no_text_aligned"))
-        assert ("touch_to_vision" in reported) == (name != "no_vision")
-    encoder = load_encoder(tmp_path / "r")
-    with pytest.warns(UserWarning, match="was not in training"):
-        z = [encoder.encode_touch(STILLS, sensor) for sensor in ("digit", "duragel", "universal")]
-    assert all(one.shape == (2, 12) and np.isfinite(one).all() for one in z)
-    np.testing.assert_array_equal(z[1], z[2])  # the row of duragel is untrained
-    told_apart = bool(np.abs(z[0] - z[1]).max() > 0)
-    assert told_apart == (name != "tlv_link")  # without tokens all sensors are one

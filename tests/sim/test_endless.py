@@ -17,15 +17,6 @@ SCENES = Scenes(objects=60, seed=41, depth=(0.15, 1.0))
 COUNT = 3000
 
 
-def by_numpy(draw):
-    return jax.tree.map(lambda *x: np.stack(x), *(draw(np.random.default_rng([5, n])) for n in range(COUNT)))
-
-
-def by_jax(draw, most):
-    keys = jax.random.split(jax.random.key(3), COUNT)
-    return jax.device_get(jax.jit(jax.vmap(lambda key: draw(Draws(key, most))))(keys))
-
-
 def flat(tree):
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
 
@@ -41,7 +32,10 @@ def gesture(rng):
     ids=["unit", "gesture", "drift"],
 )
 def test_both_kinds_of_draws_have_one_distribution(draw, most):
-    ours, theirs = flat(by_jax(draw, most)), flat(by_numpy(draw))
+    keys = jax.random.split(jax.random.key(3), COUNT)
+    ours = flat(jax.device_get(jax.jit(jax.vmap(lambda key: draw(Draws(key, most))))(keys)))
+    by_numpy = (draw(np.random.default_rng([5, n])) for n in range(COUNT))
+    theirs = flat(jax.tree.map(lambda *x: np.stack(x), *by_numpy))
     assert ours.keys() == theirs.keys()
     for name, values in ours.items():
         one, other = (np.asarray(x, np.float64).reshape(COUNT, -1) for x in (values, theirs[name]))

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import jax
-from places import ROOT
+from places import ROOT, SUPPORT
 from train_toy import ROWS, toy_batch, toy_config, toy_loss, toy_params
 
 from anytouch_jax.errors import UserError
@@ -43,18 +43,26 @@ def batches_of(index: int, count: int, *, at: int = -1, number: int = 0):
 
 def start(run_dir: Path, count: int = 2, *, devices: int = 1, hit: int = -1, at: int = -1, number: int = 0, **run):
     """Start `count` processes that train in `run_dir`; process `hit` gets the signal `number` before step `at`."""
+    settings = json.dumps({"run_dir": str(run_dir), "hit": hit, "at": at, "number": number, "run": run})
+    return spawn([__file__, settings], count, devices)
+
+
+def free_address() -> str:
     with socket.socket() as free:
         free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    settings = json.dumps({"run_dir": str(run_dir), "hit": hit, "at": at, "number": number, "run": run})
+        return f"localhost:{free.getsockname()[1]}"
+
+
+def spawn(words: list[str], count: int = 2, devices: int = 1, *folders: Path):
+    """Start `count` processes of Python that find each other, with the tests' helpers and `folders` in their path."""
+    path = [str(SRC), str(SUPPORT), *map(str, folders), os.environ.get("PYTHONPATH", "")]
     common = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(SRC), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]),
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "true", "JAX_NUM_CPU_DEVICES": str(devices),
-        "JAX_COORDINATOR_ADDRESS": f"localhost:{port}", "JAX_NUM_PROCESSES": str(count),
+        "PYTHONPATH": os.pathsep.join(path), "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
+        "JAX_NUM_CPU_DEVICES": str(devices), "JAX_COORDINATOR_ADDRESS": free_address(), "JAX_NUM_PROCESSES": str(count),
     }  # fmt: skip
-    command, pipes = [sys.executable, __file__, settings], {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     places = [common | {"JAX_PROCESS_ID": str(index)} for index in range(count)]
-    return [subprocess.Popen(command, env=place, text=True, **pipes) for place in places]
+    return [subprocess.Popen([sys.executable, *words], env=place, text=True, **pipes) for place in places]
 
 
 def finish(processes, timeout: float = 600):

@@ -98,12 +98,6 @@ def test_a_failed_join_is_one_sentence_that_names_the_variables(error, initializ
     assert all(name in message for name in BY_HAND)
 
 
-def test_in_one_process_nothing_is_exchanged(tmp_path):
-    tree = {"a": jax.numpy.ones(3)}
-    assert distributed.gather(tree) is tree and distributed.broadcast(7) == 7
-    distributed.check_shared(tmp_path / "missing")
-
-
 def test_a_ballot_gives_the_largest_vote():
     ballot = distributed.Ballot(make_mesh(fsdp=2))
     assert [[int(one) for one in ballot.cast(number, 3)] for number in (0, 15)] == [[0, 3], [15, 3]]

@@ -19,7 +19,7 @@ from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
-from anytouch_jax.encoder.novelty import ContactGate
+from anytouch_jax.encoder.linear_head import ContactGate
 from anytouch_jax.encoder.stream import stream
 from anytouch_jax.errors import UserError
 from experiments.pouring import policy

@@ -14,9 +14,8 @@ import pytest
 
 import anytouch_jax as at
 from anytouch_jax import bars, files
-from anytouch_jax.encoder.embed import Features, save_npz
+from anytouch_jax.encoder.embed import Features, load_index, save_npz
 from anytouch_jax.encoder.linear_head import LinearHead
-from anytouch_jax.encoder.search import load_index
 from anytouch_jax.files import atomic_path, atomic_write, lock
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import softmax
 
-from anytouch_jax.encoder.search import nearest
+from anytouch_jax.encoder.embed import nearest
 from anytouch_jax.evaluate import heads, statistics
 from experiments.real.recordings import Recordings
 

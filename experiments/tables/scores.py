@@ -15,7 +15,7 @@ from anytouch_jax.config import Config
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.evaluate import geometry, retrieval
+from anytouch_jax.evaluate import plots, retrieval
 from anytouch_jax.evaluate.feature_cache import (
     FeatureSource,
     background_difference,
@@ -138,7 +138,7 @@ def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
 
 def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: retrieval.Metric) -> list[Row]:
     sensors, touch = table.text_column("sensor")[rows], table.codes("touch", own=True)[rows]
-    about = geometry.describe(values, sensors, table.text_column("object")[rows], touch)
+    about = plots.describe(values, sensors, table.text_column("object")[rows], touch)
     fewest = min(len(np.unique(touch[sensors == one])) for one in np.unique(sensors))
     pooled = retrieval.cross_sensor_retrieval(
         table, {view: values}, rows, gallery_size=min(retrieval.GALLERY, fewest), centre=(False,),
@@ -165,7 +165,7 @@ def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list
     names = np.unique(touch)
     some = np.random.default_rng(0).permutation(names)[:TOUCHES]  # the same touches for all
     keep = np.isin(sensors, SHOWN) & np.isin(touch, some)
-    places = geometry.tsne(values[keep], seed=seed)
+    places = plots.tsne(values[keep], seed=seed)
     return [
         {"x": round(float(x), 3), "y": round(float(y), 3), "sensor": str(sensor), "touch": int(code)}
         for (x, y), sensor, code in zip(places, sensors[keep], touch[keep], strict=True)

@@ -45,7 +45,7 @@ def serve(embedded: Any, path: str) -> None:
 if __name__ == "__main__":
     import anytouch_jax as at
     from anytouch_jax.data.images import decode
-    from anytouch_jax.encoder.novelty import ContactGate
+    from anytouch_jax.encoder.linear_head import ContactGate
     from anytouch_jax.encoder.stream import open_source, stream
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -3,8 +3,6 @@
 Public names are imported on first use, so that `import anytouch_jax` is fast.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 
@@ -20,7 +18,7 @@ _HOMES = {
     "train.optim": "optimizer",
     "train.loop": "fit",
     "pretrain": "pretrain",
-    "sim.touch": "simulate_touch",
+    "sim.recorder": "simulate_touch",
     "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",
     "data.gels": "untouched_gel",

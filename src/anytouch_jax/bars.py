@@ -1,7 +1,5 @@
 """Progress bars with the time left, on a terminal."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

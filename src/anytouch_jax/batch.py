@@ -4,8 +4,6 @@ The shape is the data type: T is 1 for stills, 3 for clips, 4 for clips with the
 channel last (RGB); normalisation happens on the device. B batch, V image slots, L text slots, S text length.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 from anytouch_jax.shown import shown_short

@@ -1,7 +1,12 @@
-"""Errors that a user can mend."""
+"""Errors that a user can mend, and signals."""
 
+import contextlib
 import os
+import signal
 import sys
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
 
 _LETTERS = 500  # of a message
 
@@ -37,6 +42,23 @@ class ConfigError(UserError):
 
 class CheckError(UserError):
     """A check that failed, such as an export that differs from its model. The command line exits with 1."""
+
+
+@contextlib.contextmanager
+def handled(handler: Callable[[int, Any], Any], *names: signal.Signals) -> Iterator[None]:
+    """Let signals call `handler` while the block runs. Outside the main thread Python has no handlers."""
+    before: dict[signal.Signals, Any] = {}
+    try:
+        for name in names if threading.current_thread() is threading.main_thread() else ():
+            before[name] = signal.signal(name, handler)
+        yield
+    finally:
+        for name, earlier in before.items():
+            signal.signal(name, earlier)
+
+
+class Terminated(BaseException):
+    """SIGTERM outside a training step."""
 
 
 _inherited = False  # whether this process was forked from one whose jax was running

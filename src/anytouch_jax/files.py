@@ -80,10 +80,7 @@ def placeholder(file: str | Path | bytes) -> str | None:
 
 
 def csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of the first line, from 1, and the cells of the rows of a CSV file. Blank lines are left out.
-
-    Raises csv.Error, which names the line, for a quote that is not closed.
-    """
+    """Yield the first line, from 1, and the cells of each row of a CSV file. Raises csv.Error for a quote left open."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         line, rows = 1, csv.reader(file, strict=True)
         try:

@@ -1,7 +1,5 @@
 """Pre-training runs: config, data, network, first parameters and loss, put together for `train.loop.fit`."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
@@ -30,8 +28,7 @@ from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.simulated import SIMULATED, SimulatedLoader
 from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
-from anytouch_jax.train.metrics import alone_in, begun_with
-from anytouch_jax.train.progress import silent
+from anytouch_jax.train.progress import alone_in, begun_with, silent
 from anytouch_jax.weights.checkpoint import CheckpointError, read_metadata, steps
 from anytouch_jax.weights.families import load_start
 
@@ -47,12 +44,10 @@ def pretrain(
 ) -> FitResult:  # fmt: skip
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
-    `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1,
-    also of an encoder of photographs (see `load_start`).
-    `clip` is CLIP weights for the towers. Stage 1 starts the touch encoder from their image tower, as the paper does.
-    A resumed run reads neither. `mesh` is the devices to train on, all of them if None. `curve` shows the loss of all
-    steps on a terminal. `until` is as in `fit`. Raises UserError for a mistake in the settings, the data or the
-    folder.
+    `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1
+    (see `load_start`). `clip` is CLIP weights for the towers, and for the touch encoder of stage 1. A resumed run reads
+    neither. `mesh` is the devices to train on. `curve` and `until` are as in `fit`. Raises UserError for a mistake in
+    the settings, the data or the folder.
     """
     refuse_forked()
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
@@ -111,25 +106,21 @@ def _check(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> No
     """Raise UserError for settings that this machine or this stage cannot follow, and for missing weights."""
     model, has_x64 = config.model, jax.config.read("jax_enable_x64")
     cudnn, float64 = model.attention == "cudnn", model.dtype == "float64"
+    wide, lacks_x64 = model.dtype != "bfloat16", float64 and not has_x64
+    linear, twice = model.match_head == "linear" and config.recipe == "paper", init is not None and clip is not None
     slots = config.stage == 2 and bool(model.image or model.text)
     has_tokenizer = model.text is None or (run / TOKENIZER).exists()
     lacks_clip = config.towers == "pretrained" and clip is None and not (resumes and has_tokenizer)
     wrong = {
         "--model.attention cudnn needs a GPU of NVIDIA; leave it out here": cudnn and jax.default_backend() != "gpu",
-        "--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out": cudnn
-        and model.dtype != "bfloat16",
-        "--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32": float64
-        and not has_x64,
+        "--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out": cudnn and wide,
+        "--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32": lacks_x64,
         "JAX_ENABLE_X64 is set, which changes the random numbers and the checkpoints of a run: unset it, or add "
         "--model.dtype float64": has_x64 and not float64,
         "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "
         "whole batch; lower --batch instead": slots and config.optim.accumulate > 1,
-        "--model.match-head linear is the head of the release; add --recipe release, or choose mlp": (
-            model.match_head == "linear" and config.recipe == "paper"
-        ),
-        "--init and --clip-weights both give stage 1 its touch encoder; leave one out": (
-            config.stage == 1 and init is not None and clip is not None
-        ),
+        "--model.match-head linear is the head of the release; add --recipe release, or choose mlp": linear,
+        "--init and --clip-weights both give stage 1 its touch encoder; leave one out": config.stage == 1 and twice,
         f"{run} is a file, not a folder; choose another --run": run.is_file(),
         "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in the same "
         "folder": lacks_clip,

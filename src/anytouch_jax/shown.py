@@ -1,7 +1,5 @@
 """Short `repr` of records and objects: arrays by their type and shape, trees of arrays by their size."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping

@@ -1,10 +1,8 @@
 """Batches of simulated touches for training, alone or mixed with real recordings.
 
-Touches are simulated inside the training program (`sim.endless`), so none repeats and no data set is written. Real
-recordings are kept on the device at the model's size. A batch depends on the seed and the step alone.
+Touches are simulated inside the training program (`sim.endless`), and none repeats. Real recordings are kept on the
+device at the model's size. A batch depends on the seed and the step alone.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -18,7 +16,7 @@ from jax.scipy.ndimage import map_coordinates
 
 from anytouch_jax.batch import AlignBatch, FieldBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config
-from anytouch_jax.data.loading.pools import CLIP, STILL, Pools, epoch_weights, find_pools
+from anytouch_jax.data.loading.pools import CLIP, STILL, MatchPool, Pools, epoch_weights, find_pools
 from anytouch_jax.data.loading.samples import SampleReader, read_image
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
@@ -29,8 +27,7 @@ from anytouch_jax.sim.contact.mechanics import KPA_MM2
 from anytouch_jax.sim.endless import Sampling, SimulatedTouches, World
 from anytouch_jax.sim.sensing.own import find_sensor
 from anytouch_jax.sim.sensing.photo import seeded_photograph
-from anytouch_jax.sim.world import captions
-from anytouch_jax.sim.world.objects import Object
+from anytouch_jax.sim.world.objects import Object, caption
 
 SIMULATED = "simulated"  # the word of --data that stands for simulated touches
 WORDINGS = 8  # captions of each object
@@ -41,6 +38,7 @@ TRIES = 8  # draws in which a partner by another unit is looked for
 MOST_PIXELS = 4_000_000_000  # bytes of real frames that are kept on the device
 FIELD_SHARE = 0.5  # of a batch's touches: those whose fields are learned
 FIELDS = ("displacement", "shear", "pressure")
+SUBTRACTED = 0.7  # share of touches whose background is subtracted with --data.background either
 Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 
@@ -76,16 +74,14 @@ class Texts(NamedTuple):
     mask: Any
 
 
-_sample = jax.jit(
-    endless.sample_touches, static_argnames=("sampling", "count")
-)  # one program for all loaders of one form
+# One program for all loaders of one form.
+_sample = jax.jit(endless.sample_touches, static_argnames=("sampling", "count"))
 
 
 class SimulatedLoader:
     """Batches for `config.stage` with the interface of `Loader`. `manifest` has real recordings, or is None.
 
-    A text tower needs the `tokenizer` of `caption_tokenizer`. Raises UserError for settings that simulation does not
-    serve, and for more real frames than fit.
+    A text tower needs the `tokenizer` of `caption_tokenizer`. Raises UserError for settings that do not fit.
     """
 
     def __init__(
@@ -123,9 +119,7 @@ class SimulatedLoader:
     @property
     def trained_sensors(self) -> list[str]:
         """Names of the sensors that batches are drawn from, in the order of the sensor table."""
-        rows = {int(row) for row in self._rows[:-1]} | (
-            set() if self._real is None else set(np.unique(np.asarray(self._real.sensor)).tolist())
-        )
+        rows = {*self._rows[:-1].tolist(), *(() if self._real is None else np.asarray(self._real.sensor).tolist())}
         return [name for number, name in enumerate(self.config.model.sensors) if number in rows]
 
     def _encode(self, manifest: Manifest | None) -> Texts:
@@ -171,9 +165,8 @@ class SimulatedLoader:
 
         def shapes(step: int) -> Batch:
             key, world, sampling, count, gallery = self._sampled(step)
-            touches = jax.eval_shape(
-                partial(endless.sample_touches, sampling=sampling, count=count), key, world, gallery=gallery
-            )
+            sample = partial(endless.sample_touches, sampling=sampling, count=count)
+            touches = jax.eval_shape(sample, key, world, gallery=gallery)
             batch: Batch = jax.eval_shape(self._assemble, key, touches, self._real, self._photos, self._texts)
             return batch
 
@@ -201,7 +194,7 @@ def training_objects(config: Config) -> tuple[Object, ...]:
 def wordings(things: Sequence[Object], count: int = WORDINGS) -> list[str]:
     """Return `count` captions of each object."""
     return [
-        captions.caption(thing, np.random.default_rng([thing.seed, scene.CAPTION, number]))
+        caption(thing, np.random.default_rng([thing.seed, scene.CAPTION, number]))
         for thing in things
         for number in range(count)
     ]
@@ -225,11 +218,8 @@ def caption_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
 
 def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.ndarray:
     """Return photographs u8 (objects, places, size, size, 3) of the places (objects, places, 2) mm of each object."""
-    jobs = [
-        (thing, place, (thing.seed, scene.PHOTO))
-        for thing, spots in zip(things, places, strict=True)
-        for place in spots
-    ]
+    pairs = zip(things, places, strict=True)
+    jobs = [(thing, place, (thing.seed, scene.PHOTO)) for thing, spots in pairs for place in spots]
     pictures = endless.over_cores(partial(seeded_photograph, size=size), jobs)
     return np.stack(pictures).reshape(*places.shape[:2], size, size, 3)
 
@@ -237,9 +227,7 @@ def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.nd
 def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) -> Real:
     """Return the real frames of the training split on the device. Raises UserError if they are too many."""
     plain = config.with_settings({"data.background": "keep"})
-    pools: Pools = find_pools(manifest, plain, None, 1) if config.model.text is None else find_pools(
-        manifest, plain.with_settings({"data.tokenizer": None}), None, 1
-    )  # fmt: skip
+    pools: Pools = find_pools(manifest, plain.with_settings({"data.tokenizer": None}), None, 1)
     for note in pools.notes:
         log(note)
     size = config.model.image_size
@@ -259,15 +247,10 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
     caption = column.indices.fill_null(-1).to_numpy(False)[rows].astype(np.int32)
     weights, _ = epoch_weights(manifest, config, rows)
     weights = np.ones(len(manifest)) if weights is None else weights
-    kinds: list[Any] = [None, None]
-    pairs: list[Any] = [None, None]
-    for kind, pool in enumerate(pools.touch):
-        kinds[kind] = (place[pool.windows], _cumulative(weights[pool.windows[:, -1]]))
-    for kind, match in enumerate(pools.match):
-        if match is not None:
-            own = match.windows[match.matches.anchors]
-            pairs[kind] = _pairs(manifest, own, place, weights)
-    real = Real(frame, gels, gel_of, pools.sensor[rows].astype(np.int32), caption, tuple(kinds), tuple(pairs))
+    kinds = [(place[pool.windows], _cumulative(weights[pool.windows[:, -1]])) for pool in pools.touch]
+    windows_of = (*kinds, *[None] * (2 - len(kinds)))
+    pairs = tuple(_pairs(manifest, match, place, weights) for match in pools.match)
+    real = Real(frame, gels, gel_of, pools.sensor[rows].astype(np.int32), caption, windows_of, pairs)
     return jax.device_put(real)
 
 
@@ -275,28 +258,28 @@ def _real_gels(manifest: Manifest, rows: np.ndarray, frame: np.ndarray, size: in
     """Return pictures of untouched gels u8 (G, 2, S, S, 3), stored and median of the unit, and that of each row."""
     stored = manifest.codes("background_path")[rows]
     unit, sensor = manifest.codes("unit")[rows], manifest.codes("sensor")[rows]
-    _, group = np.unique(np.stack([np.where(unit >= 0, unit, -1 - sensor), stored]), axis=1, return_inverse=True)
-    group = group.ravel()
-    medians: dict[int, np.ndarray] = {}
-    gels = []
-    for number in range(group.max() + 1):
-        members = np.flatnonzero(group == number)
-        own = int(unit[members[0]] if unit[members[0]] >= 0 else -1 - sensor[members[0]])
-        if own not in medians:
-            same = np.flatnonzero(np.where(unit >= 0, unit, -1 - sensor) == own)
+    owner = np.where(unit >= 0, unit, -1 - sensor)
+    _, first, group = np.unique(np.stack([owner, stored]), axis=1, return_index=True, return_inverse=True)
+    medians, gels = dict[int, np.ndarray](), []
+    for place in first:
+        if (own := int(owner[place])) not in medians:
+            same = np.flatnonzero(owner == own)
             medians[own] = np.median(frame[same[:: max(1, len(same) // 300)]], axis=0).astype(np.uint8)
         picture = medians[own]
-        if stored[members[0]] >= 0:
-            picture = touch_evaluation([read_image(manifest, int(rows[members[0]]), "background_path")], size)[0]
+        if stored[place] >= 0:
+            picture = touch_evaluation([read_image(manifest, int(rows[place]), "background_path")], size)[0]
         gels.append(np.stack([picture, medians[own]]))
-    return np.stack(gels), group.astype(np.int32)
+    return np.stack(gels), group.ravel().astype(np.int32)
 
 
 def _cumulative(weights: np.ndarray) -> np.ndarray:
     return (np.cumsum(weights) / weights.sum()).astype(np.float32)
 
 
-def _pairs(manifest: Manifest, windows: np.ndarray, place: np.ndarray, weights: np.ndarray) -> _Pairs:
+def _pairs(manifest: Manifest, match: MatchPool | None, place: np.ndarray, weights: np.ndarray) -> _Pairs | None:
+    if match is None:
+        return None
+    windows = match.windows[match.matches.anchors]
     last = windows[:, -1]
     touch = manifest.codes("touch", own=True)[last]
     order = np.argsort(touch, kind="stable")
@@ -350,7 +333,9 @@ def _assemble(
         second = _joined(second, _real_touches(jax.random.fold_in(keys[4], 1), real, pairs.rows[other], config))
         place = jnp.concatenate([place, count + pairs.place[at]])
         own = real.caption[pairs.rows[at][:, -1]]
-        caption = jnp.concatenate([caption, jnp.where(own >= 0, _simulated_captions(texts, real) + own, -1)])
+        # Captions of real rows come after the simulated ones, and an empty one is last.
+        first_real = 0 if texts is None else len(texts.ids) - 2 - jnp.max(real.caption, initial=-1)
+        caption = jnp.concatenate([caption, jnp.where(own >= 0, first_real + own, -1)])
     match = MatchBatch(first.clip, first.sensor, second.clip, second.sensor, place=place)
     size = len(first.sensor)
     image, image_row = jnp.zeros((0, *first.clip.shape[2:]), jnp.uint8), jnp.zeros(0, jnp.int32)
@@ -371,11 +356,6 @@ def _assemble(
 def _slots(count: float, devices: int) -> int:
     """Return at least `count` rows, in a multiple of the devices."""
     return devices * max(1, -(-int(count) // devices))
-
-
-def _simulated_captions(texts: Texts | None, real: Real) -> Array:
-    """Return the number of simulated captions, after which those of real rows begin."""
-    return jnp.int32(0) if texts is None else len(texts.ids) - 1 - (jnp.max(real.caption, initial=-1) + 1)
 
 
 def _joined(one: _Touches, other: _Touches) -> _Touches:
@@ -405,10 +385,7 @@ def _real_touches(key: Array, real: Real, rows: Array, config: Config) -> _Touch
 
 
 def augmented(key: Array, clip: Array, config: Config) -> Array:
-    """Return clips u8 (B, T, S, S, 3), each mirrored, turned, shifted and zoomed, all of its frames alike.
-
-    Flips and the affine map are those of `config.data`. One axis is stretched by up to a quarter besides.
-    """
+    """Return clips u8 (B, T, S, S, 3), each mirrored, turned, shifted, zoomed and stretched, its frames alike."""
     toss, turn = jax.random.split(key)
     across, down = jax.random.bernoulli(toss, config.data.flip, (2, len(clip), 1, 1, 1, 1))
     clip = jnp.where(across, clip[:, :, :, ::-1], clip)
@@ -436,10 +413,7 @@ def _warped(clip: Array, draw: Array, affine: tuple[float, float, float]) -> Arr
 
 
 def prepared(key: Array, clip: Array, background: Array, config: Config, *, jitter: bool = True) -> Array:
-    """Return clips u8 (B, T, S, S, 3) as the network reads them: with or without the background subtracted.
-
-    With `jitter` brightness, contrast and colours change a little, as by another camera.
-    """
+    """Return clips u8 (B, T, S, S, 3), the background subtracted or not; `jitter` changes brightness and colours."""
     choice, light = jax.random.split(key)
     frames, gel = clip.astype(jnp.float32), background[:, None].astype(jnp.float32)
     size = (len(clip), 1, 1, 1, 3)
@@ -450,9 +424,6 @@ def prepared(key: Array, clip: Array, background: Array, config: Config, *, jitt
         gain, colour, level = jax.random.normal(light, (3, *size))
         x = x * jnp.exp(0.15 * gain[..., :1] + 0.08 * colour) + 3.0 * level
     return jnp.round(jnp.clip(x + UNTOUCHED, 0, 255)).astype(jnp.uint8)
-
-
-SUBTRACTED = 0.7  # share of touches whose background is subtracted with --data.background either
 
 
 def field_batch(key: Array, touches: SimulatedTouches, sensor: Array, config: Config, count: int) -> FieldBatch:

@@ -13,7 +13,8 @@ from measuring import measuring_weights
 from tiny_models import touch_model
 
 from anytouch_jax.config import to_json
-from anytouch_jax.encoder import cached_export, engines
+from anytouch_jax.encoder import engines
+from anytouch_jax.encoder import export as cached_export
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.encoder.export import describes
 from anytouch_jax.errors import CheckError, UserError

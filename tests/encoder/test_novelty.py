@@ -3,8 +3,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from anytouch_jax.encoder import linear_head, novelty
-from anytouch_jax.encoder.novelty import ContactGate
+from anytouch_jax.encoder import linear_head
+from anytouch_jax.encoder import linear_head as novelty
+from anytouch_jax.encoder.linear_head import ContactGate
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits
 from experiments.real.trust import calibration_error

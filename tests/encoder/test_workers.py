@@ -22,7 +22,7 @@ from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead, fit_head
 from anytouch_jax.evaluate.reconstruction import reconstruction_panels
 from anytouch_jax.nn.functional import build
 from anytouch_jax.pretrain import pretrain
-from anytouch_jax.sim.touch import simulate_touch
+from anytouch_jax.sim.recorder import simulate_touch
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step

@@ -4,17 +4,9 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.geometry import alignment, describe, silhouette, tsne, uniformity
-from anytouch_jax.evaluate.statistics import (
-    GroupSums,
-    bootstrap_interval,
-    classification_sums,
-    mae_of,
-    mean_interval,
-    mean_of,
-    r2_of,
-    regression_sums,
-)
+from anytouch_jax.evaluate import statistics
+from anytouch_jax.evaluate.plots import alignment, describe, silhouette, tsne, uniformity
+from anytouch_jax.evaluate.statistics import GroupSums, classification_sums, mean_interval, regression_sums
 
 
 def noise(count: int, width: int = 8, seed: int = 0) -> Any:
@@ -99,7 +91,7 @@ def test_the_interval_covers_the_truth_about_95_times_in_100() -> None:
 
 
 def r2_interval(error: np.ndarray, truth: np.ndarray, groups: np.ndarray) -> tuple[float | None, float | None]:
-    return bootstrap_interval([regression_sums(error, truth - truth.mean(), groups)], r2_of)
+    return statistics._bootstrap_interval([regression_sums(error, truth - truth.mean(), groups)], statistics._r2_of)
 
 
 def test_an_offset_changes_no_r2_interval() -> None:
@@ -112,16 +104,22 @@ def test_an_offset_changes_no_r2_interval() -> None:
 def test_seeds_and_groups_are_drawn_independently() -> None:
     """Seed k is right on group k alone: drawn alike, seeds and groups would meet in every draw, 0.2 at least."""
     group = np.arange(50) // 10
-    low, high = bootstrap_interval([classification_sums(group == k, group) for k in range(5)], mean_of)
+    low, high = statistics._bootstrap_interval(
+        [classification_sums(group == k, group) for k in range(5)], statistics._mean_of
+    )
     assert low < 0.1 and 0.2 < high < 0.5
 
 
 def test_a_value_that_no_draw_has_has_no_interval() -> None:
     still = np.stack([np.ones(20), np.ones(20), np.full(20, 3.0), np.full(20, 9.0), np.ones(20)], 1)
-    assert bootstrap_interval([GroupSums(np.array([f"g{i // 2}" for i in range(20)]), still)], r2_of) == (None, None)
+    assert statistics._bootstrap_interval(
+        [GroupSums(np.array([f"g{i // 2}" for i in range(20)]), still)], statistics._r2_of
+    ) == (None, None)
 
 
 def test_values_from_sums() -> None:
     truth, error = np.array([1.0, 2.0, 3.0, 6.0]), np.array([0.0, 0.5, 0.0, -1.0])
     sums = regression_sums(error, truth, np.arange(4)).sums.sum(0)
-    assert r2_of(sums) == pytest.approx(1 - 1.25 / np.sum((truth - 3) ** 2)) and mae_of(sums) == pytest.approx(1.5 / 4)
+    assert statistics._r2_of(sums) == pytest.approx(1 - 1.25 / np.sum((truth - 3) ** 2)) and statistics._mae_of(
+        sums
+    ) == pytest.approx(1.5 / 4)

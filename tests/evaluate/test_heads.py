@@ -6,7 +6,8 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss
 from task_world import blobs
 
-from anytouch_jax.encoder import linear_head, search
+from anytouch_jax.encoder import embed as search
+from anytouch_jax.encoder import linear_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads
 from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead, fit_head, linear_path

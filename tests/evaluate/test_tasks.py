@@ -116,7 +116,7 @@ def test_what_cannot_be_selected_is_refused():
             select(WORLD, task)
         assert all(word in str(error.value) for word in words), error.value
     with pytest.raises(UserError, match="colour"):
-        tasks.find_task("colour")
+        tasks.find_named(tasks.TASKS, "colour", "task")
     with pytest.raises(UserError, match="mnist"):
         tasks.find_named(BENCHMARKS, "mnist", "benchmark")
     with pytest.raises(UserError, match="material"):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from anytouch_jax.encoder.arrays import unit_rows
+from anytouch_jax.encoder.embed import TouchIndex
 from anytouch_jax.encoder.encoder import load_encoder
-from anytouch_jax.encoder.search import TouchIndex
-from anytouch_jax.evaluate.geometry import alignment, uniformity
 from anytouch_jax.evaluate.heads import ProbeHead, fit_head
+from anytouch_jax.evaluate.plots import alignment, uniformity
 from anytouch_jax.evaluate.retrieval import Galleries, score_galleries
 from anytouch_jax.ops.losses import normalise
 from tests.fuzz.harness import Case, pick

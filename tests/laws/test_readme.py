@@ -18,8 +18,7 @@ from anytouch_jax.config import preset
 from anytouch_jax.data.manifest.manifest import from_columns
 from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.encoder.export import export
-from anytouch_jax.encoder.linear_head import LinearHead, save_head
-from anytouch_jax.encoder.novelty import Calibration
+from anytouch_jax.encoder.linear_head import Calibration, LinearHead, save_head
 from anytouch_jax.nn.functional import build
 
 MAKEFILE = (ROOT / "Makefile").read_text()

@@ -5,7 +5,7 @@ import pytest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.interpolation import sample
-from anytouch_jax.sim.touch import ball, simulate_touch
+from anytouch_jax.sim.recorder import ball, simulate_touch
 from anytouch_jax.sim.world.objects import catalogue
 from anytouch_jax.sim.world.shapes import height, relief
 

@@ -11,11 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.sim import endless
-from anytouch_jax.sim.recorder import RELIEF, View, simulate_clip
+from anytouch_jax.sim.recorder import RELIEF, View, ball, simulate_clip
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.sim.sensing.optics import tilt
 from anytouch_jax.sim.sensing.sensors import POWERS, SENSORS, draw_unit
-from anytouch_jax.sim.touch import ball
 
 SHAPE = 120, 160  # pixels of a picture, or upright
 SHARE = 0.8  # of the touches that press

@@ -76,8 +76,8 @@ def finish(processes, timeout: float = 600):
 
 
 def main(run_dir: str, hit: int, at: int, number: int, run: dict) -> None:
-    from anytouch_jax.train.distributed import joined
     from anytouch_jax.train.loop import fit
+    from anytouch_jax.train.mesh import joined
 
     with joined() as place:
         index = place.index

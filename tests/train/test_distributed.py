@@ -9,10 +9,9 @@ from toy_process import WIDE, batches_of, config_of, finish, start
 from train_toy import toy_loss, toy_params
 
 from anytouch_jax.errors import ConfigError, UserError
-from anytouch_jax.train import distributed
-from anytouch_jax.train.distributed import joined, process_count
+from anytouch_jax.train import mesh as distributed
 from anytouch_jax.train.loop import fit
-from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.train.mesh import joined, make_mesh, process_count
 
 SLURM = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_PROCID": "3", "SLURM_LOCALID": "1"}
 ALLOCATION = {"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}  # without srun

@@ -50,8 +50,8 @@ def donates(request, monkeypatch):
     if request.param:
         with monkeypatch.context() as patch:
             patch.setattr(jax, "default_backend", lambda: "gpu")
-            allowed = loop.donated()
-        monkeypatch.setattr(loop, "donated", lambda: allowed)
+            allowed = loop.meshes.donated()
+        monkeypatch.setattr(loop.meshes, "donated", lambda: allowed)
     return request.param
 
 
@@ -190,8 +190,8 @@ def test_the_time_that_a_step_waits_for_its_batch_is_written(tmp_path, monkeypat
         clock.now += 1
         return put_batch(batch, sharding)
 
-    put_batch = loop.put_batch
-    monkeypatch.setattr(loop, "put_batch", put)
+    put_batch = loop.meshes.put_batch
+    monkeypatch.setattr(loop.meshes, "put_batch", put)
     monkeypatch.setattr(loop, "time", clock)
     monkeypatch.setattr(loop, "LastStep", lambda: Step(clock, after))
     run(tmp_path, toy_config(save_every=0), batches=batches, stop_after=4)

@@ -12,7 +12,7 @@ from train_toy import toy_config
 
 from anytouch_jax.config import from_json, preset
 from anytouch_jax.errors import ConfigError, UserError
-from anytouch_jax.train.metrics import Record, _flat, continues, open_run
+from anytouch_jax.train.progress import Record, _flat, continues, open_run
 
 
 def lines(run_dir):

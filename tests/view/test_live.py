@@ -30,7 +30,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.view import live as live_module
 from anytouch_jax.view import server
 from anytouch_jax.view.live import Live
-from anytouch_jax.view.space import FeatureMap
+from anytouch_jax.view.tables import FeatureMap
 from anytouch_jax.view.teach import SCORE, LiveRecorder
 
 PAGE = {"X-Anytouch": "1"}

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.embed import Features
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
-    from anytouch_jax.encoder.novelty import ContactGate
+    from anytouch_jax.encoder.linear_head import ContactGate, LinearHead
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +170,7 @@ def frames_input(
     """
     from anytouch_jax.data.gels import as_taken
     from anytouch_jax.encoder.base import Preprocess
-    from anytouch_jax.encoder.novelty import ContactGate
+    from anytouch_jax.encoder.linear_head import ContactGate
 
     row, sensor = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.sensor or UNIVERSAL
     if options.background is not None and not encoder.subtracts:

@@ -109,7 +109,7 @@ class BenchmarkOptions(BatteryOptions):
 def run_label(options: LabelOptions) -> int:
     """Probe a label column, print a table, and write JSON with --out."""
     from anytouch_jax.evaluate.probing import probe_label, probe_table
-    from anytouch_jax.evaluate.verdict import label_verdicts
+    from anytouch_jax.evaluate.statistics import label_verdicts
 
     if options.leave_out is not None:
         refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")

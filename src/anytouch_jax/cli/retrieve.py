@@ -126,8 +126,8 @@ def run(options: RetrieveOptions) -> int:
 
 def _search(options: RetrieveOptions) -> int:
     """List the stored touches nearest to a query."""
+    from anytouch_jax.encoder.embed import load_index
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.encoder.search import load_index
     from anytouch_jax.errors import shorten
     from anytouch_jax.evaluate.statistics import markdown_table
     from anytouch_jax.train.mesh import enable_compilation_cache

@@ -26,7 +26,7 @@ from anytouch_jax.config import (
     presets,
 )
 from anytouch_jax.config.parsing import Count, NotNegative, Seed
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import Terminated, UserError
 
 # Fields that one stage alone reads.
 _STAGE_2_FIELDS = (
@@ -108,9 +108,8 @@ def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequ
 def run(request: TrainRequest) -> int:
     """Train or continue, alone or as one of several processes; 0 after SIGTERM and 130 after Ctrl-C, both saved."""
     from anytouch_jax.pretrain import pretrain
-    from anytouch_jax.train.distributed import joined
-    from anytouch_jax.train.mesh import enable_compilation_cache
-    from anytouch_jax.train.progress import Terminated, terminating
+    from anytouch_jax.train.mesh import enable_compilation_cache, joined
+    from anytouch_jax.train.progress import terminating
 
     options, config = request[0], _with_own_sensors(request[1])
     _refuse_unread(options, config)

@@ -1,7 +1,5 @@
 """Adaptation to a new sensor: its own tokens, fitted to a few labelled frames with all else frozen (Sec. 3.5)."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil
@@ -48,8 +46,7 @@ PROTOTYPE_ROWS = 1000  # frames of the known sensors for the prototypes of the c
 class Adapted(NamedTuple):
     """A model with a fitted row of tokens, and how well it fits.
 
-    `params` are those of the whole run, `losses` (steps,). The mean losses `before` and `after` are on frames of
-    `measured`: "val", or "fitted" if the sensor has no frames in val. `metadata` is that of the new run.
+    `params` and `metadata` are of the new run. `before` and `after` are mean losses on frames of `measured`.
     """
 
     config: Config
@@ -67,9 +64,8 @@ def adapt(
 ) -> Adapted:  # fmt: skip
     """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split train.
 
-    `run` is what `load_encoder` takes: a name, a run folder, a weights file or an address. The tokens
-    start as the universal ones, and stay so with 0 frames. The embedding of each frame is drawn to the prototype of its
-    class in the column `labels`: the mean embedding of the known sensors' frames of that class. Raises UserError.
+    `run` is what `load_encoder` takes. The tokens start as the universal ones. The embedding of each frame is drawn to
+    the mean embedding of the known sensors' frames of its class in column `labels`. Raises UserError.
     """
     if frames < 0 or steps < 1:
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")

@@ -8,12 +8,14 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
     from anytouch_jax.config import ModelConfig
 
+Array = npt.NDArray[Any]
 Pooling = Literal["class", "mean", "both"]
 Join = Literal["mean", "sum", "concat"]
 Log = Callable[[str], None]
@@ -40,9 +42,8 @@ def check_features(values: np.ndarray) -> np.ndarray:
 def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: int = BATCH) -> np.ndarray:
     """Return the results (n, ...) of `function` over n items, in batches of `size`.
 
-    Items are arrays, which are stacked, or tuples of arrays, which are stacked one by one. The last batch is filled up
-    with its last item, so that `function` is compiled for one shape. Fewer items than `size` are one batch of their
-    number. Without items the result is empty, of shape (0,). Raises UserError for results that are not finite.
+    Arrays are stacked, and tuples of arrays one by one. The last batch is filled up with its last item, so that one
+    shape is compiled. Without items the result is of shape (0,). Raises UserError for results that are not finite.
     """
     values, left = list[np.ndarray](), iter(items)
     while part := list(islice(left, size)):
@@ -53,10 +54,7 @@ def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: i
 
 
 def binary_scale(values: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Return the exponent e of two that brings the largest |value| * 2**-e below 1, with the axes of `values`.
-
-    Float32 squares around 1e20 or 1e-25 are infinite or 0. Those of `np.ldexp(values, -e)` keep every digit.
-    """
+    """Return the exponent e of two that brings the largest |value| * 2**-e below 1, so that squares do not overflow."""
     return np.frexp(np.abs(values).max(axis=axis, keepdims=True, initial=0.0))[1]
 
 
@@ -65,9 +63,7 @@ def as_array(values: Any, name: str) -> np.ndarray:
     try:
         return np.asarray(values)
     except ValueError:
-        raise UserError(
-            f"{name} must be one array; its parts differ in size, so bring them to one size first"
-        ) from None
+        raise UserError(f"{name} must be one array; its parts differ in size, so bring them to one size") from None
 
 
 def check_frames(model: ModelConfig, frames: int) -> None:
@@ -77,10 +73,7 @@ def check_frames(model: ModelConfig, frames: int) -> None:
 
 
 def filled(batch: np.ndarray) -> np.ndarray:
-    """Return a batch (n, ...) with zeros up to the next of 1, 2, 4, ... 64, 128, 192, ... rows.
-
-    A program is compiled for each number of rows, for seconds. So every number would be too many.
-    """
+    """Return a batch (n, ...) with zeros up to 1, 2, 4, ... 64, 128, 192, ... rows: each number of rows is compiled."""
     count = len(batch)
     size = 1 << max(count - 1, 0).bit_length() if count <= 64 else -(-count // 64) * 64
     return batch if count == size else np.concatenate([batch, np.zeros((size - count, *batch.shape[1:]), batch.dtype)])
@@ -93,10 +86,7 @@ def unit_rows(values: np.ndarray) -> np.ndarray:
 
 
 def spread_lines(values: np.ndarray) -> list[str]:
-    """Return a line with the mean cosine of pairs of features (n, d), and a warning if they are nearly constant.
-
-    At most SPREAD_ROWS rows, evenly spaced, are compared. Fewer than two give no line.
-    """
+    """Return a line with the mean cosine of pairs of features (n, d), and a warning if they are nearly constant."""
     rows = np.asarray(values[np.linspace(0, len(values) - 1, min(len(values), SPREAD_ROWS)).astype(int)], np.float64)
     if len(rows) < 2 or not np.isfinite(rows).all():
         return []
@@ -113,10 +103,7 @@ def spread_lines(values: np.ndarray) -> list[str]:
 
 
 def rows_of_sensors(sensor: Any, count: int, row: Callable[[str], int], rows: int) -> np.ndarray:
-    """Return rows i32 (count,) of one sensor name, of names (count,), or of row numbers below `rows`.
-
-    `row` returns the row of a name. Raises UserError for another shape or type.
-    """
+    """Return rows i32 (count,) of a sensor name (by `row`), of names (count,), or of numbers. Raises UserError."""
     ids = np.full(count, row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
     if ids.dtype.kind in "UO":
         ids = np.array([row(name) for name in ids.reshape(-1)], np.int32).reshape(ids.shape)

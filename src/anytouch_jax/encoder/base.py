@@ -22,21 +22,10 @@ from anytouch_jax.data.gels import RunningGel, other_unit, same_unit, untouched_
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
-from anytouch_jax.encoder.arrays import (
-    BATCH,
-    Join,
-    Log,
-    Pooling,
-    as_array,
-    check_features,
-    check_frames,
-    filled,
-    rows_of_sensors,
-    run_in_batches,
-    warn,
-)
+from anytouch_jax.encoder import arrays
+from anytouch_jax.encoder.arrays import BATCH, Join, Log, Pooling, warn
 from anytouch_jax.encoder.engines import EngineChoice
-from anytouch_jax.encoder.fields import Fields, Measure, missing, output_of, scale_of
+from anytouch_jax.encoder.fields import Fields, Measure, missing, scale_of
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
@@ -53,10 +42,9 @@ _PART_NAMES = {"image": "image tower", "text": "text tower", "matcher": "matchin
 class Encoder:
     """A touch encoder with its parameters, and the image and text towers if the weights have them.
 
-    `config` and `params` are those of the touch encoder alone, `source` is the path of the weights. `trained_sensors`
-    is None if the weights do not store them. If training never drew the universal tokens (`universal_drawn`), the mean
-    of the trained sensors' tokens is used instead. `others` are the parameters of towers, decoder and heads of the
-    `whole` model: they stay on the host until they are used. `tokenizer_file` is None without a tokenizer.json.
+    `config` and `params` are those of the touch encoder alone, `source` is the path of the weights. If training never
+    drew the universal tokens (`universal_drawn`), the mean of the trained sensors' tokens is used instead. `others` are
+    the parameters of towers, decoder and heads of the `whole` model: they stay on the host until they are used.
     `engine` computes touch by what `exporter` returns (`cached_export`); XLA computes all else.
     """
 
@@ -100,10 +88,7 @@ class Encoder:
         return build(self.config.model)
 
     def sensor_row(self, name: str, log: Log = warn) -> int:
-        """Return the row of a sensor's tokens, that of the universal tokens for a sensor outside training.
-
-        The universal tokens (Sec. 3.5) are logged. Raises SpellingError for a misspelled name.
-        """
+        """Return the row of a sensor, or, logged, of the universal tokens (Sec. 3.5). SpellingError for a near name."""
         model, name = self.config.model, str(name)
         drawn, known = self.universal_drawn or not self.trained_sensors, name in model.sensors
         if known and (drawn if name == UNIVERSAL else self.trained_sensors is None or name in self.trained_sensors):
@@ -184,8 +169,7 @@ class Encoder:
     def preprocess(self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None) -> np.ndarray:
         """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder does so.
 
-        Raises UserError if the encoder needs a `background`, the picture of the untouched gel, and there is none.
-        `untouched_gel(frames)` makes one. Use `Preprocess` for a camera: it stores the background.
+        Raises UserError if the encoder needs a `background`, and there is none. `untouched_gel(frames)` makes one.
         """
         if self.needs_background and background is None:
             raise UserError(
@@ -203,23 +187,21 @@ class Encoder:
 
         H and W are the model's size, see `preprocess`. T is 1 (a still), 3 (a clip) or more: then features of segments
         of three are joined by `join`. `sensor` is one name, names (B,), or rows i32 (B,). `pooling`: the class token
-        (which alignment trains), the mean of the patch tokens, or both (B, 2E). Raises UserError for another shape or
-        type.
+        (which alignment trains), the mean of the patch tokens, or both (B, 2E). Raises UserError.
         """
         frames = as_clips(frames)
         side = self.config.model.image_size
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
-            convert = (
-                "" if frames.dtype == np.uint8 else "convert values 0 to 255 by np.asarray(frames, np.uint8), and "
-            )
+            convert = "convert values 0 to 255 by np.asarray(frames, np.uint8), and " * (frames.dtype != np.uint8)
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {frames.dtype} "
                 f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
             )
-        check_frames(self.config.model, frames.shape[1])
+        arrays.check_frames(self.config.model, frames.shape[1])
         check_choices(pooling, join)
         if len(frames) and (run := self.exported(frames.shape[1], pooling)) is not None:
-            return run(frames, rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors)))
+            rows = arrays.rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
+            return run(frames, rows)
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
 
     def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Any:
@@ -234,11 +216,12 @@ class Encoder:
 
     def _encode(self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any) -> np.ndarray:
         """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled for a few B and `key`s."""
-        rows = rows_of_sensors(sensor, len(clips), self.sensor_row, len(self.config.model.sensors))
+        rows = arrays.rows_of_sensors(sensor, len(clips), self.sensor_row, len(self.config.model.sensors))
         if key not in self._compiled:
             self._compiled[key] = jax.jit(run)
         with precision(self.config):
-            return np.asarray(self._compiled[key](self._placed, filled(clips), filled(rows)))[: len(clips)]
+            values = self._compiled[key](self._placed, arrays.filled(clips), arrays.filled(rows))
+        return np.asarray(values)[: len(clips)]
 
     @cached_property
     def _placed(self) -> Params:
@@ -256,10 +239,7 @@ class Encoder:
         return None if self.tokenizer_file is None else load_tokenizer(self.tokenizer_file)
 
     def encode_image(self, images: Any, *, batch: int = 64) -> np.ndarray:
-        """Return embeddings f32 (B, E) of photographs, RGB (h, w, 3) of any size each; not unit-norm.
-
-        Each is resized and cropped as in training. Raises UserError without an image tower, and for another shape.
-        """
+        """Return embeddings f32 (B, E) of photographs RGB (h, w, 3), not unit-norm. UserError without a tower."""
 
         def run(net: Net, params: Params, pixels: jax.Array) -> jax.Array:
             return net.encode_image(params, normalise_image(pixels)).astype(jnp.float32)
@@ -270,10 +250,7 @@ class Encoder:
         return self._embeddings(tower, pixels, batch)
 
     def encode_text(self, texts: str | Sequence[str], *, batch: int = 64) -> np.ndarray:
-        """Return embeddings f32 (L, E) of texts; not unit-norm.
-
-        Raises UserError without a text tower, or without a tokenizer.json in the folder of the weights.
-        """
+        """Return embeddings f32 (L, E) of texts, not unit-norm. Raises UserError without a text tower or tokenizer."""
 
         def run(net: Net, params: Params, batch: tuple[jax.Array, jax.Array]) -> jax.Array:
             return net.encode_text(params, *batch).astype(jnp.float32)
@@ -301,17 +278,16 @@ class Encoder:
         """Return depth, shear, contact and force of B frames in mm and N, with their deviations.
 
         `frames` are those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), whose
-        last frame is measured. A still shows little of shear and slip: their deviations are wide. `background` is the
-        picture of the untouched gel. A sensor that is not in `fields.GELS` needs `width_mm`, the mm that the picture's
-        width shows. Without it lengths are shares of that width, and there is no force. A grey, turned or mirrored
-        picture is logged and has wide deviations. Raises UserError if the weights do not measure.
+        last frame is measured. A still shows little of shear and slip. `background` is the untouched gel. A sensor that
+        is not in `fields.GELS` needs `width_mm`, the mm that the picture's width shows. Without it lengths are shares
+        of that width, and there is no force. Raises UserError if the weights do not measure.
         """
         measure = self.measure_of(sensor, background, width_mm, log)
-        frames = as_array(frames, "frames")
+        frames = arrays.as_array(frames, "frames")
         clips = as_clips(frames[..., None] if frames.ndim == 2 else frames)
         if clips.ndim != 5 or not len(clips):
             raise UserError(f"frames must be (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), not {frames.shape}")
-        check_frames(self.config.model, clips.shape[1])
+        arrays.check_frames(self.config.model, clips.shape[1])
         clips = clips[:, -self.config.model.frames :]
         aspect, row = np.log(clips.shape[2] / clips.shape[3]), self.sensor_row(sensor, log)
         parts = []
@@ -320,7 +296,7 @@ class Encoder:
             ready = np.stack([[self.preprocess(frame, background) for frame in clip] for clip in part])
             numbers = np.full(len(part), row, np.int32), np.full(len(part), aspect, np.float32)
             parts.append(self.encode_and_measure(ready, *numbers)[1])
-        out = output_of(check_features(np.concatenate(values)) for values in zip(*parts, strict=True))
+        out = FieldOutput._make(arrays.check_features(np.concatenate(values)) for values in zip(*parts, strict=True))
         return measure(out, to_rgb(clips[0, -1], "the frame"))
 
     def measure_of(
@@ -328,7 +304,7 @@ class Encoder:
         *, rotate: int = 0, flip: Flip = "none",
     ) -> Measure:  # fmt: skip
         """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it. Raises UserError."""
-        gel = None if background is None else to_rgb(as_array(background, "the background"), "the background")
+        gel = None if background is None else to_rgb(arrays.as_array(background, "the background"), "the background")
         if not self.measures:
             raise missing(self.source)
         return Measure(scale_of(self.metadata, sensor, width_mm), sensor, gel, log, rotate, flip)
@@ -351,8 +327,8 @@ class Encoder:
             net = build(usable(self.whole or self.config.model))
             self._compiled[key] = jax.jit(partial(features_and_fields, net=net, pooling=pooling))
         with precision(self.config):
-            values, out = self._compiled[key](self._placed_fields, *map(filled, (clips, rows, aspect)))
-        return np.asarray(values)[: len(clips)], output_of(np.asarray(value)[: len(clips)] for value in out)
+            values, out = self._compiled[key](self._placed_fields, *map(arrays.filled, (clips, rows, aspect)))
+        return np.asarray(values)[: len(clips)], FieldOutput._make(np.asarray(x)[: len(clips)] for x in out)
 
     @cached_property
     def _placed_fields(self) -> Params:
@@ -361,20 +337,16 @@ class Encoder:
         return self._placed | jax.device_put({"fields": self.part_params("fields")})
 
     def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:
-        values = run_in_batches(lambda part: tower(jax.tree.map(filled, part)), items, batch)
+        values = arrays.run_in_batches(lambda part: tower(jax.tree.map(arrays.filled, part)), items, batch)
         return values if len(values) else np.zeros((0, self.config.model.embed), np.float32)
 
     def similarity(
-        self,
-        touch: npt.ArrayLike,
-        texts: str | Sequence[str] | npt.NDArray[np.floating],
-        *,
-        probabilities: bool = False,
+        self, touch: npt.ArrayLike, texts: str | Sequence[str] | np.ndarray, *, probabilities: bool = False
     ) -> np.ndarray:
         """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text embeddings (L, E).
 
-        With `probabilities`, return their softmax over the texts with the learned temperature: a zero-shot classifier.
-        Raises UserError without a text tower. Training with `center_embeddings` subtracted the batch mean first.
+        `probabilities` are their softmax with the learned temperature: a zero-shot classifier. UserError without a
+        tower.
         """
         embeddings = texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts)  # type: ignore[arg-type]
         z_touch, z_text = np.asarray(touch, np.float32), np.asarray(embeddings, np.float32)
@@ -398,10 +370,8 @@ class Encoder:
 
         head, one, other = self._part("match", run, "matcher"), *(np.asarray(x, np.float32) for x in (first, second))
         if one.shape != other.shape or one.ndim != 2:
-            raise UserError(
-                f"match takes two sets of touch features (B, E) of one shape, not {one.shape}, {other.shape}"
-            )
-        return np.asarray(head(filled(one), filled(other)))[: len(one)]
+            raise UserError(f"match takes two sets of features of one shape (B, E), not {one.shape}, {other.shape}")
+        return np.asarray(head(arrays.filled(one), arrays.filled(other)))[: len(one)]
 
     def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
         """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
@@ -432,11 +402,9 @@ class Preprocess:
     They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and resized. For an encoder
     that `subtracts`, the `background` (a picture of the untouched gel) is subtracted first, or the `untouched_gel` of
     `frames`. Without either, the first frame chooses among the `known` pictures of a head. If none is of its unit,
-    `log` gets a warning, and the frames so far give a running estimate. So they do for an encoder that needs a
-    background. Another takes frames without subtraction. All pictures are as the camera takes them.
+    `log` gets a warning, and the frames so far give a running estimate, as for an encoder that needs a background.
 
-    >>> preprocess = Preprocess(encoder, frames=frames)
-    >>> features = encoder.encode_touch(preprocess(camera.read()), "digit")
+    >>> features = encoder.encode_touch(Preprocess(encoder, frames=frames)(camera.read()), "digit")
     """
 
     def __init__(
@@ -453,7 +421,7 @@ class Preprocess:
         self._running = RunningGel() if encoder.needs_background or self._known else None
         self._background = None if frames is None else untouched_gel(frames)
         if background is not None:
-            self._background = to_rgb(as_array(background, "the background"), "the background")
+            self._background = to_rgb(arrays.as_array(background, "the background"), "the background")
         self._gel: tuple[np.ndarray | None, np.ndarray] = None, np.zeros((0, 0, 3), np.uint8)
 
     @property
@@ -474,11 +442,8 @@ class Preprocess:
         return f"Preprocess(frames of {getattr(encoder, 'source', 'an encoder')}, {used}, {turned})"
 
     def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
-        """Return a frame as RGB u8 (size, size, 3), or as an encoder of another family reads it.
-
-        `frame` is RGB u8 (h, w, 3), or grey, RGBA, u16 or floats in 0..1. Raises ImageError for any other.
-        """
-        frame = to_rgb(as_array(frame, "the frame"), "the frame")
+        """Return a camera's frame (h, w, 3), or grey, RGBA, u16 or floats in 0..1, as the encoder reads it."""
+        frame = to_rgb(arrays.as_array(frame, "the frame"), "the frame")
         if self._background is None and self._known:
             known, self._known = self._known, {}
             gel, why = same_unit(known, frame)
@@ -502,17 +467,14 @@ def _unit(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
 
 
 def precision(config: Config) -> AbstractContextManager[Any]:
-    """Return a context in which jax has 64 bits for a float64 model, and 32 for others, whatever JAX_ENABLE_X64 is.
-
-    Raises UserError in a process that cannot use jax, see `refuse_forked`.
-    """
+    """Return a context with 64 bits for a float64 model, else 32. Raises UserError if this process cannot use jax."""
     refuse_forked()
     return jax.enable_x64(config.model.dtype == "float64")
 
 
 def as_clips(frames: Any) -> np.ndarray:
     """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips. Raises UserError for frames of two sizes."""
-    frames = as_array(frames, "frames")
+    frames = arrays.as_array(frames, "frames")
     return frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
 
 

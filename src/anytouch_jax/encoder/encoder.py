@@ -5,8 +5,6 @@
 >>> encoder.similarity(touch, ["a soft sponge", "a hard metal edge"], probabilities=True)
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -22,7 +20,6 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.encoder import export
 from anytouch_jax.encoder.arrays import METADATA, Join, Pooling, check_frames, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips, random_encoder, touch_features, touch_only
-from anytouch_jax.encoder.cached_export import cached_export
 from anytouch_jax.encoder.engines import Engine, EngineChoice
 from anytouch_jax.encoder.family import family_encoder
 from anytouch_jax.encoder.fields import missing
@@ -46,17 +43,15 @@ def load_encoder(
 ) -> Encoder:  # fmt: skip
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
-    `engine` computes the features of touch. "auto" is the fastest that is installed and exact, see `cached_export`:
-    onnxruntime on a CPU, else XLA. Gradients, towers and clips of several segments are always computed by XLA.
-    An .onnx file of `anytouch export` runs on onnxruntime, see `load_engine`.
-    Files of other families are read too (Sparsh, T3, AnyTouch 2, SITR, DINOv2, DINOv3, SigLIP, ViT-MAE, ViT, DeiT).
-    `heads` is their number of attention heads, where neither the file nor a config.json next to it has it. `image_size`
-    (a side, or height and width) changes the size of their images. Then the result is a `FamilyEncoder`.
-
     Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
-    are .pth, .bin, .safetensors or .npz. `step` chooses a checkpoint of a run, the latest by default. Image and text
-    towers are loaded too, if there are any. Raises UserError for weights without a touch encoder, or with values that
-    are not finite, and in a process that was forked from one that has used jax.
+    are .pth, .bin, .safetensors, .npz or an .onnx of `anytouch export`. `step` chooses a checkpoint of a run, the
+    latest by default. Image and text towers are loaded too. `engine` computes the features of touch, see
+    `cached_export`: "auto" is onnxruntime on a CPU where it is exact, else XLA.
+
+    Files of other families (Sparsh, T3, AnyTouch 2, SITR, DINOv2, DINOv3, SigLIP, ViT-MAE, ViT, DeiT) give a
+    `FamilyEncoder`. `heads` is their number of attention heads, where neither the file nor a config.json next to it has
+    it. `image_size` (a side, or height and width) changes the size of their images. Raises UserError for weights
+    without a touch encoder or with values that are not finite, and in a process that cannot use jax.
     """
     refuse_forked()
     name, path, names = str(path), registry.locate(path), set[str]()
@@ -83,7 +78,7 @@ def load_encoder(
     encoder = Encoder(
         touch_only(loaded.config), {"touch": loaded.params["touch"]}, name, loaded.trained_sensors,
         loaded.universal_drawn, loaded.config.model, others, find_tokenizer(path), loaded.metadata, engine,
-        cached_export,
+        export.cached_export,
     )  # fmt: skip
     return encoder if engine in ("auto", "xla") else encoder.computed_in("float32")
 

@@ -1,10 +1,7 @@
-"""A touch encoder as an ONNX graph, its int8 form, and the engines that run it (onnxruntime, OpenVINO).
+"""A touch encoder (`nn.touch`) as an ONNX graph, its int8 form, and its engines (onnxruntime, OpenVINO).
 
-Blocks are written out one after the other and constants are folded, so that engines can fuse them. The network is that
-of `nn.touch`.
+Blocks are written out one after the other and constants are folded, so that engines can fuse them.
 """
-
-from __future__ import annotations
 
 import operator
 import os
@@ -78,8 +75,7 @@ class _Graph:
 def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling = "class") -> bytes:
     """Return an ONNX model of touches u8 (B, T, H, W, 3) and sensor rows i32 (B,) to features f32 (B, E).
 
-    If `params` have fields, it has their input aspect f32 (B,) and the outputs of `nn.fields.FieldOutput` too. Raises
-    UserError for touches of more than one segment.
+    If `params` have fields, it takes aspects f32 (B,) too and returns `FieldOutput`. UserError for several segments.
     """
     with _needed("anytouch_jax[engines]"):
         from onnx import TensorProto, helper
@@ -203,10 +199,8 @@ def _fields(graph: _Graph, own: Any, model: ModelConfig, frames: int, states: li
     )  # fmt: skip
     values = dict(zip(FieldOutput._fields, made, strict=True))
     graph.nodes += [helper.make_node("Identity", [value], [name], name) for name, value in values.items()]
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-        ("depth", "contact", "pressure", "depth_log", "shear_log"), (half, half)
-    )
-    shapes |= {"shear": (half, half, 2), "force": (3,), "force_log": (2,)}
+    flat = dict.fromkeys(("depth", "contact", "pressure", "depth_log", "shear_log"), (half, half))
+    shapes: dict[str, tuple[int, ...]] = {**flat, "shear": (half, half, 2), "force": (3,), "force_log": (2,)}
     return {name: shapes.get(name, ()) for name in values}
 
 
@@ -236,9 +230,9 @@ def _block(graph: _Graph, x: str, block: Any, model: ModelConfig, *, first: bool
 def quantised(data: bytes, touches: np.ndarray, rows: np.ndarray) -> bytes:
     """Return `touch_graph` with the linear layers of its blocks in int8: weights per channel, activations per tensor.
 
-    The ranges of activations are those on `touches` u8 (200, T, H, W, 3) of sensor `rows` i32 (200,). Weights have 7
-    bits, so that sums of two products fit in 16 bits on a CPU without VNNI. The patch projection stays float32: a small
-    error of its weights is multiplied by the brightness of the picture. Raises UserError for another number of touches.
+    Ranges are those on `touches` u8 (200, T, H, W, 3) of sensor `rows` i32 (200,). Weights have 7 bits, so that sums of
+    two products fit in 16 bits on a CPU without VNNI. The patch projection stays float32: brightness multiplies its
+    errors. Raises UserError for another number of touches.
     """
     if len(touches) != CALIBRATION:
         raise UserError(f"int8 is calibrated on {CALIBRATION} touches, not on {len(touches)}; give that many")
@@ -282,8 +276,7 @@ def imported(engine: Engine) -> Any:
 def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[..., Any]:
     """Return the function of an ONNX model on an engine: touches u8, sensor rows i32 (B,) to features f32 (B, E).
 
-    A model with fields takes aspects f32 (B,) too, and returns features and the arrays of `FieldOutput`. It uses every
-    core that the process may use, in float32. Raises UserError for an engine that is not installed.
+    A model with fields takes aspects f32 (B,) too, and returns `FieldOutput`. UserError without the engine.
     """
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     package = imported(engine)

@@ -1,12 +1,12 @@
-"""Export of a touch encoder as one file that needs jax or an engine alone, and loading of that file.
+"""Export of a touch encoder as one file that needs jax or an engine alone, its loading, and exports in a cache.
 
 The file is a `jax.export` artefact or an ONNX model: uint8 frames and sensor rows in, features out, for any number of
-touches. Normalisation and parameters are inside. A JSON description says how to call it and has its checksum. Loading
-imports none of the network's code.
+touches. A JSON description says how to call it. Loading imports none of the network's code.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
@@ -23,23 +24,14 @@ from jax import export as jax_export
 
 from anytouch_jax.config import UNIVERSAL, parse_json, to_json
 from anytouch_jax.data.images import decode_bytes, encode
-from anytouch_jax.encoder import engines
-from anytouch_jax.encoder.arrays import (
-    METADATA,
-    Join,
-    Pooling,
-    as_array,
-    check_frames,
-    filled,
-    rows_of_sensors,
-    run_in_batches,
-    unit_rows,
-)
+from anytouch_jax.encoder import arrays, engines
+from anytouch_jax.encoder.arrays import METADATA, Array, Join, Pooling
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.errors import CheckError, UserError, refuse_forked
-from anytouch_jax.files import atomic_write
+from anytouch_jax.files import atomic_write, cache_folder, remove_old
 from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import described
+from anytouch_jax.weights.registry import list_encoders
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.base import Encoder
@@ -57,6 +49,8 @@ _FIELDS: dict[str, type] = {
 _ONNX_FIELDS: dict[str, type] = {"source": str, "config": dict, "weights": str, "universal_drawn": bool}
 _ENGINES = {"jax": ("xla",), "onnx": ("onnxruntime", "openvino")}
 _CHECKED = (1, 5)  # batch sizes
+LARGEST = 16_000_000  # parameters; in larger encoders products take the time, which are equally fast in XLA
+_CACHE = ".engines"  # next to the weights
 _EXAMPLE = {
     "jax": """import pathlib
 import jax
@@ -106,23 +100,22 @@ class Exported:
     def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
         """Return features f32 (B, E) of touches (B, T, H, W, 3), u8 RGB or as another family prepares them.
 
-        `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape or type, and for a sensor
-        that the model does not know.
+        `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape, type or sensor.
         """
-        frames = as_array(frames, "frames")
+        frames = arrays.as_array(frames, "frames")
         side, kind = self.about["image_size"], self.about.get("frame_dtype", "uint8")
         wanted = (self.about["frames"], *self.about.get("frame_shape", (side, side, 3)))
         if frames.dtype != kind or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
             shape = ", ".join(str(size) for size in wanted)
             raise UserError(f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
-        rows = rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
+        rows = arrays.rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
         if "fields" in self.about:  # the aspect does not change features
             return np.asarray(self.measure(frames, rows, np.zeros(len(frames), np.float32))[0])
         if self.about["form"] == "onnx":
             return np.asarray(self._run(frames, rows))
         refuse_forked()
         with jax.enable_x64(self.about["dtype"] == "float64"):
-            return np.asarray(self._run(filled(frames), filled(rows)))[: len(frames)]
+            return np.asarray(self._run(arrays.filled(frames), arrays.filled(rows)))[: len(frames)]
 
     @property
     def gels(self) -> dict[str, np.ndarray]:
@@ -147,11 +140,7 @@ def describes(path: Path) -> Path:
 
 
 def load(path: str | Path, engine: Engine | None = None) -> Exported:
-    """Load the encoder that `export` wrote to `path`, to run on an `engine`.
-
-    That is XLA for a file for jax. An ONNX model runs on "onnxruntime" or "openvino". Raises UserError for a file that
-    is damaged, for another platform or for another engine.
-    """
+    """Load what `export` wrote to `path`, to run on an `engine`. Raises UserError for a damaged or unfit file."""
     path = Path(path)
     data, about = read_checked(path)
     form, runs_on = about["form"], _ENGINES[about["form"]]
@@ -186,9 +175,9 @@ def export(
 
     The artefact is first called with 1 and 5 touches and compared with the live model by XLA. ONNX is float32, for
     CPUs, and compared on `engine`. With `calibration`, touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), its
-    linear layers become int8 after the comparison. `gels` are pictures of the untouched gel of their units, for the
-    description. With `fields`, ONNX has the outputs of `nn.fields` too. Raises CheckError if they differ, UserError for
-    what ONNX is not written for and if it cannot be compared on this machine, OSError for a full disk.
+    linear layers then become int8. `gels` are pictures of the untouched gel of their units. With `fields`, ONNX has the
+    outputs of `nn.fields` too. Raises CheckError if they differ, UserError for what cannot be exported or compared
+    here, OSError for a full disk.
     """
     encoder = replace(encoder, engine="xla")
     if form == "onnx":
@@ -199,7 +188,7 @@ def export(
     if fields and (form != "onnx" or calibration is not None):
         raise UserError("fields are exported to ONNX in float32: use --to onnx, without --int8")
     params = encoder.params | ({"fields": encoder.part_params("fields")} if fields else {})
-    check_frames(model, frames)
+    arrays.check_frames(model, frames)
     wrong = ", ".join(name for name in platforms if name not in PLATFORMS)
     if wrong or not platforms:
         raise UserError(f"platforms must be of {', '.join(PLATFORMS)}, not {wrong or 'none'}")
@@ -233,48 +222,22 @@ def export(
     if calibration is not None:
         data = engines.quantised(data, *calibration)
         more["int8"] = _int8_error(live, engines.session(data), *calibration, pooling)
+    shape = f"{encoder.blank.dtype} (B, {frames}, {', '.join(map(str, encoder.blank.shape))})"
+    trained = encoder.trained_sensors
     about = {
-        "format": FORMAT,
-        "form": form,
-        "file": path.name,
-        "bytes": len(data),
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "jax": jax.__version__,
-        **more,
-        **call_of(encoder, frames=frames, width=width, pooling=pooling, join=join),
-        "worst_difference": differs,
+        "format": FORMAT, "form": form, "file": path.name, "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(), "jax": jax.__version__, **more, "source": encoder.source,
+        "output": f"features: float32 (B, {width}), not normalised", **encoder.input_form(frames), "frames": frames,
+        "image_size": model.image_size, "features": width, "background": encoder.config.data.background,
+        "pooling": pooling, "join": join, "dtype": encoder.config.model.dtype,
+        "sensors": {name: row for row, name in enumerate(model.sensors)},
+        "trained_sensors": None if trained is None else list(trained), "worst_difference": differs,
         "gels": {name: b64encode(encode(gel)).decode() for name, gel in (gels or {}).items()},
-        "example": _EXAMPLE[form].format(name=path.name, shape=_shape(encoder, frames)),
-    }
+        "example": _EXAMPLE[form].format(name=path.name, shape=shape),
+    }  # fmt: skip
     atomic_write(path, data)
     atomic_write(describes(path), json.dumps(about, indent=2) + "\n")
     return about
-
-
-def _shape(encoder: Encoder, frames: int) -> str:
-    """Return type and shape of the input, as text."""
-    return f"{encoder.blank.dtype} (B, {frames}, {', '.join(map(str, encoder.blank.shape))})"
-
-
-def call_of(
-    encoder: Encoder, *, frames: int, width: int, pooling: Pooling = "class", join: Join = "mean"
-) -> dict[str, Any]:
-    """Return how an exported encoder is called: its inputs, its outputs, the row of each sensor."""
-    model = encoder.config.model
-    return {
-        "source": encoder.source,
-        "output": f"features: float32 (B, {width}), not normalised",
-        **encoder.input_form(frames),
-        "frames": frames,
-        "image_size": model.image_size,
-        "features": width,
-        "background": encoder.config.data.background,
-        "pooling": pooling,
-        "join": join,
-        "dtype": model.dtype,
-        "sensors": {name: row for row, name in enumerate(model.sensors)},
-        "trained_sensors": None if encoder.trained_sensors is None else list(encoder.trained_sensors),
-    }
 
 
 def _here() -> str:
@@ -290,13 +253,8 @@ def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: 
     return bytes(jax_export.export(jax.jit(run), platforms=tuple(platforms))(touches, rows).serialize())
 
 
-def _worst(
-    encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join, fields: bool = False
-) -> tuple[float, int]:
-    """Return the largest difference from the live model, as a share of the largest feature, and the feature count.
-
-    With `fields` it is that of any output, as a share of its largest value or of 1.
-    """
+def _worst(encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join, fields: bool) -> tuple[float, int]:
+    """Return the largest difference from the live model, as a share of the largest value, and the feature count."""
     model, rng, worst, width, blank = encoder.config.model, np.random.default_rng(0), 0.0, 0, encoder.blank
     for count in _CHECKED:
         clips = rng.integers(0, 256, (count, frames, *blank.shape), np.uint8)
@@ -304,10 +262,8 @@ def _worst(
         rows = rng.integers(0, len(model.sensors), count).astype(np.int32)
         if fields:
             aspect = rng.uniform(-0.5, 0.5, count).astype(np.float32)
-            (live, mine), (exported, theirs) = (
-                encoder.encode_and_measure(clips, rows, aspect, pooling),
-                run(clips, rows, aspect),
-            )
+            live, mine = encoder.encode_and_measure(clips, rows, aspect, pooling)
+            exported, theirs = run(clips, rows, aspect)
             pairs = [(np.asarray(a), np.asarray(b)) for a, b in zip(mine, theirs, strict=True)]
             off = [np.inf if a.shape != b.shape else np.abs(a - b).max() / max(np.abs(a).max(), 1e-3) for a, b in pairs]
             worst = max(worst, float(np.max(off)))
@@ -321,19 +277,14 @@ def _worst(
     return worst, width
 
 
-def _int8_error(
-    encoder: Encoder, run: Any, touches: np.ndarray, rows: np.ndarray, pooling: Pooling
-) -> dict[str, float]:
+def _int8_error(encoder: Encoder, run: Any, touches: Array, rows: Array, pooling: Pooling) -> dict[str, float]:
     """Return the largest difference of int8 on its calibration touches, and the mean cosine with the live features."""
     items = list(zip(touches, rows, strict=True))
-    live = run_in_batches(lambda part: encoder.encode_touch(*part, pooling=pooling), items, 20)
-    own = run_in_batches(lambda part: run(*part), items, 20)
-    cosine = float((unit_rows(own) * unit_rows(live)).sum(1).mean())
-    return {
-        "touches": len(rows),
-        "worst_difference": float(np.abs(own - live).max() / np.abs(live).max()),
-        "cosine": cosine,
-    }
+    live = arrays.run_in_batches(lambda part: encoder.encode_touch(*part, pooling=pooling), items, 20)
+    own = arrays.run_in_batches(lambda part: run(*part), items, 20)
+    cosine = float((arrays.unit_rows(own) * arrays.unit_rows(live)).sum(1).mean())
+    worst = float(np.abs(own - live).max() / np.abs(live).max())
+    return {"touches": len(rows), "worst_difference": worst, "cosine": cosine}
 
 
 def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
@@ -363,3 +314,88 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
     if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:
         raise UserError(f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again")
     return data, about
+
+
+def cached_export(encoder: Encoder, frames: int, pooling: Pooling, *, fields: bool = False) -> Exported | None:
+    """Return the export of touches of `frames` frames on the encoder's engine, None where XLA computes.
+
+    "auto" is onnxruntime if it is installed and jax runs on a CPU. The encoder must compute in float32, have at most
+    LARGEST parameters, and differ from its export by at most 1e-5. XLA computes clips of more than one segment. For an
+    engine that was named, raises UserError if it is not installed and for bfloat16, and CheckError if the export
+    differs.
+    """
+    engine, model, is_auto = encoder.engine, encoder.config.model, encoder.engine == "auto"
+    if frames not in (1, model.frames):
+        return None
+    count = sum(np.size(leaf) for leaf in jax.tree.leaves(encoder.params))
+    if is_auto and (jax.default_backend() != "cpu" or model.dtype != "float32" or count > LARGEST):
+        return None
+    if model.dtype != "float32":
+        raise UserError(f"{engine} computes in float32, not in {model.dtype}; leave out --dtype, or use XLA")
+    on: Engine = "onnxruntime" if engine == "auto" else engine
+    try:
+        name, folders = f"{_key(encoder, on, frames, pooling, fields)}.onnx", _folders(encoder.source)
+        for path in (folder / name for folder in folders):
+            if is_auto and _is_refused(path):
+                return None
+            with contextlib.suppress(UserError):
+                run = load(path, on)
+                for file in (path, describes(path)):
+                    with contextlib.suppress(OSError):
+                        os.utime(file)
+                return run
+        return _made(encoder, on, name, folders, frames, pooling, fields)
+    except (UserError, OSError):
+        if is_auto:
+            return None
+        raise
+
+
+def _made(
+    encoder: Encoder, engine: Engine, name: str, folders: list[Path], frames: int, pooling: Pooling, fields: bool
+) -> Exported:
+    """Make an export, and store it in the first folder that can be written. Raises CheckError, which is stored too."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        try:
+            export(encoder, path, frames=frames, pooling=pooling, form="onnx", fields=fields, engine=engine)
+            return load(path, engine)
+        except CheckError as error:
+            atomic_write(describes(path), json.dumps({"refused": str(error)}))
+            raise
+        finally:
+            files = {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir())}  # the description last
+            for stored in folders if files else []:
+                with contextlib.suppress(OSError):
+                    for file, data in files.items():
+                        atomic_write(stored / file, data)
+                    remove_old(stored, "*.onnx*")
+                    break
+
+
+def _key(encoder: Encoder, engine: Engine, frames: int, pooling: Pooling, fields: bool) -> str:
+    """Return a name for everything that decides the features: weights, preprocessing, code, engine and its version."""
+    params = encoder.params | ({"fields": encoder.part_params("fields")} if fields else {})
+    made_by = Path(engines.__file__).read_bytes(), engines.imported(engine).__version__
+    asked = FORMAT, engine, frames, pooling, fields, encoder.contract, encoder.config.data.background
+    digest = hashlib.sha256(repr((asked, made_by)).encode())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        digest.update(f"{path} {leaf.dtype} {leaf.shape}".encode())
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _folders(source: str) -> list[Path]:
+    """Return where an export is looked for: next to weights of the user, then in the user's cache."""
+    path, own = Path(source), cache_folder() / "engines"
+    if source in list_encoders() or source.startswith("hf:") or not path.exists():
+        return [own]
+    return [(path if path.is_dir() else path.parent) / _CACHE, own]
+
+
+def _is_refused(path: Path) -> bool:
+    """Whether the export was made before, and differed from the live model."""
+    try:
+        return "refused" in json.loads(describes(path).read_bytes())
+    except (OSError, ValueError):
+        return False

@@ -34,11 +34,7 @@ _CALIBRATIONS = {4: (1, 3, 7, 9), 8: (1, 3, 7, 9, 10, 12, 16, 18), 9: tuple(rang
 
 @dataclass(frozen=True, repr=False)
 class FamilyEncoder(Encoder):
-    """An encoder of another family.
-
-    `config` describes its network in this library's terms, and `form` in full. `preparation` is what `preprocess`
-    does. `calibration` are SITR's prepared calibration images.
-    """
+    """An encoder of another family: `form` describes its network in full, `preparation` what `preprocess` does."""
 
     family: Family = field(kw_only=True)
     form: VitConfig = field(kw_only=True)
@@ -80,9 +76,8 @@ class FamilyEncoder(Encoder):
     def contract(self) -> str:
         """Everything but the parameters that decides its features, as text."""
         calibration = None if self.calibration is None else self.calibration.tobytes()
-        return repr(
-            (super().contract, self.family.name, asdict(self.form), self.preparation, self.image_size, calibration)
-        )
+        form = asdict(self.form)
+        return repr((super().contract, self.family.name, form, self.preparation, self.image_size, calibration))
 
     def untrained(self, seed: int = 0) -> Encoder:
         """Return an untrained encoder of the same form and preparation."""
@@ -121,17 +116,13 @@ class FamilyEncoder(Encoder):
         return set()
 
     def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
-        """Return a frame u8 (h, w, 3) as the network of the family reads it, f32 (height, width, 3).
-
-        Raises UserError for a background of other proportions.
-        """
+        """Return a frame u8 (h, w, 3) as the network reads it, f32 (height, width, 3). Raises UserError."""
         return prepare(frame, background, self.preparation, self.image_size)
 
     def calibrated(self, frames: Sequence[npt.ArrayLike], background: npt.ArrayLike) -> FamilyEncoder:
         """Return the encoder of a sensor with SITR's calibration images, and the picture of its untouched gel.
 
-        `frames` are RGB (h, w, 3): 9 presses of a sphere, then 9 of the corner of a cube, each row by row over the gel.
-        Raises UserError for another number of images.
+        `frames` are 9 presses of a sphere, then 9 of a cube's corner, row by row. Raises UserError for another number.
         """
         need = self.form.calibration
         if not need:
@@ -150,10 +141,9 @@ class FamilyEncoder(Encoder):
     ) -> np.ndarray:  # fmt: skip
         """Return features f32 (B, E) of prepared frames (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3), oldest first.
 
-        A family of clips takes exactly its frames, or enough consecutive ones to choose them at its stride, or a still
-        that it repeats. One of stills takes any number, and their features are joined. `pooling` "class" is the
-        family's own feature: a class token, its projection, or the mean of the patches if there is none. H and W may be
-        others than `image_size` if the positions allow it. Raises UserError for another shape or type.
+        A family of clips takes exactly its frames, or enough consecutive ones to choose them at its stride, or a still.
+        One of stills takes any number, and their features are joined. `pooling` "class" is the family's own feature. H
+        and W may be others than `image_size` if the positions allow it. Raises UserError for another shape or type.
         """
         return self._encode(self._checked(frames), sensor, self.traceable(pooling, join), (pooling, join))
 

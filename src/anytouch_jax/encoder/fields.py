@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -11,17 +11,14 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from anytouch_jax.data.transforms import Flip, orient_frame
-from anytouch_jax.encoder.arrays import METADATA
+from anytouch_jax.encoder.arrays import METADATA, Array
 from anytouch_jax.encoder.health import UnitFrames, check_layout, known_gels
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.shown import shown_short
-
-Array = npt.NDArray[Any]
 
 
 class KnownGel(NamedTuple):
@@ -48,8 +45,7 @@ _EDGE = 4  # pixels, along each side, of one vertex of a surface
 class Scale(NamedTuple):
     """What turns outputs into mm and N: `width` mm of the picture or None, and the gel's `modulus` in kPa.
 
-    `spread` is the deviation of the modulus as a share. `shape` is the usual height over width of the picture, or None.
-    `factors` multiply the deviations, by name.
+    `spread` is the modulus' deviation as a share, `shape` height over width. `factors` multiply deviations, by name.
     """
 
     width: float | None
@@ -60,10 +56,7 @@ class Scale(NamedTuple):
 
 
 def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = None) -> Scale:
-    """Return the scale of a sensor: that of GELS, of the weights' `metadata`, or of a picture `width_mm` mm wide.
-
-    Raises UserError for a width that is no positive number, and for damaged metadata.
-    """
+    """Return the scale of a sensor: that of GELS, of the weights' `metadata`, or of `width_mm`. Raises UserError."""
     if width_mm is not None and not 0 < width_mm < np.inf:
         raise UserError(f"the width of the picture must be a number of mm above 0, not {width_mm:g}")
     try:
@@ -86,12 +79,12 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
 class Fields:
     """What B frames measure, each value with its standard deviation, as maps (B, h, w) over the whole picture.
 
-    `depth` mm into the gel. `shear` (B, h, w, 2) mm along x and y of the picture, and one deviation for both.
-    `contact` is a probability. `force` (B, 3) N along x, along y and into the gel. `torque` (B,) N mm about the centre
-    of pressure. `slip` (B,) share of the contact that slides. `area` (B,) mm2. `centre` (B, 2) mm of the pressure from
-    the middle of the picture, x to the right and y down, NaN without contact. Without a width (`width_mm` None)
-    lengths are shares of the picture's width, areas of its square, and force and torque are None. `shape` is the
-    picture's height over its width. `faults` are reasons not to trust the values: their deviations are then wide.
+    `depth` mm into the gel. `shear` (B, h, w, 2) mm along x and y of the picture, and one deviation for both. `contact`
+    is a probability. `force` (B, 3) N along x, along y and into the gel. `torque` (B,) N mm about the centre of
+    pressure. `slip` (B,) share of the contact that slides. `area` (B,) mm2. `centre` (B, 2) mm of the pressure from the
+    middle of the picture, x to the right and y down, NaN without contact. Without a width (`width_mm` None) lengths are
+    shares of the picture's width, areas of its square, and force and torque are None. `shape` is height over width.
+    With `faults` the deviations are wide.
     """
 
     depth: Array
@@ -137,10 +130,7 @@ class Fields:
         return self._each(resized)
 
     def points(self) -> Array:
-        """Return the surface of the gel as points f32 (B, h, w, 3) in mm, or in shares of the picture's width.
-
-        x is to the right and y down in the picture, from its middle, and z into the gel.
-        """
+        """Return the surface of the gel f32 (B, h, w, 3), x to the right and y down from the middle, z into the gel."""
         height, width = self.depth.shape[1:]
         mm = self.width_mm or 1.0
         y, x = np.mgrid[:height, :width] + 0.5
@@ -150,16 +140,16 @@ class Fields:
     def summary(self, row: int = 0) -> dict[str, Any]:
         """Return the numbers of a frame by name, each with its deviation `*_std`; None for what is unknown."""
         y, x = np.unravel_index(np.argmax(self.depth[row]), self.depth.shape[1:])
-        values: dict[str, Any] = {}
-        for place, axis in enumerate("xyz"):
-            values[f"force_{axis}"] = None if self.force is None else self.force[row, place]
-            values[f"force_{axis}_std"] = None if self.force_std is None else self.force_std[row, place]
-        values["torque"] = None if self.torque is None else self.torque[row]
-        values["torque_std"] = None if self.torque_std is None else self.torque_std[row]
-        values |= {"depth": self.depth[row, y, x], "depth_std": self.depth_std[row, y, x]}
-        values |= {"area": self.area[row], "area_std": self.area_std[row]}
+
+        def at(name: str, *place: Any) -> dict[str, Any]:
+            pair = {end: getattr(self, f"{name}{end}") for end in ("", "_std")}
+            return {f"{name}{end}": None if value is None else value[(row, *place)] for end, value in pair.items()}
+
+        forces = {f"force_{axis}": at("force", place) for place, axis in enumerate("xyz")}
+        values = {name.replace("force", axis): value for axis, pair in forces.items() for name, value in pair.items()}
+        values |= at("torque") | at("depth", y, x) | at("area")
         values |= {"centre_x": self.centre[row, 0], "centre_y": self.centre[row, 1]}
-        values |= {"centre_std": self.centre_std[row], "slip": self.slip[row], "slip_std": self.slip_std[row]}
+        values |= {"centre_std": self.centre_std[row]} | at("slip")
         numbers = {name: None if value is None else round(float(value), 5) for name, value in values.items()}
         return {name: None if value != value else value for name, value in numbers.items()}
 
@@ -183,11 +173,6 @@ def stacked(parts: Sequence[Fields]) -> dict[str, Array]:
     return arrays | {"width_mm": np.concatenate(widths)}
 
 
-def output_of(arrays: Iterable[Any]) -> FieldOutput:
-    """Return the output of the network of its arrays, in their order."""
-    return FieldOutput(*arrays)
-
-
 def _deviation(log: Any) -> Array:
     """Return the standard deviation of a Laplace error from its bent logarithm, as `ops.losses.laplace_loss`."""
     return np.asarray(np.sqrt(2) * np.exp(5 * np.tanh(log / 5)))
@@ -195,7 +180,7 @@ def _deviation(log: Any) -> Array:
 
 def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, ...] = ()) -> Fields:
     """Return the output of the network, as numpy arrays, in mm and N. `shape` is the picture's height over width."""
-    out = output_of(np.asarray(value, np.float32) for value in out)
+    out = FieldOutput._make(np.asarray(value, np.float32) for value in out)
     mm, own = scale.width or 1.0, scale.factors
     rows, columns = out.depth.shape[1:]
     contact = 1 / (1 + np.exp(-out.contact))
@@ -240,10 +225,9 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
 
 
 class Measure:
-    """Turns outputs of the network for frames of one sensor into `Fields`, and looks for faults of the first frame.
+    """Turns outputs of the network for frames of one sensor into `Fields`, and logs faults of the first frame once.
 
-    `background` is the picture of its untouched gel. `oriented` turns and mirrors pictures as `Preprocess` does. A
-    fault goes to `log` once.
+    `background` is the picture of its untouched gel. `oriented` turns and mirrors pictures as `Preprocess` does.
     """
 
     def __init__(
@@ -264,11 +248,7 @@ class Measure:
 
 
 def faults_of(frame: Array, background: Array | None, sensor: str, shape: float | None) -> tuple[str, ...]:
-    """Return sentences on a frame RGB u8 (h, w, 3) that a known sensor in order does not give.
-
-    It is grey, turned, mirrored or cropped, or its red and blue are exchanged. `shape` is the usual height over width.
-    Raises UserError for a background of other proportions.
-    """
+    """Return sentences on a frame RGB u8 (h, w, 3) that a sensor in order does not give. UserError if parts differ."""
     (height, width), faults = frame.shape[:2], list[str]()
     if background is not None and abs(np.log(background.shape[0] * width / (background.shape[1] * height))) > 0.03:
         raise UserError(
@@ -296,8 +276,7 @@ def faults_of(frame: Array, background: Array | None, sensor: str, shape: float 
 def _unlike(frame: Array, background: Array) -> str:
     """Return how a frame was turned or recoloured against its background, "" if it was not.
 
-    A press covers the smaller part of a picture, so the median difference is that of the untouched part. Of simulated
-    presses, which are wide, 4 % look exchanged by a factor of up to 1.17.
+    A press covers the smaller part of a picture. Of simulated presses 4 % look exchanged by a factor of up to 1.17.
     """
     size = (_SIDE, max(1, round(_SIDE * frame.shape[0] / frame.shape[1])))
     small, gel = (cv2.resize(one, size, interpolation=cv2.INTER_AREA).astype(np.float32) for one in (frame, background))
@@ -343,9 +322,8 @@ def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) 
     unit, force = "" if one.width_mm is None else " mm", about["force_z"]
     line = f"{about['depth']:.2f}+-{about['depth_std']:.2f}{unit}"
     line += "" if force is None else f"  {force:.2f}+-{about['force_z_std']:.2f} N"
-    cv2.putText(
-        view, line, (6, height - 8), cv2.FONT_HERSHEY_SIMPLEX, width / 800 + 0.1, (255, 255, 255), 1, cv2.LINE_AA
-    )
+    font, white = cv2.FONT_HERSHEY_SIMPLEX, (255, 255, 255)
+    cv2.putText(view, line, (6, height - 8), font, width / 800 + 0.1, white, 1, cv2.LINE_AA)
     return view
 
 

@@ -1,10 +1,8 @@
 """Health of sensor units: orientation, colour order, exposure, focus, frozen frames, drift, wear, background, contact.
 
-A check reads some recordings of a unit and gives a value, a limit and what to do. The limits were set on real
-recordings of units in good order (`experiments/real/trust.py`). Pictures are compared at 160 pixels on the long side.
+A check reads some recordings of a unit and gives a value, a limit and what to do. The limits were set on real units in
+good order (`experiments/real/trust.py`). Pictures are compared at 160 pixels on the long side.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -12,20 +10,17 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS, spread
 from anytouch_jax.data.prepare.untouched_gel import DOT_DEPTH, UntouchedGel, close_dots, has_dots, scale_picture
+from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
-
-Array = npt.NDArray[Any]
 
 _LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "looks.npz"  # real untouched gels, in the package
 RECORDINGS, FRAMES = 24, 6  # that are read of a unit, and of a recording
@@ -60,8 +55,7 @@ class Check:
 class UnitFrames:
     """Frames of one sensor unit: `recordings` are lists of pictures RGB u8 (h, w, 3), in order, all of one size.
 
-    `background` is its untouched gel. `steps`: distances of neighbouring frame numbers in strides, (n,), of all its
-    recordings. `rows` counts all frames, of which those in `recordings` were read.
+    `background` is its untouched gel. `steps` (n,): distances of neighbouring frame numbers. `rows` counts all.
     """
 
     sensor: str
@@ -118,10 +112,7 @@ class UnitHealth:
 
 
 def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
-    """Yield the frames of each unit of a manifest, or of each dataset and sensor where no unit is named.
-
-    At most RECORDINGS evenly spaced recordings are read, and FRAMES of each. Pictures that cannot be read are left out.
-    """
+    """Yield the frames of each unit of a manifest: at most RECORDINGS recordings, evenly spaced, and FRAMES of each."""
     names = ("dataset", "sensor", "unit")
     codes = np.stack([manifest.codes(name) for name in names], 1)
     sequence, split = manifest.codes("sequence", own=True), manifest.text_column("split")
@@ -168,8 +159,7 @@ def examine(
 ) -> UnitHealth:
     """Return the checks of a unit, or the one called `only`.
 
-    `references` are pictures of untouched gels of the same sensor family, upright and with colours in order. `others`
-    are the other units of the data, among which exchanged recordings are looked for.
+    `references` are untouched gels of the same family. Recordings are compared with the `others` of the data.
     """
     checks: dict[str, Callable[[], Check]] = {
         "orientation and colours": lambda: check_layout(unit, references), "one unit": lambda: _one_unit(unit, others),
@@ -202,10 +192,7 @@ def known_gels(sensor: str) -> list[Array]:
 
 
 def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
-    """Compare orientation and colour order with the references: which turn and order of colours fits them best?
-
-    A sensor that looks nearly the same when it is mirrored, as a GelSight Mini does, is not called mirrored.
-    """
+    """Compare with the references: which turn and order of colours fits them best? A near symmetry is no fault."""
     name = "orientation and colours"
     if not references:
         return Check(name, None, "no reference of this sensor")
@@ -309,10 +296,7 @@ def _dead(unit: UnitFrames) -> Check:
 
 
 def _difference(unit: UnitFrames) -> tuple[Array, Array] | None:
-    """Return the usual picture minus the background, f32 (h, w, 3) at 160 pixels without tint, and where dots are not.
-
-    Shear moves dots a little. None without a background, or where dots cover most of the picture.
-    """
+    """Return the usual picture minus the background f32 (h, w, 3) at 160 pixels without tint, and where no dots are."""
     if unit.background is None or unit.background.shape != unit.frames[0].shape:
         return None
     gel = scale_picture(unit.background)
@@ -401,8 +385,7 @@ def _look(picture: Array) -> Array:
 def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
     """Return whether features (n, d) of frames in contact (n,) bool differ from the others more than by chance.
 
-    The value is the distance of the two means over the spread within them. The limit is the largest value of `draws`
-    random assignments but a twentieth.
+    The value is the distance of the means over the spread. The limit is that of 95 % of `draws` random assignments.
     """
     if min(contact.sum(), (~contact).sum()) < _FEWEST:
         return Check("contact visible to the encoder", None, "too few frames with or without contact")

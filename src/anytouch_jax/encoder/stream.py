@@ -1,12 +1,9 @@
 """Live features of a camera or a video, frame by frame, with the latency of each part (`anytouch stream`).
 
 A thread reads and preprocesses frames, and a mailbox of one slot holds the newest clip. A camera is never waited for:
-frames that arrive while the encoder is busy are dropped, and a clip still has consecutive frames. A video can wait, so
-none of its frames is dropped. A clip that shows what the last embedded one showed gets the same features. The end of a
-video ends the stream. A camera has no end: a missed read is tried again, and the stream fails if no frame comes.
+frames that arrive while the encoder is busy are dropped, and a clip still has consecutive frames. None of a video's
+frames is dropped, and its end ends the stream. A missed read of a camera is tried again.
 """
-
-from __future__ import annotations
 
 import contextlib
 import signal
@@ -27,7 +24,7 @@ from anytouch_jax.encoder.arrays import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.base import Preprocess, precision
 from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
 from anytouch_jax.encoder.fields import Fields, Measure
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, handled
 from anytouch_jax.shown import shown_short
 
 PARTS = ("decode", "resize", "copy", "encoder")
@@ -54,8 +51,7 @@ class CameraError(UserError):
 class Frame(NamedTuple):
     """Pixels RGB u8 (h, w, 3) of frame `number`, the clock when it was `read`, and the seconds of decoding.
 
-    `time`: its time stamp in a video, None for a camera. `picture`: "ok", "frozen" or "black". `missed`: missed reads
-    of the camera up to here.
+    `time`: its time stamp in a video. `picture`: "ok", "frozen" or "black". `missed`: missed reads so far.
     """
 
     number: int
@@ -69,10 +65,7 @@ class Frame(NamedTuple):
 
 @shown_short
 class Clip(NamedTuple):
-    """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN.
-
-    `estimated`: the untouched gel is a running estimate.
-    """
+    """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN."""
 
     last: Frame
     frames: np.ndarray
@@ -86,10 +79,9 @@ class Embedded(NamedTuple):
     """Features f32 (E,) of the clip that ends with frame `number`.
 
     `at`: seconds from the start of the stream to the frame. `seconds`: those of PARTS. `age`: seconds from the grabbed
-    frame to its features, with decoding and waiting. `started`: start of the stream in Unix seconds. `time`: the time
-    stamp of a video's frame, or `at` of a camera's. `picture` and `missed` are those of `Frame`. `contact`: 1, 0 or
-    NaN (unknown). `reused`: the features are those of the last clip that was embedded (`Reuse`). `estimated`: the
-    untouched gel is a running estimate, which may still improve. `fields` is what was measured, or None.
+    frame to its features. `started`: start of the stream in Unix seconds. `time`: the time stamp of a video's frame, or
+    `at` of a camera's. `contact`: 1, 0 or NaN (unknown). `reused`: see `Reuse`. `estimated`: the untouched gel is a
+    running estimate, which may still improve. `fields` is what was measured.
     """
 
     number: int
@@ -108,10 +100,7 @@ class Embedded(NamedTuple):
 
 
 class Mailbox:
-    """One slot between the reader and the encoder. With `replace` a newer clip replaces one that was not taken.
-
-    `is_closed`: one side has ended the stream. `alive`: when the reader last came back from the camera.
-    """
+    """One slot between the reader and the encoder, in which a newer clip may `replace` one that was not taken."""
 
     def __init__(self, *, replace: bool) -> None:
         self.is_closed, self.alive = False, time.perf_counter()
@@ -160,9 +149,9 @@ def stream(
     A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
     `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy, and `log` gets one
     sentence each about a missed read, a frozen and a black picture. `contact` decides contact of a frame, as
-    `novelty.ContactGate` does. `reuse` is the factor of `Reuse`. With `measure`, of `Encoder.measure_of`, the frames
-    are measured too, in the same pass. Close the iterator to stop and to release the
-    source. Raises UserError for a wrong length or factor, and CameraError if no frame can be read for RETRY seconds.
+    `ContactGate` does. `reuse` is the factor of `Reuse`. `measure`, of `Encoder.measure_of`, measures in the same pass.
+    Close the iterator to stop and to release the source. Raises UserError for a wrong length or factor, and CameraError
+    after RETRY seconds without a frame.
     """
     check_frames(encoder.config.model, frames)
     if stride < 1:
@@ -213,10 +202,9 @@ def stream(
 class Reuse:
     """Whether the features of the last embedded clip serve a clip: no place changed by more than noise.
 
-    Clips are arrays (T, H, W, 3) of one shape. A change is the largest of all places, cells of CELL pixels. The noise
-    is what a tenth of the last CHANGES from one clip to the next stay below. It is known after LEARNED of them. A clip
-    is served if it changed by at most `factor` times the noise, and with a factor of 0 if it is equal. Raises UserError
-    for a negative factor.
+    Clips are arrays (T, H, W, 3) of one shape. The noise is what a tenth of the last CHANGES from one clip to the next
+    stay below, known after LEARNED of them. A clip is served if its largest change is at most `factor` times the noise,
+    and with a factor of 0 if it is equal. Raises UserError for a negative factor.
     """
 
     def __init__(self, factor: float) -> None:
@@ -290,9 +278,8 @@ def _read(
             resize = time.perf_counter() - begin
             touched = float("nan") if contact is None else contact(frame.pixels)
             clip = np.stack(list(ring)[::stride])
-            if len(ring) == ring.maxlen and not mailbox.put(
-                Clip(frame, clip, resize, touched, getattr(preprocess, "estimated", False))
-            ):
+            made = Clip(frame, clip, resize, touched, getattr(preprocess, "estimated", False))
+            if len(ring) == ring.maxlen and not mailbox.put(made):
                 break
         mailbox.close()
     except BaseException as error:
@@ -318,10 +305,9 @@ def _video_frames(source: Source) -> Iterator[Frame]:
 
 
 def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]:
-    """Yield the frames of a camera until the mailbox is closed.
+    """Yield the frames of a camera until the mailbox is closed; a read that fails or changes shape is tried again.
 
-    A read without a picture, one that raises cv2.error, and a picture of another shape than the first are missed and
-    tried again. Raises CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be used.
+    Raises CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be used.
     """
     number, missed, failing, fault, shape = 0, 0, None, "", None
     watch = _Watch(log)
@@ -395,7 +381,7 @@ class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 
     `total` frames have features: the arrays may have only the last ones. `frozen` and `black` count such pictures.
-    `interrupted`: Ctrl-C or SIGTERM ended the stream. `error`: a camera that delivers nothing ended it.
+    `interrupted` by Ctrl-C or SIGTERM. `error`: a camera that delivers nothing.
     """
 
     values: np.ndarray
@@ -420,14 +406,14 @@ class Result(NamedTuple):
 def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
     """Return the frames of a stream up to its end, Ctrl-C, SIGTERM or the failure of the camera.
 
-    With `on_each`, features go there and are not stored, and only the last KEPT times are: a stream may run for weeks.
+    With `on_each`, features go there, and only the last KEPT times are stored: a stream may run for weeks.
     """
     stored: deque[Embedded] = deque(maxlen=KEPT if on_each else None)
     total, interrupted, failure = 0, False, None
     pictures: Counter[str] = Counter()
     names, summaries = list[str](), list[list[float]]()
     try:
-        with contextlib.closing(embedded), _sigterm_as_ctrl_c():
+        with contextlib.closing(embedded), handled(signal.default_int_handler, signal.SIGTERM):  # as Ctrl-C
             for frame in embedded:
                 total += 1
                 pictures[frame.picture] += 1
@@ -456,19 +442,6 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
         pictures["black"], failure, contact, reused.astype(bool), estimated.astype(bool),
         dict(zip(names, np.transpose(summaries), strict=True)) if names else None,
     )  # fmt: skip
-
-
-@contextlib.contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt inside the block. Python has handlers in the main thread only."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def budget(result: Result) -> list[str]:

@@ -1,11 +1,8 @@
 """Does touch matter for a task? The same probe on touches that were exchanged, shifted, emptied or averaged.
 
-A probe can score well on what a recording shows besides touch: the gel, the light, the order of the data. Each control
-removes one thing. Shuffled touch is that of another row, and time-shifted touch that of half a recording later.
-Background only is the untouched gel. Mean touch is the mean of all features.
+Each control removes one thing. Shuffled touch is that of another row, and time-shifted touch that of half a recording
+later. Background only is the untouched gel. Mean touch is the mean of all features.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,19 +13,18 @@ import numpy as np
 from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import statistics
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore, encoder_features
 from anytouch_jax.evaluate.probing import probe_tasks
-from anytouch_jax.evaluate.statistics import Array, GroupSums
-from anytouch_jax.evaluate.verdict import interval_text
+from anytouch_jax.evaluate.statistics import Array, GroupSums, interval_text
 
 REAL, SHUFFLED, SHIFTED, BACKGROUND, MEAN = (
     "real touch", "shuffled touch", "time-shifted touch", "background only", "mean touch",
 )  # fmt: skip
-Log = Callable[[str], None]
 
 
 def probe_counterfactual(
@@ -36,10 +32,9 @@ def probe_counterfactual(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the results of `probe_tasks` for the five kinds of touch, and what real touch adds to each of the others.
 
-    An entry of the second has task, head, control, difference, low and high. The last two are a 95 % interval of the
-    paired difference of accuracy or R2, over the same test groups and seeds. Background only needs an untouched gel for
-    every row. Without it the control is left out, which is logged. `options` are others of `probe_tasks`. Raises
-    UserError.
+    An entry of the second has task, head, control, difference, low and high: a paired difference of accuracy or R2 with
+    its 95 % interval. Without an untouched gel for every row "background only" is left out. `options` are others of
+    `probe_tasks`. Raises UserError.
     """
     if len(models) != 1:
         raise UserError(f"A counterfactual probe takes one encoder, not {len(models)}. Give one --model.")
@@ -77,9 +72,17 @@ def touch_sources(
     def shifted(rows: Array, frames: int) -> Array:
         return shift_in_time(table, rows, frames)
 
+    gel = gels.shared(lambda picture: encoder.prepare(picture, picture if encoder.subtracts else None))
+
+    def empty(clips: Array, rows: Array) -> Array:
+        return np.broadcast_to(np.stack([np.asarray(gel(row)) for row in rows.tolist()])[:, None], clips.shape)
+
+    def background(rows: Array, frames: int) -> Array:
+        return embed_rows(encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding)[1]
+
     stores = {REAL: real, SHUFFLED: from_real(lambda rows, _: shuffle_rows(table, rows)), SHIFTED: from_real(shifted)}
     if gels.has(np.flatnonzero(np.isin(table.text_column("split"), ("train", "val", "test")))).all():
-        stores[BACKGROUND] = FeatureStore(_background_features(table, encoder, gels, **encoding))
+        stores[BACKGROUND] = FeatureStore(background)
     else:
         log(f"{BACKGROUND}: left out, as some rows have no picture of the untouched gel")
     stores[MEAN] = FeatureStore(average)
@@ -106,20 +109,6 @@ def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
     partner = np.arange(len(table))
     partner[ends] = ends[later]
     return partner[rows]
-
-
-def _background_features(
-    table: Manifest, encoder: Encoder, gels: UnitGels, **encoding: Any
-) -> Callable[[Array, int], Array]:
-    gel = gels.shared(lambda picture: encoder.prepare(picture, picture if encoder.subtracts else None))
-
-    def empty(clips: Array, rows: Array) -> Array:
-        return np.broadcast_to(np.stack([np.asarray(gel(row)) for row in rows.tolist()])[:, None], clips.shape)
-
-    def compute(rows: Array, frames: int) -> Array:
-        return embed_rows(encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding)[1]
-
-    return compute
 
 
 def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:

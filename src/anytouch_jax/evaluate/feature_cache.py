@@ -1,7 +1,5 @@
 """Feature caches: features by manifest row, of an encoder, a features file or raw pixels; in memory and on disk."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
@@ -26,14 +24,13 @@ from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, read
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import Scaling
-from anytouch_jax.evaluate.statistics import Array
+from anytouch_jax.evaluate.statistics import RANDOM, RAW, Array
 from anytouch_jax.evaluate.tasks import TaskRows
 from anytouch_jax.files import read_arrays
 
 Order = Literal["right", "shuffled", "repeated"]
 Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
 
-RAW, RANDOM = "raw pixels", "random encoder"
 VERSION = 4  # of the features; a change to their computation raises it
 RAW_SIZE = (240, 320)  # of a picture before its area averages
 SMALL = (24, 32)
@@ -91,10 +88,7 @@ def encoder_features(
     universal: bool = False, folder: Path | None = None, gels: UnitGels | None = None,
     log: Callable[[str], None] = lambda _: None,
 ) -> FeatureStore:  # fmt: skip
-    """Return the features of an encoder; `universal`: the universal tokens for every sensor.
-
-    An unknown sensor gets these too, which is reported by `log`.
-    """
+    """Return the features of an encoder; `universal`: the universal tokens for every sensor, as for unknown ones."""
     gels = gels or UnitGels(table)
 
     def describe() -> dict[str, Any]:
@@ -127,16 +121,14 @@ def pixel_features(
         places = places.reshape(windows.shape)
         return np.concatenate([last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1)
 
-    return FeatureStore(
-        compute, lambda: _content(table, "raw pixels in colour", order) | {"gels": gels.digest()}, folder
-    )
+    name = "raw pixels in colour"
+    return FeatureStore(compute, lambda: _content(table, name, order) | {"gels": gels.digest()}, folder)
 
 
 def file_features(path: Path, table: Manifest) -> FeatureStore:
     """Return the features of an .npz file: arrays `features` (n, d) and `rows` (n,) of the manifest.
 
-    Raises UserError for another file, for features of another manifest (by `key/path`), and, when they are read, for
-    clips of another length (by `about/frames`) and for missing rows.
+    Raises UserError for another file or manifest, and, when they are read, for other clips and missing rows.
     """
     features, about = read_npz(path)
     values, rows, length = features.values, features.rows, about.get("frames")
@@ -216,10 +208,7 @@ def image_digest(table: Manifest, count: int = 32) -> str:
 
 
 def raw_pixels(frame: Array, background: Array | None) -> Array:
-    """Return pixels in colour and their difference from the background (0 if it is None), averaged down to SMALL.
-
-    `frame`, `background`: u8 RGB (h, w, 3) -> f32 (2 * 24 * 32 * 3,) in 0..1.
-    """
+    """Return pixels in colour, and minus the background (0 if None): u8 RGB (h, w, 3) -> f32 (2 * 24 * 32 * 3,)."""
     pixels = _small(frame)
     return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background)])
 
@@ -231,10 +220,7 @@ def _pair_reader(table: Manifest, gels: UnitGels, prepare: Callable[[Array], Any
 
 
 def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = None) -> Array:
-    """Return frames minus their untouched gel in RGB, averaged down to SMALL: f32 (n, 24 * 32 * 3) in -1..1.
-
-    Raises UserError that names a row without one, or whose untouched gel has other proportions.
-    """
+    """Return frames minus their untouched gel in RGB: f32 (n, 24 * 32 * 3) in -1..1. Raises UserError without one."""
     read = _pair_reader(table, gels or UnitGels(table), lambda one: (_small(one), one.shape[1] / one.shape[0]))
     values = np.zeros((len(rows), SMALL[0] * SMALL[1] * 3), np.float32)
     for place, row in enumerate(map(int, rows)):
@@ -250,10 +236,7 @@ def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = 
 def principal_components(
     features: Array, train: Array, components: int = COMPONENTS, solver: Literal["full", "randomized"] = "full"
 ) -> Array:
-    """Return `features` (n, d) on the principal components of their `train` (n,) rows, largest variance first.
-
-    Raises UserError if `train` is empty.
-    """
+    """Return `features` (n, d) on the principal components of their `train` (n,) rows. Raises UserError without any."""
     fitted = features[np.asarray(train, bool)]
     if not len(fitted):
         raise UserError("No row is marked as train. The principal components need some.")
@@ -295,18 +278,13 @@ def opened(models: Sequence[str | Path | FeatureSource]) -> list[Encoder | Featu
 
 
 def with_gel(rows: TaskRows, gels: UnitGels, models: Sequence[Encoder | FeatureSource]) -> TaskRows:
-    """Return the rows that all models can read: those that have an untouched gel, if one of them needs it.
-
-    The others are counted in a note. Raises UserError if none is left.
-    """
+    """Return the rows that all models can read, for those that need an untouched gel. Raises UserError without any."""
     encoders = [one if isinstance(one, Encoder) else one.encoder for one in models]
     if not any(encoder is not None and encoder.needs_background for encoder in encoders):
         return rows
     has = np.all(gels.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
     if not has.any():
-        raise UserError(
-            f"None of {len(rows.rows)} rows has a picture of the untouched gel, which is subtracted. {ADVICE}"
-        )
+        raise UserError(f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. {ADVICE}")
     note = f"{(~has).sum()} rows are left out: they have no picture of the untouched gel"
     return rows.take(np.flatnonzero(has))._replace(notes=(*rows.notes, *([] if has.all() else [note])))
 

@@ -1,8 +1,4 @@
-"""Heads on frozen features: linear, nearest-neighbour, ridge and gradient-trained.
-
-A head is fitted once for all its options, from which a protocol selects one. The options are penalties (linear, ridge),
-numbers of neighbours (kNN) or epochs (the authors' gradient-trained layer).
-"""
+"""Heads on frozen features: linear, nearest-neighbour, ridge and gradient-trained, each fitted for all its options."""
 
 from __future__ import annotations
 
@@ -19,8 +15,8 @@ from threadpoolctl import ThreadpoolController
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.encoder.arrays import binary_scale, unit_rows
+from anytouch_jax.encoder.embed import nearest
 from anytouch_jax.encoder.linear_head import LinearHead
-from anytouch_jax.encoder.search import nearest
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.shown import shown_short
@@ -40,10 +36,7 @@ STEPS = 300  # of logistic regression
 
 @dataclass(frozen=True)
 class GradientRecipe:
-    """The authors' probe: one linear layer on unscaled features, AdamW, cosine decay to 0 without warm-up.
-
-    The defaults are those of `run_probe_OF1.sh` in the released code for two devices. The batch is that of both.
-    """
+    """The authors' probe: a linear layer, AdamW, cosine decay to 0. Defaults are of `run_probe_OF1.sh`, two devices."""
 
     epochs: int = 50
     batch: int = 128
@@ -57,9 +50,8 @@ class GradientRecipe:
 class ProbeHead:
     """A head to fit; on numbers "linear" is ridge regression.
 
-    `scaling` "column" brings every feature to unit variance. "common" divides all by one factor, which keeps the
-    ranking of principal components. `options` replace the default penalties, numbers of neighbours or epochs. They are
-    sorted, as a strong penalty is a good start for the next weaker one. `recipe` and `seed` are of "gradient". Raises
+    `scaling` "column" brings every feature to unit variance, "common" divides all by one factor. `options` replace the
+    default penalties, numbers of neighbours or epochs, and are sorted. `recipe` and `seed` are of "gradient". Raises
     UserError for an unknown head, and for options that are not above 0.
     """
 
@@ -105,8 +97,7 @@ def fit_head(
 ) -> FittedHead:
     """Fit all options of a head on features f32 (n, d) and class numbers below `classes` (0: y are numbers).
 
-    `weights` (n,): how often each row counts, a whole number except in logistic regression. `start`: a fit that it
-    starts from.
+    `weights` (n,): how often each row counts, whole except in logistic regression. `start`: a fit that it starts from.
     """
     epochs = range(1, head.recipe.epochs + 1)
     defaults = {"linear": PENALTIES if classes else RIDGE, "knn": NEIGHBOURS, "gradient": epochs}
@@ -143,10 +134,7 @@ def linear_path(
     x: Array, y: Array, penalties: Sequence[float], *, scaling: Scaling = "column", weights: Array | None = None,
     start: LinearModel | None = None,
 ) -> list[LinearModel]:  # fmt: skip
-    """Return logistic regression of `y` (n,), of two classes or more, for each penalty, strongest first.
-
-    Each starts from the one before, the first from `start`. `weights` (n,): how often each row counts.
-    """
+    """Return logistic regression of `y` (n,) for each penalty, each from the fit before; `weights` (n,) of the rows."""
     mean, scale = _mean_and_scale(x, weights, scaling)
     classes, numbers = np.unique(y, return_inverse=True)
     first = start.fit if start is not None and np.array_equal(start.classes, classes) else None
@@ -170,10 +158,7 @@ def _mean_and_scale(x: Array, weights: Array | None = None, scaling: Scaling = "
 
 
 def fit_ridge(x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "column") -> Predict:
-    """Return a function from features (m, d) to ridge predictions (m,), one array a penalty.
-
-    A penalty is added to the mean squared error. One covariance serves all.
-    """
+    """Return a function from features (m, d) to ridge predictions (m,), one array a penalty of the mean square."""
     from sklearn.linear_model import Ridge  # here, so that other heads are fitted without it
 
     mean, scale = _mean_and_scale(x, scaling=scaling)
@@ -250,10 +235,9 @@ def calibrate(
 ) -> LinearHead:  # fmt: skip
     """Return the head with a calibration from rows that it was not fitted on.
 
-    `features` (N, d), class names `y` (N,) str, `groups` (N,) and `sensors` (N,) are of all rows. `fit` and `val` are
-    row numbers. `folds` yields rows of `fit` to fit on and left out: heads fitted again with `penalty` predict these.
-    `shares` are those of `LinearHead.calibrated`. Rows of a class that a fit lacks are not used. Raises UserError if
-    none is left.
+    `features` (N, d), class names `y` (N,), `groups` (N,) and `sensors` (N,) are of all rows. `fit` and `val` are row
+    numbers. `folds` yields rows of `fit` to fit on and left out: heads fitted again with `penalty` predict these.
+    `shares` are those of `LinearHead.calibrated`. Raises UserError if no row is left.
     """
     count, logits, used = len(head.classes), [head.scaled(features[val]) @ head.weights + head.bias], [val]
     numbers = np.searchsorted(head.classes, y)
@@ -290,10 +274,7 @@ def linear_head(
 
 
 class Logistic(NamedTuple):
-    """A fit: `weights` f32 (d, columns) and `bias` f32 (columns,), one column for two classes, else one a class.
-
-    `loss` is the mean log loss plus the penalty times half the squared weights. `finished`: within STEPS.
-    """
+    """A fit: `weights` f32 (d, columns), `bias` (columns,), one column for two classes; `finished`: within STEPS."""
 
     weights: Array
     bias: Array
@@ -312,8 +293,8 @@ def logistic_path(
 ) -> Iterator[Logistic]:  # fmt: skip
     """Yield multinomial logistic regressions of class numbers `y` (n,) below `classes` on features `x` f32 (n, d).
 
-    Each starts from the fit before. A penalty is the factor of half the squared weights, added to the mean log loss;
-    the bias is free. Give standardised features, and the strongest penalty first. `weights` (n,) of rows in that mean.
+    A penalty is the factor of half the squared weights, added to the mean log loss; the bias is free. Give standardised
+    features, and the strongest penalty first: each starts from the fit before. `weights` (n,) of rows in that mean.
     """
     x = np.ascontiguousarray(x, np.float32)
     columns = 1 if classes == 2 else classes
@@ -375,9 +356,7 @@ def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
     return loss, logits
 
 
-@functools.cache
-def _libraries() -> ThreadpoolController:
-    return ThreadpoolController()  # finding the libraries takes longer than a small fit
+_libraries = functools.cache(ThreadpoolController)  # finding the libraries takes longer than a small fit
 
 
 def threads(size: int) -> contextlib.AbstractContextManager[Any]:

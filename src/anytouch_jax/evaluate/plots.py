@@ -1,16 +1,20 @@
-"""Charts as PNG files, written atomically: losses, t-SNE, sample grids, bars with intervals."""
+"""Charts as PNG files (losses, t-SNE, sample grids, bars), and the geometry of a feature space."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from anytouch_jax.config import parse_json
+from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.splits import subsample
 from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.files import atomic_write
 
@@ -19,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TERMS = ("reconstruction", "next_frame", "align", "match")  # the terms of a loss that get a curve
+MOST = 4000  # rows that are compared in pairs
 _DPI = 110
 _LEGEND = 12  # more names than that are colours without a legend
 
@@ -165,3 +170,78 @@ def _colours(count: int) -> Array:
     if count <= 10:
         return np.asarray(colormaps["tab10"].colors)[:count]  # type: ignore[attr-defined]
     return np.asarray(colormaps["hsv"](np.arange(count) * 0.618 % 1.0))[:, :3] * 0.85
+
+
+@dataclass(frozen=True)
+class Space:
+    """Numbers of one feature space; see the functions of the same names. None: not defined for these labels."""
+
+    name: str
+    alignment: float | None
+    uniformity: float
+    silhouette_sensor: float | None
+    silhouette_object: float | None
+    rows: int
+
+
+def alignment(first: Array, second: Array) -> float:
+    """Return the mean squared distance of unit-norm positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
+    first, second = _unit(first), _unit(second)
+    if first.shape != second.shape or not len(first):
+        raise UserError(f"Alignment needs pairs of rows, not {first.shape} and {second.shape}.")
+    return float(np.mean(np.linalg.norm(first - second, axis=1) ** 2))
+
+
+def uniformity(features: Array) -> float:
+    """Return the log of the mean of exp(-2 |x - y|^2) over pairs of unit-norm rows, -8 to 0 (Wang & Isola, 2020)."""
+    x = _unit(subsample(np.asarray(features), MOST))
+    if len(x) < 2:
+        raise UserError("Uniformity needs two rows or more.")
+    likeness = (x @ x.T)[np.triu_indices(len(x), 1)]
+    return float(np.log(np.mean(np.exp(-2.0 * np.maximum(2 - 2 * likeness, 0.0)))))
+
+
+def silhouette(features: Array, labels: Any) -> float | None:
+    """Return the mean silhouette by cosine distance, -1..1; None with fewer than two labels, or as many as rows."""
+    from sklearn.metrics import silhouette_score
+
+    labels = subsample(np.asarray(labels).astype(str), MOST)
+    count = len(np.unique(labels))
+    if not 2 <= count < len(labels):
+        return None
+    return float(silhouette_score(_unit(subsample(np.asarray(features), MOST)), labels, metric="cosine"))
+
+
+def tsne(features: Array, *, seed: int = 0) -> Array:
+    """Return a t-SNE of features (n, d) by cosine distance, f32 (n, 2). Raises UserError below 4 rows or 2 columns."""
+    from sklearn.manifold import TSNE
+    from threadpoolctl import threadpool_limits
+
+    if (features := np.asarray(features)).ndim != 2 or features.shape[0] < 4 or features.shape[1] < 2:
+        raise UserError(f"A t-SNE needs 4 rows of 2 columns or more, not {features.shape}.")
+    x = _unit(features)
+    # Squared Euclidean distances of unit-norm rows are twice the cosine distances.
+    model = TSNE(perplexity=min(30.0, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed)
+    with threadpool_limits(1):  # its threads wait for each other at every step, very long on a busy machine
+        return np.asarray(model.fit_transform(x.astype(np.float32)), np.float32)
+
+
+def describe(features: Array, sensors: Any, objects: Any, touches: Any, *, name: str = "features") -> Space:
+    """Return all numbers of features (n, d); positive pairs are the rows of one touch by different sensors."""
+    x, sensors, objects = np.asarray(features), np.asarray(sensors).astype(str), np.asarray(objects).astype(str)
+    known, members = objects != "", dict[str, list[int]]()
+    for row, touch in enumerate(np.asarray(touches).astype(str)):
+        members.setdefault(touch, []).append(row)
+    several = [combinations(rows, 2) for _, rows in sorted(members.items())]
+    pairs = [(a, b) for a, b in chain.from_iterable(several) if sensors[a] != sensors[b]]
+    first, second = np.array(pairs, np.int64).reshape(-1, 2).T
+    aligned = alignment(x[first], x[second]) if pairs else None
+    by_sensor, by_object = silhouette(x, sensors), silhouette(x[known], objects[known])
+    return Space(name, aligned, uniformity(x), by_sensor, by_object, len(x))
+
+
+def _unit(features: Array) -> Array:
+    x = np.asarray(features, np.float64)
+    if x.ndim != 2 or not np.isfinite(x).all():
+        raise UserError(f"Features must be finite numbers (n, d), not {x.shape} with NaN or Inf.")
+    return unit_rows(x)

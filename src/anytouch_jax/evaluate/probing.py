@@ -1,14 +1,11 @@
 """Probes of frozen features: of arrays, a label column, named tasks, or a public benchmark; their results and tables.
 
-A task selects rows and labels. Features are computed once, groups are split, heads are fitted and scored. Frames are
-never flipped or otherwise augmented. The protocols are those of `splits`. In tasks, "honest" splits whole groups
-(objects, recordings) again by every seed, and "published" keeps the manifest's split.
+A task selects rows and labels. Frames are never augmented. The protocols are those of `splits`. In tasks, "honest"
+splits whole groups (objects, recordings) again by every seed, and "published" keeps the manifest's split.
 
-Probes of arrays take `features` (n, d); `labels` (n,), where None, "" or NaN is no label; `groups` (n,), recordings or
-objects that no fold or bootstrap cuts; and `split` (n,), "train", "val" or "test" for the rows that take part.
+Probes of arrays take `features` (n, d); `labels` (n,), where None, "" or NaN is no label; `groups` (n,), which no fold
+or bootstrap cuts; and `split` (n,), "train", "val" or "test" for the rows that take part.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import itertools
@@ -25,23 +22,20 @@ from anytouch_jax.bars import tracked
 from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder import novelty
-from anytouch_jax.encoder.arrays import Join, Pooling
-from anytouch_jax.encoder.linear_head import LinearHead, save_head
+from anytouch_jax.encoder.arrays import Join, Log, Pooling
+from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS, LinearHead, save_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, splits, statistics, tasks
 from anytouch_jax.evaluate import heads as probe_heads
 from anytouch_jax.evaluate.feature_cache import RANDOM, RAW, FeatureSource, Order
 from anytouch_jax.evaluate.heads import GradientRecipe, HeadName, LinearModel, ProbeHead, Scaling
 from anytouch_jax.evaluate.splits import SIDES, LabelledFeatures, RowRoles, Selection, Split
-from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
+from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol, interval_text, share_text, verdict
 from anytouch_jax.evaluate.tasks import Task, TaskRows
-from anytouch_jax.evaluate.verdict import interval_text, share_text, verdict
 from anytouch_jax.files import atomic_write
 from anytouch_jax.shown import shown_short
 
 Subsets = Mapping[str, Array]
-Log = Callable[[str], None]
 Paths = Sequence[str | Path]
 Models = Sequence[str | Path | FeatureSource]
 Names = Sequence[str] | None
@@ -79,13 +73,10 @@ class ProbeResult:
     """The score of a head fitted on all of train, on the test rows. Shares are in 0..1.
 
     `low`, `high`: 95 % interval of the accuracy or R2 under a bootstrap over the test groups, None with fewer than two.
-    `penalty` (k, epoch) was selected on `chosen_on`. If that is test, the score is an upper estimate.
-
-    Of classes: a test row of a class that train lacks counts as an error. `baseline` is the accuracy of the most
-    frequent class of train. `refit_mean`, `refit_std`: accuracy of `seeds` heads fitted on bootstraps of the train
-    groups. Each has some 63 % of the groups, so the mean is a little below `accuracy`.
-
-    Of numbers: `r2` and the mean absolute error `mae` in units of the label. `baseline_mae` is that of train's mean.
+    `penalty` (k, epoch) was selected on `chosen_on`. If that is test, the score is an upper estimate. A class that
+    train lacks counts as an error. `baseline` is the most frequent class of train. `refit_mean`, `refit_std`: accuracy
+    of `seeds` heads fitted on bootstraps of the train groups, a little lower. `mae` is in units of the label,
+    `baseline_mae` that of train's mean.
     """
 
     probe: str
@@ -151,13 +142,6 @@ def probe_features(
     return replace(result, outcome=result.outcome and replace(result.outcome, fitted=(model, data.names)))
 
 
-def majority_baseline(labels: Any, groups: Any, split: Any, *, subsets: Subsets | None = None) -> ProbeResult:
-    """Score the most frequent class of train on test."""
-    nothing = np.zeros((len(labels), 1), np.float32)
-    data, rows, _ = splits.check_rows(nothing, labels, groups, split, least_classes=1)
-    return _result("commonest class", "honest", data, rows, _constant(data, rows), None, (), subsets)
-
-
 def leave_groups_out(
     features: Array, labels: Any, groups: Any, *, folds: int | None = 10,
     penalties: Sequence[float] = (10.0, *probe_heads.PENALTIES), scaling: Scaling = "column",
@@ -165,8 +149,7 @@ def leave_groups_out(
 ) -> ProbeResult:  # fmt: skip
     """Probe each row with a linear fit on no row of its group, for instance on held-out objects.
 
-    The groups are assigned to `folds` folds (None: each group alone). The penalty is selected by folds over the other
-    groups. `baseline` is the most frequent class of the same other rows. Every labelled row is tested.
+    `folds` None: each group alone. The other groups select the penalty, and their commonest class is the baseline.
     """
     data, rows, notes = splits.check_rows(features, labels, groups, np.full(len(labels), "train"), tested=False)
     used, chosen = rows.fit, []
@@ -226,10 +209,9 @@ def _result(
         correct, parts = predicted == truth, []
         for part, mask in (subsets or {}).items():
             kept = np.asarray(mask, bool)[rows.test]
+            interval = statistics.mean_interval(correct[kept], groups[kept])
             accuracy = float(correct[kept].mean()) if kept.any() else NAN
-            parts.append(
-                SubsetResult(part, accuracy, *statistics.mean_interval(correct[kept], groups[kept]), int(kept.sum()))
-            )
+            parts.append(SubsetResult(part, accuracy, *interval, int(kept.sum())))
         scores = {
             "accuracy": scored["mean"], "baseline": scored["chance"], "parts": tuple(parts),
             "balanced_accuracy": float(np.mean([correct[truth == number].mean() for number in np.unique(truth)])),
@@ -301,16 +283,12 @@ def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
 
 def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
     """Return the cells of a result of `probe_tasks` that every table has."""
-    cells = {
-        "score": share_text(row["mean"]),
-        "95 %": interval_text(row["low"], row["high"]),
-        "chance": share_text(row["chance"]),
-    }
+    score, interval, chance = share_text(row["mean"]), interval_text(row["low"], row["high"]), share_text(row["chance"])
     if row["metric"] == "r2":
         mae, chance = (f"{row[name]:.3g} {row['unit']}".strip() for name in ("mae", "chance_mae"))
-        interval = interval_text(row["low"], row["high"], 1.0, 3)
-        cells = {"score": f"R2 {row['mean']:.3f}, {mae}", "95 %": interval, "chance": chance}
-    return cells | {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
+        score, interval = f"R2 {row['mean']:.3f}, {mae}", interval_text(row["low"], row["high"], 1.0, 3)
+    sizes = {"train": str(row["train"]), "test (groups)": f"{row['test']} ({row['groups']})"}
+    return {"score": score, "95 %": interval, "chance": chance} | sizes
 
 
 def probe_label(
@@ -318,14 +296,13 @@ def probe_label(
     leave_out: str | None = None, where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
     pooling: Pooling = "class", join: Join = "mean", seeds: int = 5, protocol: Protocol = "honest",
     controls: bool = True, cache: Path | None = None, save: Path | None = None, out: Path | None = None,
-    coverage: float = novelty.COVERAGE, false_alarms: float = novelty.FALSE_ALARMS, log: Log = print,
+    coverage: float = COVERAGE, false_alarms: float = FALSE_ALARMS, log: Log = print,
 ) -> list[ProbeResult]:  # fmt: skip
     """Probe a label column with features of every model, of features files, and of the controls.
 
-    `group` is the column that no split cuts. `leave_out` tests every value of a column held out, instead of the splits.
+    No split cuts a value of column `group`. `leave_out` tests every value of a column held out, instead of the splits.
     `where` keeps rows whose column exceeds a number. `save` writes the linear head of the only model, calibrated to a
-    `coverage` of its sets and a share of `false_alarms` of novelty. `out` writes the results as JSON. Print the results
-    with `probe_table`. Raises UserError.
+    `coverage` of its sets and a share of `false_alarms`. `out` writes JSON. `probe_table` prints. Raises UserError.
     """
     if save is not None and len(models) != 1:
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
@@ -342,13 +319,20 @@ def probe_label(
     if leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(f"All rows are of one {leave_out} ({rows.groups[0]}). Nothing is left to fit on.")
     split = rows.split if leave_out is None else np.full(len(rows.split), "train")
-    splits.check_rows(np.zeros((len(split), 1)), rows.labels, rows.groups, split, tested=leave_out is None)
+    nothing = np.zeros((len(split), 1))
+    given, cut, _ = splits.check_rows(nothing, rows.labels, rows.groups, split, tested=leave_out is None)
     results, encoding = list[ProbeResult](), dict[str, Any](least=frames, pooling=pooling, join=join, gels=gels)
     for source in feature_cache.sources(table, opened, features, controls, cache, {frames: rows.rows}, **encoding):
         pixels = source.name == RAW
         x = feature_cache.pixel_components(source.store, rows) if pixels else source.store.get(rows.rows, frames)
-        results += probe_rows(x, rows, source.name, leave_out=leave_out, protocol=protocol, seeds=seeds,
-                              scaling=source.scaling, subsets=subsets)  # fmt: skip
+        arrays = (x, rows.labels, rows.groups)
+        if leave_out is not None:
+            name = f"{source.name}: linear, {leave_out} left out"
+            results.append(leave_groups_out(*arrays, name=name, scaling=source.scaling, subsets=subsets))
+        for kind, each in {"linear": ProbeHead("linear", source.scaling), "kNN": ProbeHead("knn")}.items():
+            if leave_out is None:
+                options: dict[str, Any] = {"protocol": protocol, "seeds": seeds, "subsets": subsets}
+                results.append(probe_features(*arrays, rows.split, each, name=f"{source.name}: {kind}", **options))
         log(f"probed {source.name}")
         if save is not None and source.encoder is not None and source.name != RANDOM and (tested := results[0].outcome):
             about: dict[str, Any] = {"label": label.removeprefix("label."), "pooling": pooling, "frames": frames}
@@ -356,13 +340,11 @@ def probe_label(
             head = probe_heads.linear_head(*tested.fitted, **about, fingerprint=source.encoder.fingerprint)
             if source.encoder.subtracts:
                 head = replace(head, gels=gels.pictures(rows.rows[:, 0]))
-            head = calibrated(
-                head, x, rows, results[0].penalty or 1.0, log, coverage=coverage, false_alarms=false_alarms
-            )
-            save_head(save, head)
+            shares = {"coverage": coverage, "false_alarms": false_alarms}
+            save_head(save, calibrated(head, x, rows, results[0].penalty or 1.0, log, **shares))
             log(f"{save}: the linear head")
     if leave_out is None:
-        results.append(majority_baseline(rows.labels, rows.groups, rows.split, subsets=subsets))
+        results.append(_result("commonest class", "honest", given, cut, _constant(given, cut), None, (), subsets))
     if out is not None:
         atomic_write(out, probe_json(results))
     return results
@@ -372,10 +354,9 @@ def calibrated(head: LinearHead, x: Array, rows: TaskRows, penalty: float, log: 
     """Return the head with its calibration, and log what it says; without one if the data do not allow it."""
     fit, val = (np.flatnonzero(rows.split == name) for name in ("train", "val"))
     try:
-        folds = splits.group_folds(fit, rows.groups, np.unique(rows.labels, return_inverse=True)[1], splits.FOLDS)
-        head = probe_heads.calibrate(
-            head, x, rows.labels, rows.groups, rows.sensors, fit, val, folds, penalty, **shares
-        )
+        labels, groups, sensors = rows.labels, rows.groups, rows.sensors
+        folds = splits.group_folds(fit, groups, np.unique(labels, return_inverse=True)[1], splits.FOLDS)
+        head = probe_heads.calibrate(head, x, labels, groups, sensors, fit, val, folds, penalty, **shares)
     except UserError as error:
         log(f"The head has no calibration: {error}")
     for sentence in head.promises():
@@ -388,30 +369,11 @@ def label_rows(
     where: tuple[str, float] | None = None, sensor: str | None = None, frames: int = 1,
     among: Callable[[TaskRows], TaskRows] = lambda rows: rows,
 ) -> tuple[TaskRows, dict[str, Array]]:  # fmt: skip
-    """Return the rows of `probe_label`, and masks of those whose class (held-out object) alignment may have named.
-
-    `among` chooses some of the rows.
-    """
+    """Return the rows of `probe_label`, of which `among` chooses some, and masks as of `tasks.described_subsets`."""
     task = tasks.label_task(table, label, group=leave_out or group, where=where, sensor=sensor)
     rows = among(tasks.select(table, task, frames))
     column, name = (task.label, "classes") if leave_out is None else (task.groups[0], f"{leave_out}s")
     return rows, tasks.described_subsets(table, column, rows.rows[:, 0], name)
-
-
-def probe_rows(
-    features: Array, rows: TaskRows, name: str, *, leave_out: str | None = None, protocol: Protocol = "honest",
-    seeds: int = 5, scaling: Scaling = "column", subsets: dict[str, Array] | None = None,
-) -> list[ProbeResult]:  # fmt: skip
-    """Return the linear and kNN results of features (n, d) on the rows of a task, or that of held-out groups."""
-    arrays = (features, rows.labels, rows.groups)
-    if leave_out is not None:
-        name = f"{name}: linear, {leave_out} left out"
-        return [leave_groups_out(*arrays, name=name, scaling=scaling, subsets=subsets)]
-    options: dict[str, Any] = {"protocol": protocol, "seeds": seeds, "subsets": subsets}
-    kinds = {"linear": ProbeHead("linear", scaling), "kNN": ProbeHead("knn")}
-    return [
-        probe_features(*arrays, rows.split, head, name=f"{name}: {kind}", **options) for kind, head in kinds.items()
-    ]
 
 
 class _Plan(NamedTuple):
@@ -435,17 +397,15 @@ def probe_tasks(
 ) -> dict[str, Any]:  # fmt: skip
     """Probe named tasks with features of every model, of features files, and of the controls.
 
-    The "results" have a JSON-ready dict for each source of features, task, head and protocol. These four are keys.
-    Among the others, `metric` is "accuracy" in 0..1 or "r2". `mean`, `low` and `high` (95 %) are over seeds and test
-    groups. `values` has one a seed. `train` and `test` count rows, `groups` the tested groups. `chance` is the score of
-    the most frequent class or the mean of train. Classes, chosen options, frames, order and notes are there too. A
-    regression also has mae, mae_low, mae_high and chance_mae in `unit`. Print them with `probe_table`. Tasks that
-    cannot be probed are left out with their reason.
+    The "results" have a JSON-ready dict for each source of features, task, head and protocol. `metric` is "accuracy" in
+    0..1 or "r2". `mean`, `low` and `high` (95 %) are over seeds and test groups, and `values` has one a seed. `train`
+    and `test` count rows, `groups` the tested groups. `chance` is that of the most frequent class or the mean of train.
+    A regression also has mae, mae_low, mae_high and chance_mae in `unit`. Tasks that cannot be probed are "left_out"
+    with their reason.
 
-    `protocol` "published" reports both protocols. `frames` replaces that of each task. `order` shuffles the frames of
-    clips, or repeats the last. `universal`: the universal tokens for all sensors. `paper`: the accuracy that the report
-    names. `out` writes JSON. `keep` gets the test rows of every seed, by the four keys. `sides`: train_sensors,
-    test_sensors, train_units and test_units, names or patterns to fit on and to test on. Raises UserError.
+    `protocol` "published" reports both. `frames` replaces that of each task. `order` shuffles the frames of clips, or
+    repeats the last. `universal`: the universal tokens for all sensors. `keep` gets the test rows of every seed.
+    `sides`: train_sensors, test_sensors, train_units and test_units, names or patterns. Raises UserError.
     """
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
@@ -458,8 +418,7 @@ def probe_tasks(
     lengths = sorted({plan.frames for plan in plans})  # one pass computes the features of all tasks
     rows = {n: np.concatenate([plan.rows.rows.ravel() for plan in plans if plan.frames == n]) for n in lengths}
     log(gels.report(np.unique(np.concatenate(list(rows.values())))))
-    encoding: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal}
-    encoding["gels"] = gels
+    encoding: dict[str, Any] = {"pooling": pooling, "join": join, "order": order, "universal": universal, "gels": gels}
     sources = feature_cache.sources(table, opened, features, controls, cache, rows, least=frames or 1, **encoding)
     if join != "mean" and any(s.encoder and (frames or 1) <= s.encoder.config.model.frames for s in sources):
         raise UserError("--join has no effect without --frames longer than a clip of the model.")
@@ -496,10 +455,7 @@ def probe_tasks(
 
 
 def probe_benchmark(models: Models, data: Paths | Manifest, benchmark: str, **options: Any) -> dict[str, Any]:
-    """Probe a public benchmark with the authors' pooling, head and settings, by both protocols.
-
-    `options` are the others of `probe_tasks`, which returns the result. Raises UserError.
-    """
+    """Probe a public benchmark as its authors do, by both protocols; `options` of `probe_tasks`. Raises UserError."""
     setting = tasks.find_named(tasks.BENCHMARKS, benchmark, "benchmark")
     return probe_tasks(
         models, data, [setting.task], heads=("gradient",), protocol="published", pooling=setting.pooling,
@@ -519,7 +475,7 @@ def _plan_tasks(
     if not names:
         raise UserError("The manifest has no label of any task. `anytouch probe label` takes any column.")
     errors = []
-    for task in map(tasks.find_task, names):
+    for task in [tasks.find_named(tasks.TASKS, name, "task") for name in names]:
         try:
             plans.append(_plan(table, task, frames, sides, max_rows, among))
         except UserError as error:

@@ -28,9 +28,8 @@ def pixel_scores(params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net,
     """Return the mean squared errors of normalised pixels (Eq. 1, 2) of the clips that end at rows `ends`.
 
     "reconstruction" (masked patches) and "next_frame" are those of stage 1. Those that begin with "plain" are of
-    `plain_reconstruction` on the same masks. Those that begin with "untouched" are of an untouched gel, if the
-    background is subtracted. A clip has the model's frames and, if it predicts one, the next frame. Sensors outside the
-    table get the universal tokens. Raises ValueError without rows, and for `norm_pix_loss`.
+    `plain_reconstruction`, and with "untouched" of an untouched gel, if the background is subtracted. Sensors outside
+    the table get the universal tokens. Raises ValueError without rows, and for `norm_pix_loss`.
     """
     if config.objective.norm_pix_loss or not len(ends):
         raise ValueError("pixels are scored on at least one clip, and not with norm_pix_loss")
@@ -64,11 +63,7 @@ def _errors(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config
 
 
 def plain_reconstruction(target: Any, hidden: Any, frames: int) -> Any:
-    """Return patches (B, N, T, C) predicted without a model, from patches that are not `hidden` bool (B, N).
-
-    Every patch is the mean of the sample's visible ones. A frame after the encoder's `frames` is a copy of the last of
-    these.
-    """
+    """Return patches (B, N, T, C): the mean of those not `hidden` (B, N); after `frames` a copy of the last frame."""
     visible = ~hidden[:, :, None, None]
     mean = (target * visible).sum(axis=1, keepdims=True) / visible.sum(axis=1, keepdims=True)
     prediction = jnp.broadcast_to(mean, target.shape)
@@ -80,8 +75,7 @@ def reconstruction_panels(
 ) -> np.ndarray:
     """Return an RGB image u8 with a row per sample: original, masked input, reconstruction, next frame, prediction.
 
-    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). Visible patches are copied from the input. With `norm_pix_loss` the
-    prediction is scaled back by the true mean and spread of each patch.
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). With `norm_pix_loss` the true mean and spread are put back.
     """
     refuse_forked()
     patch, size, frames = net.model.patch, net.model.image_size, net.model.frames

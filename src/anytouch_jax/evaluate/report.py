@@ -1,7 +1,5 @@
 """The report of two runs on a manifest: sections of text, figures and tables in one Markdown file, numbers as JSON."""
 
-from __future__ import annotations
-
 import base64
 import html
 import json
@@ -25,10 +23,11 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import read_file
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import known_contact
+from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import geometry, plots, probing, retrieval, statistics
+from anytouch_jax.evaluate import plots, probing, retrieval, statistics
 from anytouch_jax.evaluate.feature_cache import RANDOM, background_difference, principal_components
 from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.plots import ShareBar
@@ -39,7 +38,6 @@ from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.evaluate.tasks import best_rows
 from anytouch_jax.files import atomic_write, read_array
 
-Log = Callable[[str], None]
 Change = tuple[float, float | None, float | None]  # a difference with its interval
 
 PIXELS, VECTOR = "pixels minus background", "area, centroid, force"
@@ -66,8 +64,7 @@ def write_report(
 ) -> Path:
     """Write `folder`/report.html, report.md, report.json (`numbers`) and the figures, and return the path of report.md.
 
-    report.html is one file with its pictures inside. The figures are written first and report.md last, each atomically,
-    so an existing report is always complete. Raises UserError for a missing figure, OSError for a full disk.
+    Each file is written atomically, report.md last. Raises UserError for a missing figure, OSError for a full disk.
     """
     parts = [f"# {title}"]
     for section in sections:
@@ -87,10 +84,7 @@ def write_report(
 
 
 def html_page(text: str, folder: Path, title: str) -> str:
-    """Return Markdown as an HTML page of one file. Pictures of `folder`/figures lie inside.
-
-    HTML in the Markdown is shown as text. The page runs no script and loads nothing.
-    """
+    """Return Markdown as one HTML page, pictures of `folder`/figures inside; its HTML is text, and no script runs."""
     from markdown_it import MarkdownIt
 
     def inside(match: re.Match[str]) -> str:
@@ -118,10 +112,8 @@ def demo_report(
 ) -> Path:  # fmt: skip
     """Write a report of two runs on the split test of a manifest, and return the path of report.md.
 
-    It has samples, losses, reconstructions, the feature space, retrieval, matching and probes. `touches` is the largest
-    number of touches of test, and half of it of train and of val, each with its deepest frame. The folder `out` is
-    written at the end, so a report that fails leaves an earlier one unchanged. Raises UserError, also for a run of the
-    other stage and for weights files.
+    `touches` is the most of test, and half of it of train and of val, each with its deepest frame. A report that fails
+    leaves an earlier one in `out` unchanged. Raises UserError, also for a run of the other stage and for weights files.
     """
     clock, table = time.perf_counter(), manifests.read(manifest)
     if (count := len(_chosen(table, "test", touches, seed))) < FEWEST:
@@ -198,10 +190,7 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
 
 
 def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[Section]:
-    """Return a section for each grade of alignment: a picture with a touch per row and a sensor per column, captions.
-
-    The touches are those by most sensors, of different objects if possible.
-    """
+    """Return a section for each grade of alignment: pictures with a touch a row and a sensor a column, and captions."""
     rows, sections = deepest_rows(manifest), []
     grades = _grades(manifest, rows, "")
     for grade in np.unique(grades):
@@ -369,15 +358,15 @@ def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
     return rows
 
 
-def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[geometry.Space]]:
+def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[plots.Space]]:
     """Return the section and the numbers of the feature spaces: alignment, uniformity, silhouettes, t-SNE."""
     rows = study.test(study.rows)
     sensors, objects = study.manifest.text_column("sensor")[rows], study.manifest.text_column("object")[rows]
     touch = study.manifest.codes("touch", own=True)[rows]
     drawn = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_T_SNE_ROWS])
     features = {name: study.test(values) for name, values in study.classes.items()}
-    spaces = [geometry.describe(values, sensors, objects, touch, name=name) for name, values in features.items()]
-    points = {name: geometry.tsne(values[drawn], seed=seed) for name, values in tracked(features.items(), "t-SNE")}
+    spaces = [plots.describe(values, sensors, objects, touch, name=name) for name, values in features.items()]
+    points = {name: plots.tsne(values[drawn], seed=seed) for name, values in tracked(features.items(), "t-SNE")}
     path = out / "figures" / "tsne.png"
     plots.tsne_panels(path, points, sensors[drawn], objects[drawn])
     lines = []
@@ -425,10 +414,7 @@ def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, 
 def retrieval_section(
     results: Mapping[str, Mapping[str, Sequence[retrieval.Retrieval]]], best: str, notes: Sequence[str], folder: Path
 ) -> tuple[Section, dict[str, dict[str, Change]]]:
-    """Return tables of retrieval {grade: {"matched" or "by chance": results}}, and differences to the features `best`.
-
-    The differences {grade: {features: (mean, low, high)}} are in recall@1, paired by query.
-    """
+    """Return tables of retrieval {grade: {"matched" or "by chance": results}}, and paired differences to `best`."""
     rows, ahead, changes, panels = [], [], {}, {}
     for grade, kinds in results.items():
         pooled = {

@@ -1,9 +1,7 @@
 """Cross-sensor retrieval and matching: recall of the same touch by another sensor, among similar touches.
 
 For each query touch of sensor A, a gallery of touches of sensor B has that touch once. The distractors are its nearest
-neighbours in position, depth and force, so that the place or the size of a contact does not reveal it. Reported are
-recall@1 and recall@5 with intervals over objects. Equal scores share their ranks evenly, so constant features score
-chance.
+neighbours in position, depth and force. Equal scores share their ranks evenly, so constant features score chance.
 """
 
 from __future__ import annotations
@@ -55,7 +53,7 @@ class Retrieval:
     `top1`, `top5`: recall@1 and recall@5. `low`, `high` (and those of top 5): 95 % interval under a bootstrap over the
     groups (objects), None with fewer than two. `chance1`, `chance5`: recall of constant features. `matched`: covariates
     in which distractors are near, empty for random galleries. `nearness`: mean distance of the distractors to the true
-    touch, divided by that of all candidates (1: no effect). `centred`: the mean feature of each sensor was subtracted.
+    touch, over that of all candidates. `centred`: the mean feature of each sensor was subtracted.
     """
 
     name: str
@@ -89,18 +87,16 @@ def cross_sensor_retrieval(
 
     `features` {name: (len(rows), d)} are those of manifest `rows`; the deepest frame of each touch, sensor and unit is
     used. `match` names label columns, of which those in the manifest are used; None draws random galleries. `metrics`
-    {name: metric}, cosine by default. Touches without a value in one of the columns are left out, with a note. Raises
-    UserError for a single sensor, no covariate, no common touch, a gallery that is too large, or features that are not
-    finite.
+    {name: metric}, cosine by default. Raises UserError for a single sensor, no covariate, no common touch, a gallery
+    that is too large, or features that are not finite.
     """
     rows = np.asarray(rows)
     for name, values in features.items():
         if len(values) != len(rows):
             raise UserError(f"Features {name!r} have {len(values)} rows. They must have one for each of {len(rows)}.")
     used, place, covariates, notes = _usable(manifest, rows, match)
-    sensors, units, objects, touch = (
-        manifest.text_column(name)[used] for name in ("sensor", "unit", "object", "touch")
-    )
+    names = ("sensor", "unit", "object", "touch")
+    sensors, units, objects, touch = (manifest.text_column(name)[used] for name in names)
     if len(manifest.files) > 1:
         touch = _joined(touch, manifest.source[used])  # equal names of joined manifests are not one touch
     unit, groups = _joined(sensors, units), np.where(objects == "", touch, objects)
@@ -130,18 +126,15 @@ def cross_sensor_retrieval(
             tops = score_galleries(values[query], values[gallery], galleries, metric=metric, centre=centred)
             ids = query[galleries.queries]
             tables.append(QueryScores(_joined(keys[ids], [f"{first} to {second}"] * len(ids)), *tops, groups[ids]))
-            names = {"query_sensor": first, "gallery_sensor": second}
-            results.append(_summary(tables[-1], gallery_size, (galleries,), common | names))
+            sides = {"query_sensor": first, "gallery_sensor": second}
+            results.append(_summary(tables[-1], gallery_size, (galleries,), common | sides))
         pooled = QueryScores(*map(np.concatenate, zip(*(vars(table).values() for table in tables), strict=True)))
         results.append(_summary(pooled, gallery_size, tuple(drawn.values()), common))
     return results
 
 
 def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None, float | None]:
-    """Return recall@1 of `first` minus that of `second`, and its 95 % interval over groups, paired by query.
-
-    Raises UserError if the two have different queries.
-    """
+    """Return recall@1 of `first` minus `second`, and its 95 % interval, paired. Raises UserError for other queries."""
     a, b = first.per_query, second.per_query
     if a is None or b is None or not np.array_equal(a.keys, b.keys) or not np.array_equal(a.groups, b.groups):
         raise UserError(f"{first.name!r} and {second.name!r} have different queries. Give both the same rows.")
@@ -211,9 +204,9 @@ def draw_galleries(
 ) -> Galleries:  # fmt: skip
     """Return galleries that depend on names, covariates and seeds, not on the order of rows.
 
-    Equal names are one touch. `match` (m, k) are covariates of the gallery: the distractors are the nearest to the true
-    touch, each covariate scaled to unit spread. Without it `seeds` random galleries are drawn. Items of the query's
-    own unit are never in its gallery. Raises UserError for too few touches, or no common touch.
+    Equal names are one touch. `match` (m, k) are covariates of the gallery, scaled to unit spread: the nearest are the
+    distractors. Without it `seeds` random galleries are drawn. Items of the query's own unit are never in its gallery.
+    Raises UserError for too few touches, or no common touch.
     """
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
@@ -276,8 +269,7 @@ def score_galleries(
 ) -> tuple[Array, Array]:
     """Return recall@1 and recall@5 (n,) of each query as means over galleries; ties share their ranks evenly.
 
-    `query` (q, d), `gallery` (m, d). With `centre` the mean of each side is subtracted first. Raises UserError for
-    values that are not finite, or of different widths.
+    `query` (q, d), `gallery` (m, d). `centre` subtracts the mean of each side. UserError for values that do not fit.
     """
     q, g = _finite(query, "query"), _finite(gallery, "gallery")
     if q.shape[1] != g.shape[1]:
@@ -330,9 +322,9 @@ def _finite(values: Any, kind: str) -> Array:
 class MatchScore:
     """How a matcher distinguishes positives from `negatives`; shares are in 0..1, chance is 0.5.
 
-    `accuracy`: share of logits on the right side of 0, over positives and negatives. `low`, `high`: its 95 % interval
-    under a bootstrap over the anchors' objects, None with fewer than two. `auc`: chance that a positive's logit is
-    above a negative's. `sensors_alone`: accuracy of the best rule that only knows the two sensors (`best_rule`).
+    `accuracy`: share of logits on the right side of 0. `low`, `high`: its 95 % interval under a bootstrap over the
+    anchors' objects, None with fewer than two. `sensors_alone`: accuracy of the best rule that only knows the two
+    sensors.
     """
 
     negatives: Negatives
@@ -348,9 +340,8 @@ class MatchScore:
 def score_matching(encoder: Encoder, manifest: Manifest, rows: Array, features: Array) -> list[MatchScore]:
     """Return the scores of the encoder's matching head (Eq. 5) with negatives of any sensor, and of the positive's.
 
-    Did two touches, by two sensors, come from the same place? With negatives of any sensor, the sensors alone reveal
-    part of the answer, since a positive never has the anchor's sensor. `features` (n, E) are those of manifest `rows`
-    (n,), pooling class. Raises UserError without a matching head, and if two sensors share no touch.
+    With negatives of any sensor, the sensors alone reveal part of the answer. `features` (n, E) are those of manifest
+    `rows` (n,), pooling class. Raises UserError without a matching head, and if two sensors share no touch.
     """
     objects, scores = manifest.text_column("object")[rows], []
     encoder.match(features[:1], features[:1])  # raises without a head
@@ -372,10 +363,7 @@ def score_matching(encoder: Encoder, manifest: Manifest, rows: Array, features: 
 def draw_triples(
     manifest: Manifest, rows: Array, negatives: Negatives, *, draws: int = DRAWS, seed: int = 0
 ) -> tuple[Array, Array, Array]:
-    """Return anchors, positives and negatives as places in `rows`, i64 (m,) each: `draws` of every anchor.
-
-    They are drawn as in training. Raises UserError if two sensors share no touch.
-    """
+    """Return places in `rows` of anchors, positives and negatives, i64 (m,), drawn as in training. Raises UserError."""
     names = ("touch", "sensor", "unit", "object", "dataset")
     keys = MatchKeys(*(manifest.codes(name, own=name == "touch") for name in names))
     matches = Matches(rows, keys, same_sensor=negatives == "same_sensor", other_object=True)
@@ -394,8 +382,7 @@ def draw_triples(
 def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
     """Return the accuracy of the best rule on codes i64 (n,) of positives and of negatives.
 
-    The rule is learned on half of the anchors (`anchor` i64 (n,)) and scored on the other half, then the reverse. It
-    would overfit random codes if it were scored on its own half. It guesses for unknown codes.
+    It is learned on half of the anchors (`anchor` i64 (n,)) and scored on the others. It guesses for unknown codes.
     """
     names, place = np.unique(anchor, return_inverse=True)
     half = (np.random.default_rng(0).permutation(len(names)) % 2)[place]
@@ -415,9 +402,8 @@ def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
 def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1) -> Array:
     """Return one row for each touch, sensor and unit, in order: that of the largest `label.force`, the first of equals.
 
-    Only `rows` are used, the whole `split` by default; with `frames` > 1 only rows that end a clip of so many. Without
-    forces the largest `label.depth` is used, without both the middle frame. Rows without a touch are left out. Raises
-    UserError if no row is left.
+    Only `rows` are used, the whole `split` by default; with `frames` > 1 only ends of clips of so many. Without forces
+    the largest `label.depth` is used, without both the middle frame. Raises UserError if no row is left.
     """
     rows = np.unique(manifest.rows_of(split) if rows is None else np.asarray(rows))
     rows = rows[manifest.present("touch")[rows]]
@@ -448,8 +434,7 @@ def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
 def contact_vector(manifest: Manifest, rows: Array) -> Array:
     """Return area, centroid and force of each contact, as far as the manifest has them, f32 (rows, up to 4).
 
-    Each is scaled to mean 0 and spread 1 within its sensor; compare them by Euclidean distance. Raises UserError if the
-    manifest has none of them, or a row lacks one.
+    Each has mean 0 and spread 1 within its sensor. Raises UserError if the manifest or a row lacks them.
     """
     names = [name for name in VECTOR if name in manifest.table.column_names]
     if not names:

@@ -4,8 +4,6 @@ Every result names its protocol. By "honest" the penalty (k, epoch) is selected 
 groups of train, and test is read once. By "published" it is selected on test, as the authors' released code does.
 """
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
@@ -35,10 +33,7 @@ class Split(NamedTuple):
 
 
 class RowRoles(NamedTuple):
-    """Labels `y` (n,), numbers if `measured`; `groups` (n,); and boolean masks (n,) of the use of a row.
-
-    `test`: the manifest's split (val counts as train). `may_fit`, `may_test`: by sensor and unit.
-    """
+    """Labels `y`, `groups` and masks, all (n,): `test` by the split, `may_fit`, `may_test` by sensor and unit."""
 
     y: Array
     groups: Array
@@ -57,10 +52,7 @@ class RowRoles(NamedTuple):
 
 
 def assign_roles(task: Task, rows: TaskRows, sides: Sides) -> tuple[RowRoles, Array]:
-    """Return the roles of the rows and the class names.
-
-    Raises UserError for an unknown sensor or unit, and if nothing is left to fit on or to test.
-    """
+    """Return the roles of the rows and the class names. Raises UserError if nothing is left to fit on or to test."""
     measured, masks = task.kind == "regression", dict.fromkeys(("train", "test"), np.ones(len(rows.labels), bool))
     for side in SIDES:
         purpose, _, kind = side.partition("_")
@@ -92,12 +84,6 @@ def subsample(rows: Array, most: int | None = None) -> Array:
     return rows[np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))]
 
 
-def best_option(scores: Any) -> int:
-    """Return the index of the best score, the middle one of equals: the ends of a plateau are fragile."""
-    equal = np.flatnonzero(np.asarray(scores) == np.max(scores))
-    return int(equal[len(equal) // 2])
-
-
 def assign_folds(groups: Array, y: Array | None, rng: np.random.Generator, count: int = FOLDS) -> Array:
     """Return the fold i64 (n,) of each row, with whole `groups` (n,) and each class of `y` (n,) spread over the folds.
 
@@ -106,9 +92,7 @@ def assign_folds(groups: Array, y: Array | None, rng: np.random.Generator, count
     # scikit-learn's StratifiedGroupKFold takes 60 times longer on 100 groups, 200 times on 2000.
     names, first, group_ids = np.unique(groups, return_index=True, return_inverse=True)
     if len(names) < 2:
-        raise UserError(
-            f"All rows to fit on are of one group, {str(names[0])!r}. Selection takes two groups, or rows of split val."
-        )
+        raise UserError(f"All rows to fit on are of one group, {str(names[0])!r}. Give two, or rows of split val.")
     count = min(count, len(names))
     order = np.lexsort((rng.permutation(len(names)), np.zeros(len(names)) if y is None else y[first]))
     fold = np.empty(len(names), np.int64)
@@ -135,8 +119,7 @@ def group_bootstraps(rows: Array, groups: Array, seeds: int) -> Iterator[tuple[A
 def split_scheme(roles: RowRoles) -> tuple[Literal["split", "folds"], Array, str]:
     """Return how honest tests are split, the rows bool (n,) that take part, and the reason.
 
-    The manifest's split is kept if it keeps groups apart. If no class of test is in train, the test rows are cut into
-    folds. If a group is in both, all rows are.
+    The manifest's split is kept if it keeps groups apart. Else folds are made, of test rows if train lacks classes.
     """
     missing = "row to fit on" if roles.measured else "class of test"
     fitted, tested = roles.y[roles.fitted], roles.y[roles.tested]
@@ -152,8 +135,8 @@ def split_scheme(roles: RowRoles) -> tuple[Literal["split", "folds"], Array, str
 def seeded_splits(roles: RowRoles, seed: int, protocol: Protocol) -> list[Split]:
     """Return the splits of one seed: one by the manifest's split, or FOLDS that test every row once.
 
-    By "honest" a fifth of the groups of train selects, and the rest is fitted on. By "published" the manifest's split
-    is used even if it shares groups. All of train is fitted on, and test selects. Raises UserError for too few groups.
+    By "honest" a fifth of the groups of train selects. By "published" the manifest's split is used even if it shares
+    groups, and test selects. Raises UserError for too few groups.
     """
     _check_protocol(protocol)
     rng = np.random.default_rng([11, seed])
@@ -199,10 +182,7 @@ class LabelledFeatures(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """The selected option of a head and its place, the rows it was chosen on, and the scores and the fit of all.
-
-    `fitted` is None after cross-validation, and where only one option was given.
-    """
+    """The selected option and its place, what it was chosen on, all scores, and their fit (None after many folds)."""
 
     place: int
     option: float
@@ -227,23 +207,17 @@ def select_option(head: ProbeHead, data: LabelledFeatures, split: Split, protoco
     totals: Any = 0
     for inner, out in tracked(parts, "folds"):
         fitted = data.fit(head, inner)
-        scores = [
-            heads.head_score(predicted, data.y[out], len(data.names)) for predicted in fitted.predict(data.x[out])
-        ]
+        scores = [heads.head_score(one, data.y[out], len(data.names)) for one in fitted.predict(data.x[out])]
         totals = totals + len(out) * np.array(scores)
-    place = best_option(totals)
+    equal = np.flatnonzero(totals == np.max(totals))
+    place = int(equal[len(equal) // 2])  # the middle one: the ends of a plateau are fragile
     return Selection(place, fitted.options[place], chosen_on, totals, fitted if len(parts) == 1 else None)
 
 
 def check_rows(
-    features: Array, labels: Any, groups: Any, split: Any, *, measured: bool = False, tested: bool = True,
-    least_classes: int = 2,
-) -> tuple[LabelledFeatures, Split, tuple[str, ...]]:  # fmt: skip
-    """Return the arguments of a probe as records, with notes on the rows.
-
-    Raises UserError for lengths that differ, an empty train or test, features that are not finite, labels that never
-    change, or classes of which train and test share none.
-    """
+    features: Array, labels: Any, groups: Any, split: Any, *, measured: bool = False, tested: bool = True
+) -> tuple[LabelledFeatures, Split, tuple[str, ...]]:
+    """Return the arguments of a probe as records, with notes on the rows. Raises UserError if they do not fit."""
     x, groups, split = np.asarray(features, np.float32), np.asarray(groups).astype(str), np.asarray(split).astype(str)
     sizes = {"features": len(x), "labels": len(labels), "groups": len(groups), "split": len(split)}
     if x.ndim != 2 or len(set(sizes.values())) != 1:
@@ -261,15 +235,13 @@ def check_rows(
     if len(bad):
         raise UserError(f"The features of rows {_listed(bad)} are NaN or infinite. Embed them again or leave them out.")
     learned = np.unique(y[rows.fit])
-    if len(learned) < least_classes:
+    if len(learned) < 2:
         value = f"{learned[0]:g}" if measured else repr(str(names[learned[0]]))
         raise UserError(f"The label is {value} on every row of train. A probe needs at least two values.")
     if measured and np.ptp(y[rows.test]) == 0:
         raise UserError(f"The label is {y[rows.test][0]:g} on every row of test. R2 has no meaning there.")
     if tested and not measured and not np.isin(y[rows.test], learned).any():
-        raise UserError(
-            "No class of test is in train. Choose another label, or `anytouch probe tasks`, which splits again."
-        )
+        raise UserError("No class of test is in train. Take another label, or let `anytouch probe tasks` split again.")
     unlabelled = int(np.sum(np.isin(split, ("train", "val", "test")) & ~has_label))
     notes = [f"{unlabelled} rows without this label left out"] if unlabelled else []
     for part, ids in (("val", rows.val), ("test", rows.test)):

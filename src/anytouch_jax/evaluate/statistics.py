@@ -1,6 +1,4 @@
-"""Statistics of evaluations: bootstrap intervals over groups and seeds, Markdown tables, plain JSON."""
-
-from __future__ import annotations
+"""Statistics of evaluations: bootstrap intervals over groups and seeds, verdicts, Markdown tables, plain JSON."""
 
 import dataclasses
 import functools
@@ -14,6 +12,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 Protocol = Literal["honest", "published"]
+RAW, RANDOM = "raw pixels", "random encoder"  # the controls of probes
 
 DRAWS = 10_000  # bootstraps of an interval: its ends are 0.03 standard errors off, with a tenth of the draws 0.09
 
@@ -26,49 +25,48 @@ class GroupSums(NamedTuple):
 
 
 def classification_sums(correct: Array, groups: Array) -> GroupSums:
-    """Return the sums that `mean_of` divides, of values (n,) or of rows that are right or wrong."""
+    """Return the sums that `_mean_of` divides, of values (n,) or of rows that are right or wrong."""
     return GroupSums(groups, np.stack([np.asarray(correct, np.float64), np.ones(len(correct))], 1))
 
 
 def regression_sums(error: Array, truth: Array, groups: Array) -> GroupSums:
-    """Return the sums of `r2_of` and `mae_of`; `truth` is best centred, as the square of an offset hides the spread."""
+    """Return what `_r2_of` and `_mae_of` divide; `truth` is best centred: the square of an offset hides the spread."""
     return GroupSums(groups, np.stack([error**2, np.abs(error), truth, truth**2, np.ones(len(error))], 1))
 
 
-def mean_of(sums: Array) -> Array:
+def _mean_of(sums: Array) -> Array:
     """Return the mean (accuracy) from sums (..., [values, rows])."""
     return np.asarray(sums[..., 0] / sums[..., 1])
 
 
-def r2_of(sums: Array) -> Array:
+def _r2_of(sums: Array) -> Array:
     """Return R2 from sums (..., [squared error, absolute error, truth, squared truth, rows]); NaN for equal labels."""
     spread = sums[..., 3] - sums[..., 2] ** 2 / sums[..., 4]
     return np.asarray(1 - sums[..., 0] / np.where(spread > 1e-12 * sums[..., 3], spread, np.nan))
 
 
-def mae_of(sums: Array) -> Array:
-    """Return the mean absolute error from sums as `r2_of` reads them."""
+def _mae_of(sums: Array) -> Array:
+    """Return the mean absolute error from sums as `_r2_of` reads them."""
     return np.asarray(sums[..., 1] / sums[..., 4])
 
 
 def paired_gain(real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool) -> dict[str, float | None]:
     """Return by how much the score of `real` is above that of `other` on the same rows, with its 95 % interval."""
-    metric = r2_of if measured else mean_of
+    metric = _r2_of if measured else _mean_of
     width = real[0].sums.shape[1]
 
     def gain(sums: Array) -> Array:
         return metric(sums[..., :width]) - metric(sums[..., width:])
 
     both = [GroupSums(a.groups, np.concatenate([a.sums, b.sums], 1)) for a, b in zip(real, other, strict=True)]
-    low, high = bootstrap_interval(both, gain)
+    low, high = _bootstrap_interval(both, gain)
     return {"difference": float(np.mean([gain(run.sums.sum(0)) for run in both])), "low": low, "high": high}
 
 
-def bootstrap_interval(runs: Sequence[GroupSums], value: Callable[[Array], Array]) -> tuple[float | None, float | None]:
-    """Return the 95 % percentile interval of the mean over runs of `value` (sums -> number).
+def _bootstrap_interval(runs: Sequence[GroupSums], of: Callable[[Array], Array]) -> tuple[float | None, float | None]:
+    """Return the 95 % percentile interval of the mean over runs of `of` (sums -> number).
 
-    Groups and runs (seeds) are resampled with replacement. Runs share the drawn groups, as they share the test rows.
-    The interval is too narrow with a handful of either. (None, None) with fewer than two groups, or without a value.
+    Groups, which all runs share, and runs are resampled. (None, None) with fewer than two groups, or no value.
     """
     names = np.unique(np.concatenate([run.groups for run in runs]))
     if len(names) < 2:
@@ -79,7 +77,7 @@ def bootstrap_interval(runs: Sequence[GroupSums], value: Callable[[Array], Array
     draw = _draws if len(names) <= 5000 else _draws.__wrapped__  # the draws of many groups are not kept
     shares = np.concatenate(_draws(len(runs), stream=1)) / len(runs)
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.concatenate([[value(times @ total) for total in totals] for times in draw(len(names), 0)], axis=1).T
+        values = np.concatenate([[of(times @ total) for total in totals] for times in draw(len(names), 0)], axis=1).T
     means = np.where(shares > 0, shares * values, 0).sum(1)
     means = means[np.isfinite(means)]
     return tuple(np.percentile(means, [2.5, 97.5]).tolist()) if means.size else (None, None)
@@ -94,7 +92,7 @@ def _draws(count: int, stream: int) -> list[Array]:
 
 def mean_interval(values: Array, groups: Array) -> tuple[float | None, float | None]:
     """Return the 95 % percentile interval of the mean of `values` (n,) under a bootstrap over `groups` (n,)."""
-    return bootstrap_interval([classification_sums(values, groups)], mean_of)
+    return _bootstrap_interval([classification_sums(values, groups)], _mean_of)
 
 
 def scores(runs: Sequence[GroupSums], baselines: Sequence[GroupSums], measured: bool) -> dict[str, Any]:
@@ -103,15 +101,15 @@ def scores(runs: Sequence[GroupSums], baselines: Sequence[GroupSums], measured: 
     def values(of: Callable[[Array], Array], several: Sequence[GroupSums]) -> list[float]:
         return [float(of(run.sums.sum(0))) for run in several]
 
-    metric = r2_of if measured else mean_of
-    low, high = bootstrap_interval(runs, metric)
+    metric = _r2_of if measured else _mean_of
+    low, high = _bootstrap_interval(runs, metric)
     result: dict[str, Any] = {
         "metric": "r2" if measured else "accuracy", "mean": float(np.mean(values(metric, runs))), "low": low,
         "high": high, "values": values(metric, runs), "chance": float(np.mean(values(metric, baselines))),
     }  # fmt: skip
     if measured:
-        mae_low, mae_high = bootstrap_interval(runs, mae_of)
-        mae, chance = (float(np.mean(values(mae_of, several))) for several in (runs, baselines))
+        mae_low, mae_high = _bootstrap_interval(runs, _mae_of)
+        mae, chance = (float(np.mean(values(_mae_of, several))) for several in (runs, baselines))
         result |= {"mae": mae, "mae_low": mae_low, "mae_high": mae_high, "chance_mae": chance}
     return result
 
@@ -157,3 +155,44 @@ def without_html(value: Any) -> str:
 def as_text(value: Any) -> str:
     """Return one line of Markdown that a reader sees as the value is written: for names and captions of a user."""
     return re.sub(r"[\\`*\[\]~]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", without_html(value).replace("]\\(", "]("))
+
+
+def verdict(name: str, gain: Mapping[str, float | None], task: str = "") -> str:
+    """Return a sentence on features against raw pixels, from a `paired_gain`."""
+    points, low, high = (100 * (gain[key] or 0.0) for key in ("difference", "low", "high"))
+    of = f"{task}: " if task else ""
+    if gain["low"] is None:
+        return f"{of}{name} is {points:+.0f} points from raw pixels, by too few test recordings to be sure."
+    interval = f"({low:.0f} to {high:.0f})"
+    if low > 0:
+        return f"{of}{name} is {points:.0f} points above raw pixels {interval}."
+    return (
+        f"{of}{name} is no better than raw pixels: {points:+.0f} points {interval}. Try --pooling both, more "
+        "recordings, or another encoder, and look at the untouched gel with `anytouch view`."
+    )
+
+
+def label_verdicts(results: Sequence[Any]) -> list[str]:
+    """Return a sentence on each source of features of `probe_label` against raw pixels, by its first head."""
+    first: dict[str, Any] = {}
+    for result in results:
+        first.setdefault(result.probe.partition(": ")[0], result)
+    sums = {
+        name: classification_sums(one.outcome.correct, one.outcome.groups)
+        for name, one in first.items() if one.outcome is not None and ": " in one.probe
+    }  # fmt: skip
+    raw = sums.pop(RAW, None)
+    sums.pop(RANDOM, None)
+    return [] if raw is None else [
+        verdict(name, paired_gain([one], [raw], False)) for name, one in sums.items()
+    ]  # fmt: skip
+
+
+def share_text(value: float | None) -> str:
+    """Return a share in percent as text, "-" if there is none."""
+    return "-" if value is None or np.isnan(value) else f"{100 * value:.1f} %"
+
+
+def interval_text(low: float | None, high: float | None, factor: float = 100.0, digits: int = 1) -> str:
+    """Return an interval as text, "-" if there is none; shares are in points by default."""
+    return "-" if low is None or high is None else f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"

@@ -1,7 +1,6 @@
 """Probing tasks: which rows of a manifest, which label, which groups never stand on both sides of a split.
 
-Probes read every frame unflipped, as a flip changes a direction label. Pre-training flips touches (`data.flip`), and
-the positive of a matching pair independently, which teaches the encoder to overlook directions.
+Probes read every frame unflipped, as a flip changes a direction label. Pre-training flips touches (`data.flip`).
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ class Task:
     `label`: a column of the manifest. `classes`: the only values that take part. `above`: the label is a number, and
     the class is whether it is larger. `groups`: columns of which the first with a value names the group of a row, else
     its sequence. The group "recording" is the sequence without its last part. `frames`: 1, or the length of a clip that
-    ends at the row. `which` rows: "press", the deepest frame of a recording; "contact", all that touch; "moving", the
-    frame of a recording that slips most. `fingers`: rows of a touch by two units, features concatenated. `phase`
-    "after": the frames after the grasp (Feel). `where`: (column, text) must be equal, (column, number) must be
-    exceeded. `test_list`: test rows are those whose `downstream_test` names this list. `unit` of a regression.
+    ends at the row. `which` rows: the deepest frame of a recording ("press"), all that touch ("contact"), or the frame
+    that slips most ("moving"). `fingers`: rows of a touch by two units. `phase` "after" the grasp (Feel). `where`:
+    (column, text) must be equal, (column, number) must be exceeded. `test_list`: test rows are those whose
+    `downstream_test` names this list.
     """
 
     name: str
@@ -60,9 +59,7 @@ class Task:
 TASKS = {
     task.name: task
     for task in (
-        Task("material", "label.material"),
-        Task("roughness", "label.roughness"),
-        Task("hardness", "label.hardness"),
+        *(Task(name, f"label.{name}") for name in ("material", "roughness", "hardness")),
         Task("grasp", "label.success", which="all", fingers=True),
         Task("grasp_after", "label.success", which="all", fingers=True, phase="after"),
         Task("object", "label.object", groups=("grasp_group", "touch")),
@@ -77,10 +74,7 @@ TASKS = {
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A public benchmark of the paper with the authors' settings.
-
-    `universal`: universal tokens for all sensors. `paper`: accuracy of AnyTouch in the paper, its epoch chosen on test.
-    """
+    """A public benchmark of the paper with the authors' settings; `paper`: the accuracy of AnyTouch there."""
 
     task: Task
     pooling: Pooling
@@ -132,13 +126,10 @@ class TaskRows(NamedTuple):
         return TaskRows._make([*(column[ids] for column in self[:-1]), self.notes])
 
 
-def find_task(task: str | Task) -> Task:
-    """Return the task with that name. Raises UserError."""
-    return task if isinstance(task, Task) else find_named(TASKS, task, "task")
-
-
-def find_named(known: Mapping[str, T], name: str, kind: str) -> T:
-    """Return the task or benchmark with that name. Raises UserError."""
+def find_named(known: Mapping[str, T], name: str | T, kind: str) -> T:
+    """Return the task or benchmark with that name, or one that is given. Raises UserError."""
+    if not isinstance(name, str):
+        return name
     if name not in known:
         raise UserError(f"There is no {kind} {name!r}. Choose among {', '.join(known)}.")
     return known[name]
@@ -154,10 +145,9 @@ def available_tasks(table: Manifest) -> tuple[str, ...]:
 def label_task(
     table: Manifest, label: str, *, group: str = "", where: tuple[str, float] | None = None, sensor: str | None = None
 ) -> Task:
-    """Return the task of any label column, on all rows that pass the filters.
+    """Return the task of any label column ("label." may be left out), on all rows that pass the filters.
 
-    Columns may be given without "label.". `group` defaults to the first of GROUPS with a value that is not the label.
-    Raises UserError for a column or sensor that the manifest lacks.
+    `group` defaults to the first of GROUPS with a value that is not the label. UserError for an unknown name.
     """
     conditions: list[tuple[str, str | float]] = [(find_column(table, where[0]), where[1])] if where else []
     if sensor is not None:
@@ -182,10 +172,7 @@ def find_column(table: Manifest, name: str) -> str:
 
 
 def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> dict[str, Array]:
-    """Return masks over `rows` (n,): values of `column` that have an image or a caption in train, and the others.
-
-    Alignment may have named the first. Empty if all or none have.
-    """
+    """Return masks over `rows` (n,): values of `column` with a photograph or caption in train, and others, or {}."""
     values = table.text_column(column)
     described = (table.present("image_path") | table.present("text")) & (table.text_column("split") == "train")
     mask = np.isin(values[rows], np.setdiff1d(values[described], [""]))

@@ -15,9 +15,8 @@ from anytouch_jax.data.images import encode
 from anytouch_jax.files import atomic_write
 from anytouch_jax.sim import endless
 from anytouch_jax.sim.endless import CAMERAS, Sampling, SimulatedTouches, World
-from anytouch_jax.sim.recorder import RELIEF
+from anytouch_jax.sim.recorder import RELIEF, ball
 from anytouch_jax.sim.scene import Scenes
-from anytouch_jax.sim.touch import ball
 
 Array = np.ndarray
 OBJECTS = 160  # of a world

@@ -1,19 +1,16 @@
 """Simulated data sets on disk: images, fields, photographs and a manifest.
 
-Touches are simulated in groups. A group's files are written first, then its table in `parts/`. When all parts exist
-they become `manifest.parquet` in one rename. A folder without it is unfinished, and the same command continues it.
+A group's files are written first, then its table in `parts/`. When all parts exist they become `manifest.parquet` in
+one rename. A folder without it is unfinished, and the same command continues it.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import io
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +28,7 @@ from anytouch_jax.sim.recorder import ClipOutput, Recorder
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import photo
 from anytouch_jax.sim.sensing.own import find_sensor
-from anytouch_jax.sim.world import captions, objects
+from anytouch_jax.sim.world import objects
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches in a part
@@ -44,8 +41,7 @@ def simulate(
 ) -> Path:
     """Simulate `scenes` into the folder `out`, or continue there, and return the manifest's path.
 
-    `progress(touches done, touches)` is called after each part. A seed gives the same bytes on the same machine. Raises
-    UserError if `out` has other contents or cannot be written.
+    A seed gives the same bytes on the same machine. Raises UserError if `out` has other contents or cannot be written.
     """
     out = Path(out).expanduser().resolve()  # pyarrow reads a leading ~ and a colon in its own way
     if threads < 1:
@@ -86,11 +82,18 @@ def _simulate(
             if file in finished:
                 continue
             touches = [scene.draw_touch(scenes, number, splits) for number in group]
-            rows = _write_group(scenes, things, touches, partial(solving.map, recorder.record), out, pool)
-            _write_table(rows, file)
+            by_sensor = [[scene.draw_recording(scenes, touch, name) for touch in touches] for name in scenes.sensors]
+            futures = [
+                pool.submit(_write_recording, scenes, things[recording.touch.object], recording, take, out)
+                for recordings, takes in zip(by_sensor, solving.map(recorder.record, by_sensor), strict=True)
+                for recording, take in zip(recordings, takes, strict=True)
+            ]
+            _write_table([row for future in futures for row in future.result()], file)
             done += len(group)
             progress(done, scenes.touches)
-    _write_manifest(files, target)
+    table = pa.concat_tables([pq.read_table(file) for file in files], promote_options="permissive")
+    columns = {name: table[name].combine_chunks() for name in table.column_names}
+    manifests.write(manifests.from_columns(columns, target), target)
     shutil.rmtree(out / PARTS)
     return target
 
@@ -126,25 +129,6 @@ def _read_settings(file: Path) -> dict[str, Any]:
     return settings
 
 
-def _write_group(
-    scenes: Scenes,
-    things: Any,
-    touches: list[scene.Touch],
-    record: Callable[..., Iterator[list[ClipOutput]]],
-    out: Path,
-    pool: ThreadPoolExecutor,
-) -> list[Row]:
-    """Simulate and write the recordings of a few touches, sensor by sensor. Returns their manifest rows."""
-    futures = []
-    by_sensor = [[scene.draw_recording(scenes, touch, sensor) for touch in touches] for sensor in scenes.sensors]
-    for recordings, takes in zip(by_sensor, record(by_sensor), strict=True):
-        futures += [
-            pool.submit(_write_recording, scenes, things[recording.touch.object], recording, take, out)
-            for recording, take in zip(recordings, takes, strict=True)
-        ]
-    return [row for future in futures for row in future.result()]
-
-
 def _write_recording(
     scenes: Scenes, thing: objects.Object, recording: Recording, take: ClipOutput, out: Path
 ) -> list[Row]:
@@ -161,13 +145,10 @@ def _write_recording(
         image = photo.photograph(thing, touch.place, rng, scenes.size or 224)
         _write_image(out / photograph, image)
     if recording.has_text:
-        caption = captions.caption(thing, np.random.default_rng([scenes.seed, scene.CAPTION, recording.seed]))
+        caption = objects.caption(thing, np.random.default_rng([scenes.seed, scene.CAPTION, recording.seed]))
     background = None if kind == "field" else folder / "background.jpg"
-    common |= {
-        "image_path": photograph and photograph.as_posix(),
-        "text": caption,
-        "background_path": background and background.as_posix(),
-    }
+    common |= {"image_path": photograph and photograph.as_posix(), "text": caption}
+    common["background_path"] = background and background.as_posix()
     rows = []
     for t in range(scenes.frames):
         path = folder / f"{t:03d}{'.npy' if kind == 'field' else '.jpg'}"
@@ -195,23 +176,13 @@ def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording, sen
     """Return the columns that all frames of a recording share."""
     touch = recording.touch
     return {
-        "sensor": sensor,
-        "split": touch.split,
-        "dataset": f"simulated-{scenes.grade}",
+        "sensor": sensor, "split": touch.split, "dataset": f"simulated-{scenes.grade}",
         "unit": f"{sensor}-{f'{touch.split}-{touch.number:06d}' if scenes.units == 'each' else scenes.seed}",
-        "stride": 1,
-        "touch": f"{touch.number:06d}",
-        "object": thing.name,
-        "license": "CC0-1.0",
-        "commercial": True,
-        "grade": scenes.grade,
-        "label.object": thing.name,
-        "label.material": thing.material.name,
-        "label.hardness": objects.hardness_of(thing),
-        "label.roughness": objects.roughness_of(thing),
-        "label.indenter": thing.shape.primitive,
-        "label.texture": thing.shape.texture,
-    } | scene.directions(recording)
+        "stride": 1, "touch": f"{touch.number:06d}", "object": thing.name, "license": "CC0-1.0", "commercial": True,
+        "grade": scenes.grade, "label.object": thing.name, "label.material": thing.material.name,
+        "label.hardness": objects.hardness_of(thing), "label.roughness": objects.roughness_of(thing),
+        "label.indenter": thing.shape.primitive, "label.texture": thing.shape.texture,
+    } | scene.directions(recording)  # fmt: skip
 
 
 def _write_table(rows: list[Row], file: Path) -> None:
@@ -228,12 +199,6 @@ def _is_readable(part: Path) -> bool:
         return part.exists() and pq.read_metadata(part).num_rows > 0
     except (pa.ArrowException, OSError):
         return False
-
-
-def _write_manifest(parts: list[Path], target: Path) -> None:
-    table = pa.concat_tables([pq.read_table(part) for part in parts], promote_options="permissive")
-    manifest = manifests.from_columns({name: table[name].combine_chunks() for name in table.column_names}, target)
-    manifests.write(manifest, target)
 
 
 def _write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:

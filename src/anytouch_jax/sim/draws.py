@@ -1,10 +1,7 @@
 """Random draws of the simulator: one description of a distribution serves numpy and JAX.
 
-A distribution is a function of an `Rng`. With a numpy generator it draws data sets on the host. With `Draws` it is a
-pure function of a JAX key, for touches that are made inside a compiled program.
+A distribution is a function of an `Rng`: a numpy generator, or `Draws` from a JAX key inside a compiled program.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -22,8 +19,7 @@ class Draws:
     """Draws from a JAX key, by those methods of `numpy.random.Generator` that the simulator uses.
 
     All values are parts of one block of uniform and one of normal numbers: a program with a random call for each value
-    takes minutes to compile. A sequence of calls gives the same values for a key. Raises ValueError after `most` values
-    of a kind.
+    takes minutes to compile. Raises ValueError after `most` values of a kind.
     """
 
     def __init__(self, key: jax.Array, most: int = 64) -> None:

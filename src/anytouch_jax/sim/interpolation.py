@@ -4,8 +4,6 @@ On a grid of some hundred points a matrix product beats gathers and short convol
 resample, blur and differentiate at once. Maps are (rows, columns). M @ map acts on rows, map @ M.T on columns.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,16 +46,6 @@ def average(count: int, cells: int) -> npt.NDArray[np.float32]:
     return np.asarray(np.maximum(overlap, 0) * cells / count, np.float32)
 
 
-def _cubic_weights(f: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Return Catmull-Rom weights of the four neighbours at the fraction `f`, exactly 0, 1, 0, 0 at 0."""
-    return (
-        ((-0.5 * f + 1.0) * f - 0.5) * f,
-        (1.5 * f - 2.5) * f * f + 1.0,
-        ((-1.5 * f + 2.0) * f + 0.5) * f,
-        (0.5 * f - 0.5) * f * f,
-    )
-
-
 def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
     """Return values of a centred `raster` (H, W) with `pitch` mm between pixels at `x`, `y` mm of equal shape.
 
@@ -73,7 +61,9 @@ def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.A
         inside = inside & (at >= -slack) & (at <= count - 1 + slack)
         at = jnp.clip(jnp.nan_to_num(at), 0, count - 1)
         first = jnp.floor(at)
-        weights.append(_cubic_weights((at - first).astype(dtype)))
+        f = (at - first).astype(dtype)  # Catmull-Rom weights of the four neighbours, exactly 0, 1, 0, 0 at 0
+        outer, inner = ((-0.5 * f + 1.0) * f - 0.5) * f, (1.5 * f - 2.5) * f * f + 1.0
+        weights.append((outer, inner, ((-1.5 * f + 2.0) * f + 0.5) * f, (0.5 * f - 0.5) * f * f))
         index.append([jnp.clip(first.astype(jnp.int32) + i, 0, count - 1) for i in (-1, 0, 1, 2)])
     flat = jnp.asarray(raster).reshape(-1)
     total = jnp.zeros(inside.shape, dtype)

@@ -1,9 +1,4 @@
-"""Simulation of recordings: surface under the gel, contact, shear and image, for a batch of clips in one program.
-
-Only requested outputs are computed. A field sensor renders no image. Shear is left out for stills.
-"""
-
-from __future__ import annotations
+"""Simulation of single touches and of recordings: surface under the gel, contact, shear and image, in one program."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -14,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from anytouch_jax.errors import refuse_forked
+from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
 from anytouch_jax.sim.sensing.own import find_sensor
-from anytouch_jax.sim.sensing.sensors import Sensor, gel_to_object, rotated, unit_gel
+from anytouch_jax.sim.sensing.sensors import Sensor, Unit, gel_to_object, identity_unit, rotated, unit_gel
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object
 
@@ -29,6 +24,7 @@ Tree = TypeVar("Tree")
 SPACING = 0.1  # mm between pixels of a height map
 RELIEF = 400  # pixels of a height map: 40 mm hold any rotated field and its motion
 GRID = 96  # pixels of the solve grid on the field's short side, at most
+FIELDS = ("displacement", "shear", "pressure")
 LEAST = 64  # with fidelity fast the grid has half the image's pixels, or as many as these
 
 
@@ -75,8 +71,7 @@ def solve_grid(sensor: Sensor, size: int = 0, fidelity: Fidelity = "exact") -> t
 def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
     """Return heights (T, h, w) mm of the object under the gel's points `x`, `y` mm. The first contact is at 0.
 
-    The object turns and slides about the middle of the gel. Its tilt is that of the sensor in the hand. The mounting of
-    the unit turns and moves everything.
+    The object turns and slides about the middle of the gel. Its tilt is that of the sensor in the hand.
     """
     x, y = gel_to_object(clip.unit, x, y)
     frames, halves = len(clip.motion), (2, -1, x.shape[-1])
@@ -105,7 +100,7 @@ class View(NamedTuple):
     """How a sensor is solved and shown: the grid (rows, columns), its `pitch` mm, and the image (height, width).
 
     `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields` is the (height,
-    width) of the requested fields of the last frame. If it is None, all frames have fields, in the size of the image.
+    width) of the fields of the last frame. If it is None, all frames have fields, in the size of the image.
     """
 
     grid: tuple[int, int]
@@ -181,24 +176,18 @@ def _sheared(
 def _labels(clip: ClipInput, contact: PressResult, sheared: shear.Shear, pitch: float) -> dict[str, Array]:
     centre = jax.vmap(lambda p: jnp.asarray(mechanics.centroid(p, pitch)))(contact.pressure)
     shown = (centre - clip.unit.window[None]) * clip.unit.mirror[None]
+    area = jax.vmap(lambda p: mechanics.area(p, pitch))(contact.pressure)
+    force_x, force_y = (sheared.force[:, axis] * clip.unit.mirror[axis] for axis in (0, 1))
     return {
-        "force": contact.force,
-        "area": jax.vmap(lambda p: mechanics.area(p, pitch))(contact.pressure),
-        "x": shown[:, 0],
-        "y": shown[:, 1],
-        "slip": sheared.slip_fraction,
-        "force_x": sheared.force[:, 0] * clip.unit.mirror[0],
-        "force_y": sheared.force[:, 1] * clip.unit.mirror[1],
+        "force": contact.force, "area": area, "x": shown[:, 0], "y": shown[:, 1], "slip": sheared.slip_fraction,
+        "force_x": force_x, "force_y": force_y,
         "torque": sheared.twist_torque * clip.unit.mirror[0] * clip.unit.mirror[1],
         "converged": (contact.converged & sheared.converged).astype(jnp.float32),
-    }
+    }  # fmt: skip
 
 
 def _depth(clip: ClipInput, relief: Array) -> Array:
-    """Return the depth mm (T,) of the object's highest point under the gel, from `relief` (T, h, w) mm.
-
-    It differs from the depth of the hand, because tilt and sliding bring other points under the gel.
-    """
+    """Return the depth mm (T,) of the highest point under the gel, from `relief` (T, h, w): not that of the hand."""
     return jnp.maximum(clip.depth + jnp.max(relief, axis=(1, 2)), 0)
 
 
@@ -218,10 +207,7 @@ MAX_PIXELS = 24_000_000  # pixels of a batch; some dozen float32 planes of them 
 
 
 class Recorder:
-    """Simulates recordings of a data set in batches of one size, so that each sensor is compiled once.
-
-    Several threads may share it if each uses another sensor.
-    """
+    """Simulates recordings in batches of one size, so that each sensor is compiled once; a thread for each sensor."""
 
     def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
         self._scenes, self._objects, self._batch = scenes, objects, batch
@@ -250,34 +236,86 @@ class Recorder:
     def _program(self, name: str) -> Any:
         if name not in self._programs:
             scenes = self._scenes
-            one = partial(
-                simulate_clip,
-                sensor=find_sensor(name),
-                fidelity=scenes.fidelity,
-                size=scenes.size,
-                fields=scenes.fields,
-            )
-            self._programs[name] = jax.jit(jax.vmap(one))
+            about: dict[str, Any] = {"fidelity": scenes.fidelity, "size": scenes.size, "fields": scenes.fields}
+            self._programs[name] = jax.jit(jax.vmap(partial(simulate_clip, sensor=find_sensor(name), **about)))
         return self._programs[name]
 
     def _clip(self, recording: Recording) -> ClipInput:
         touch = recording.touch
         thing = self._objects[touch.object]
+        given = (touch.place, recording.start, recording.motion, recording.depth, recording.tilt)
+        place, start, motion, depth, tilt = (np.asarray(each, np.float32) for each in given)
         return ClipInput(
-            relief=self._relief(touch.object),
-            place=np.asarray(touch.place, np.float32),
-            start=np.asarray(recording.start, np.float32),
-            motion=np.asarray(recording.motion, np.float32),
-            depth=np.asarray(recording.depth, np.float32),
-            tilt=np.asarray(recording.tilt, np.float32),
-            modulus=np.float32(thing.material.modulus),
-            friction=np.float32(thing.material.friction),
-            unit=recording.unit,
-            drift=recording.drift,
-            seed=np.uint32(recording.seed),
-        )
+            self._relief(touch.object), place, start, motion, depth, tilt, np.float32(thing.material.modulus),
+            np.float32(thing.material.friction), recording.unit, recording.drift, np.uint32(recording.seed),
+        )  # fmt: skip
 
 
 def stack_trees(trees: Sequence[Tree]) -> Tree:
     """Stack units, or records with units, along a new leading axis for vmap."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+class SimulatedTouch(NamedTuple):
+    """Pictures u8 (B, h, w, 3), the gel's `background`, and fields of B touches at the picture's pixels.
+
+    `depth` (B, h, w) is the gel's displacement in mm. `shear` (B, h, w, 2) is in mm along x and y of the picture.
+    `pressure` (B, h, w) is in kPa, `force` (B, 3) in N along x, y and into the gel, `torque` (B,) in N mm.
+    """
+
+    image: Any
+    background: Any
+    depth: Any
+    shear: Any
+    pressure: Any
+    force: Any
+    torque: Any
+
+
+def simulate_touch(
+    height_map: Any, pose: Any, sensor: str = "digit", *, drag: Any = (0.0, 0.0, 0.0), size: int = 224,
+    modulus: float = 1e6, friction: float = 0.6, fidelity: Fidelity = "fast", unit: Unit | None = None,
+) -> SimulatedTouch:  # fmt: skip
+    """Press a surface into the gel of a sensor, and return what the camera sees and the gel feels.
+
+    `height_map` (H, W) is in mm, with 0.1 mm between pixels, its highest part nearest to the gel. `pose` (B, 4) is the
+    touched place x and y in mm from the map's centre, the turn in rad, and the depth in mm. `drag` (B, 3) mm, mm and
+    rad moves the object over the gel under the whole pressure. `modulus` kPa and `friction` are the object's. `unit` is
+    a device (`sensors.draw_unit`), by default the nominal one without markers. With fidelity "fast" all but the
+    pictures can be differentiated with respect to pose and drag. Use it under jit. Raises UserError without a camera.
+    """
+    kind = find_sensor(sensor)
+    if kind.kind != "image":
+        raise UserError(f"{sensor} has no camera; name a sensor that has one")
+    refuse_forked()
+    pose, relief = jnp.atleast_2d(jnp.asarray(pose, jnp.float32)), jnp.asarray(height_map, jnp.float32)
+    if relief.ndim != 2 or pose.shape[1] != 4:
+        raise UserError(
+            f"a height map is (H, W) mm with {SPACING} mm between pixels and a pose (B, 4), not {relief.shape} and "
+            f"{pose.shape}"
+        )
+    moves = jnp.broadcast_to(jnp.atleast_2d(jnp.asarray(drag, jnp.float32)), (len(pose), 3))
+    device = identity_unit(kind) if unit is None else unit
+
+    def one(pose: jax.Array, drag: jax.Array) -> SimulatedTouch:
+        clip = ClipInput(
+            relief, pose[:2], jnp.stack([0.0 * pose[0], 0.0 * pose[0], pose[2]]), drag[None],
+            pose[3:], jnp.zeros(2), jnp.float32(modulus), jnp.float32(friction), device,
+            jnp.zeros((1, 3, 3)), jnp.uint32(0),
+        )  # fmt: skip
+        out = simulate_clip(clip, sensor=kind, fidelity=fidelity, size=size, fields=FIELDS)
+        force = jnp.stack([out.labels[name][-1] for name in ("force_x", "force_y", "force")])
+        field = out.field[-1]
+        return SimulatedTouch(
+            out.image[-1], out.background, field[..., 0], field[..., 1:3], field[..., 3], force,
+            out.labels["torque"][-1],
+        )  # fmt: skip
+
+    return jax.vmap(one)(pose, moves)
+
+
+def ball(diameter: float, pixels: int = 200) -> np.ndarray:
+    """Return the height map (pixels, pixels) mm of a ball, 0 at its top."""
+    line = (np.arange(pixels) - (pixels - 1) / 2) * SPACING
+    away, radius = np.hypot(*np.meshgrid(line, line)), diameter / 2
+    return (np.sqrt(np.maximum(radius**2 - away**2, 0.0)) - radius).astype(np.float32)

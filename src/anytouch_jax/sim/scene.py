@@ -1,7 +1,6 @@
 """Touch scenes: objects, places, motions and sensor units, drawn from a seed by numpy.
 
-A touch is a place on an object. A recording is one sensor's clip of it: a part of press, hold, slide or twist, release,
-with pauses and regrasps.
+A touch is a place on an object. A recording is one sensor's clip of it: a part of press, hold, slide or twist, release.
 """
 
 from __future__ import annotations
@@ -138,10 +137,7 @@ class Recording(NamedTuple):
 
 
 def objects_and_splits(scenes: Scenes) -> tuple[tuple[Object, ...], tuple[str, ...]]:
-    """Return the objects of a data set and their splits. Splits share no (primitive, texture) pair.
-
-    Raises UserError if so many objects cannot be held out.
-    """
+    """Return the objects of a data set and their splits, which share no (primitive, texture) pair. Raises UserError."""
     objects = catalogue(scenes.seed, scenes.objects)
     if scenes.held_out <= 0 or scenes.objects < 12:  # too few to hold out whole pairs
         return objects, ("train",) * len(objects)
@@ -201,8 +197,9 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     kind = find_sensor(sensor)
     rng = np.random.default_rng([scenes.seed, _RECORDING, touch.number, sensor_number(kind)])
     unit = draw_unit(kind, rng)
-    if scenes.units == "one":
-        unit = shared_unit(scenes, sensor)
+    if scenes.units == "one":  # not mirrored, not rotated, not moved
+        unit, none = draw_unit(kind, np.random.default_rng([scenes.seed, _UNIT, sensor_number(kind)])), np.zeros(2)
+        unit = unit._replace(mirror=np.float32(none + 1), rotation=np.float32(0), offset=np.float32(none))
     if kind.kind == "field":  # it has no camera
         unit = unit._replace(mirror=np.ones(2, np.float32), window=np.zeros(2, np.float32), zoom=np.float32(1))
     gesture, yaw, offset, tilt = touch.gesture, touch.yaw, np.zeros(2), np.zeros(2)
@@ -213,14 +210,6 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     has_photo, has_text = (bool(rng.random() < share) for share in (scenes.vision, scenes.text))
     seed, drift = int(rng.integers(2**31)), draw_drift(scenes.frames, rng)
     return Recording(touch, sensor, unit, start, motion, depth, tilt, gesture, drift, has_photo, has_text, seed)
-
-
-def shared_unit(scenes: Scenes, sensor: str) -> Unit:
-    """Return the unit of `sensor` for units "one": not mirrored, not rotated, not moved."""
-    kind = find_sensor(sensor)
-    rng = np.random.default_rng([scenes.seed, _UNIT, sensor_number(kind)])
-    unit, none = draw_unit(kind, rng), np.zeros(2, np.float32)
-    return unit._replace(mirror=none + 1, rotation=none[0], offset=none)
 
 
 def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
@@ -251,11 +240,7 @@ MOVES = (0.1, math.radians(1))  # mm and rad that the gel must be moved to be la
 
 
 def directions(recording: Recording) -> dict[str, str]:
-    """Return labels of the motion in contact as the image shows it.
-
-    They are `label.motion` (hold, slide, twist), `label.twist` (clockwise, counterclockwise, none) and `label.slide`
-    (right, down, left, up, none), the nearest of four directions.
-    """
+    """Return labels of the motion in contact as the image shows it: `label.motion`, `label.twist` and `label.slide`."""
     unit, touching = recording.unit, recording.depth > 0
     steps = np.diff(trajectory(len(touching), recording.gesture._replace(lift=-1.0))[0], axis=0)
     *slid, turn = steps[touching[1:] & touching[:-1]].sum(0)

@@ -1,6 +1,4 @@
-"""The training loop: compile, feed, log, save, continue. Its side effects are here and in `metrics.py`."""
-
-from __future__ import annotations
+"""The training loop: compile, feed, log, save, continue. Its side effects are here and in `progress.py`."""
 
 import contextlib
 import functools
@@ -20,20 +18,10 @@ from jax.sharding import Mesh
 from anytouch_jax.config import Config, to_json
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.shown import shown_short
-from anytouch_jax.train.distributed import Ballot, broadcast, check_shared, gather
-from anytouch_jax.train.mesh import (
-    batch_sharding,
-    donated,
-    gathering,
-    make_mesh,
-    put_batch,
-    put_state,
-    replicated,
-    state_sharding,
-)
-from anytouch_jax.train.metrics import Record, alone_in, continues, open_run, writing
+from anytouch_jax.train import mesh as meshes
+from anytouch_jax.train import progress
 from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.progress import Log, progress, signals, silent, to_stderr
+from anytouch_jax.train.progress import Log, Record, silent, to_stderr, writing
 from anytouch_jax.train.step import LossFn, TrainedFn, TrainState, init_state, make_step, merge
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
@@ -65,50 +53,37 @@ class FitResult:
 
 
 def fit(
-    config: Config,
-    *,
-    params: Tree,
-    loss_fn: LossFn,
-    batches: Batches,
-    run_dir: Path | str,
-    trained: TrainedFn | None = None,
-    stop_after: int | None = None,
-    on_report: Report | None = None,
-    metadata: Mapping[str, Any] | None = None,
-    log: Log | None = None,
-    mesh: Mesh | None = None,
-    curve: bool = False,
-    until: float | None = None,
-    examples: Sequence[Example] = (),
-) -> FitResult:
+    config: Config, *, params: Tree, loss_fn: LossFn, batches: Batches, run_dir: Path | str,
+    trained: TrainedFn | None = None, stop_after: int | None = None, on_report: Report | None = None,
+    metadata: Mapping[str, Any] | None = None, log: Log | None = None, mesh: Mesh | None = None, curve: bool = False,
+    until: float | None = None, examples: Sequence[Example] = (),
+) -> FitResult:  # fmt: skip
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
-    `params` are the first parameters. When a run continues, only their shapes matter. `loss_fn` and `trained` are those
+    `params` are the first parameters; when a run continues, only their shapes matter. `loss_fn` and `trained` are those
     of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
     `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
-    `until` ends the run at that time of `time.monotonic`: the schedule then follows the time that has passed since the
-    first step, in place of `run.steps`. `examples` are a batch of each structure: its shapes, and a function that makes
-    it. Their steps are compiled before the first step, side by side. SIGTERM and Ctrl-C finish the step, save and
-    return. If one of several processes gets the signal, all stop a step later. Raises UserError for settings that
-    changed since the start, too many skipped steps in a row, a full disk, an unreadable checkpoint, and a folder that
-    some process cannot see.
+    `until` ends the run at that time of `time.monotonic`, which the schedule then follows. `examples` are a batch of
+    each structure, its shapes and a function that makes it, whose steps are compiled side by side. SIGTERM and Ctrl-C,
+    in one of several processes, finish the step, save and return. Raises UserError for settings that changed since the
+    start, too many skipped steps in a row, a full disk, an unreadable checkpoint, and a folder that some process cannot
+    see.
     """
     refuse_forked()
-    run_dir, mesh = Path(run_dir), mesh or make_mesh(fsdp=config.run.fsdp)
+    run_dir, mesh = Path(run_dir), mesh or meshes.make_mesh(fsdp=config.run.fsdp)
     log, lead = log or to_stderr, jax.process_index() == 0
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
     with contextlib.ExitStack() as stack:
         if lead:
-            stack.enter_context(alone_in(run_dir))
-            open_run(run_dir, config)
+            stack.enter_context(progress.alone_in(run_dir))
+            progress.open_run(run_dir, config)
         else:
-            continues(run_dir, config)  # each process reports a changed setting
+            progress.continues(run_dir, config)  # each process reports a changed setting
             log = silent
-        check_shared(run_dir / "figures")
+        meshes.check_shared(run_dir / "figures")
         with writing(folder := run_dir / "checkpoints"):
-            checkpoints = Checkpoints(
-                folder, keep=config.run.keep, config_json=to_json(config), metadata=dict(metadata or {})
-            )
+            text, about = to_json(config), dict(metadata or {})
+            checkpoints = Checkpoints(folder, keep=config.run.keep, config_json=text, metadata=about)
         stack.push(checkpoints.leave)
         state, start = _first_state(config, params, checkpoints, mesh)
         if start:
@@ -119,9 +94,9 @@ def fit(
         checkpoints.check_space(state)
         record = Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead)
         stack.enter_context(contextlib.closing(record))
-        advance = stack.enter_context(progress(start, stop, log, curve=curve))
+        advance = stack.enter_context(progress.progress(start, stop, log, curve=curve))
         loop = _Loop(config, mesh, checkpoints, record, log, advance, on_report, until)
-        interrupt = stack.enter_context(signals())
+        interrupt = stack.enter_context(progress.signals())
         return loop.run(state, start, stop, batches, loss_fn, trained, interrupt, examples)
 
 
@@ -146,30 +121,23 @@ class _Loop:
     waited: float = 0.0
 
     def __post_init__(self) -> None:
-        self.ballot = Ballot(self.mesh) if jax.process_count() > 1 else None
+        self.ballot = meshes.Ballot(self.mesh) if jax.process_count() > 1 else None
         self.clock, self.last = time.perf_counter(), LastStep()
 
     def run(
-        self,
-        state: TrainState,
-        start: int,
-        stop: int,
-        batches: Batches,
-        loss_fn: LossFn,
-        trained: TrainedFn | None,
-        interrupt: list[signal.Signals],
-        examples: Sequence[Example] = (),
-    ) -> FitResult:
+        self, state: TrainState, start: int, stop: int, batches: Batches, loss_fn: LossFn, trained: TrainedFn | None,
+        interrupt: list[signal.Signals], examples: Sequence[Example] = (),
+    ) -> FitResult:  # fmt: skip
         """Run steps `start` to `stop`, or until a signal arrives."""
         every, figures = self.config.run.save_every, self.config.run.figure_every
-        step_fn, sharding = self.compile(state, loss_fn, trained), batch_sharding(self.mesh)
+        step_fn, sharding = self.compile(state, loss_fn, trained), meshes.batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
-        seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=replicated(self.mesh))()
+        seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=meshes.replicated(self.mesh))()
         step_fn = self.ahead(step_fn, state, seed_key, examples)
         done, saved, reported, placed = start, start, start, None
         with contextlib.closing(self.awaited(batches, start, stop)) as feed:
             for step, batch, info in feed:
-                placed = put_batch(batch, sharding)
+                placed = meshes.put_batch(batch, sharding)
                 state, metrics = step_fn(state, placed, seed_key, *self.progress())
                 if self.ballot:
                     votes = self.ballot.cast(int(interrupt[0]) if interrupt else 0, int(info.get(_SKIPPED, 0)))
@@ -200,19 +168,17 @@ class _Loop:
             self.log(f"stopped by {signalled.name} after step {done} and saved, the same command continues from here")
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
-    def ahead(
-        self, step_fn: Any, state: TrainState, seed_key: jax.Array, examples: Sequence[Example]
-    ) -> Callable[..., Any]:
+    def ahead(self, step_fn: Any, state: TrainState, key: jax.Array, examples: Sequence[Example]) -> Callable[..., Any]:
         """Return the step, compiled for the batch of each example side by side. Others compile when they come."""
 
         def form(batch: Any) -> Any:
             return jax.tree.structure(batch), tuple((x.shape, x.dtype) for x in jax.tree.leaves(batch))
 
-        sharding = batch_sharding(self.mesh)
+        sharding = meshes.batch_sharding(self.mesh)
 
         def build(shapes: Any) -> tuple[Any, Any]:
             batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
-            return form(batch), step_fn.lower(state, batch, seed_key, *self.progress()).compile()
+            return form(batch), step_fn.lower(state, batch, key, *self.progress()).compile()
 
         if len(examples) < 2:
             return step_fn
@@ -232,10 +198,7 @@ class _Loop:
         return (np.float32(min((time.monotonic() - self.begun) / max(self.until - self.begun, 1e-3), 1.0)),)
 
     def awaited(self, batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
-        """Yield the batches of steps `start` to `stop`, check their order, and close their source in the end.
-
-        Counts the time with neither a batch nor a running step.
-        """
+        """Yield the batches of steps `start` to `stop` in order, count the time without one, and close their source."""
         source, expected, requested = batches(start, stop), start, time.perf_counter()
         try:
             for step, batch, info in source:
@@ -256,7 +219,7 @@ class _Loop:
         self, state: TrainState, loss_fn: LossFn, trained: TrainedFn | None
     ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
         """Return the jitted step, which keeps the sharding of the state and is traced once a batch structure."""
-        loss_fn, tx, options = gathering(loss_fn, self.mesh), optimizer(self.config), self.config.optim
+        loss_fn, tx, options = meshes.gathering(loss_fn, self.mesh), optimizer(self.config), self.config.optim
         step = make_step(loss_fn, tx, total_steps=self.config.run.steps, accumulate=options.accumulate, trained=trained)
 
         @functools.wraps(step)
@@ -265,7 +228,7 @@ class _Loop:
             return step(*args)
 
         places = jax.tree.map(lambda x: x.sharding, state)
-        return jax.jit(counted, donate_argnums=donated(), out_shardings=(places, replicated(self.mesh)))
+        return jax.jit(counted, donate_argnums=meshes.donated(), out_shardings=(places, meshes.replicated(self.mesh)))
 
     def log_metrics(self) -> None:
         """Fetch and write the metrics of the pending step; stop the run when too many were skipped in a row."""
@@ -314,7 +277,7 @@ class _Loop:
         if self.on_report is not None:
             self.log_metrics()
             try:
-                self.on_report(done, gather(merge(state.trainable, state.frozen)), gather(batch))
+                self.on_report(done, meshes.gather(merge(state.trainable, state.frozen)), meshes.gather(batch))
             except Exception as error:
                 self.log(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
@@ -324,11 +287,11 @@ def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: M
     """Return the state of the latest complete checkpoint and its step, or a new state, sharded over the mesh."""
     init = functools.partial(init_state, config=config)
     shapes = jax.eval_shape(init, params)
-    places = state_sharding(shapes, mesh)
-    if latest := broadcast(checkpoints.latest() or 0):
+    places = meshes.state_sharding(shapes, mesh)
+    if latest := meshes.broadcast(checkpoints.latest() or 0):
         wanted = jax.tree.map(lambda x, at: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at), shapes, places)
         return checkpoints.restore(wanted, latest), latest
-    return jax.jit(init, out_shardings=places)(put_state(params, state_sharding(params, mesh))), 0
+    return jax.jit(init, out_shardings=places)(meshes.put_state(params, meshes.state_sharding(params, mesh))), 0
 
 
 class LastStep:

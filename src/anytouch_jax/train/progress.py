@@ -1,15 +1,23 @@
-"""Progress of a run on a terminal or in a log, and the signals that end it."""
-
-from __future__ import annotations
+"""A run's folder (config.json, metrics.jsonl with one line a step, the lock), its progress, and signals that end it."""
 
 import contextlib
+import dataclasses
+import json
+import math
+import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TextIO
 
 import numpy as np
+
+from anytouch_jax.config import Config, from_json, parse_json, to_json
+from anytouch_jax.errors import ConfigError, Terminated, UserError, handled
+from anytouch_jax.files import atomic_write, lock
+from anytouch_jax.weights.checkpoint import read_record, steps
 
 Log = Callable[[str], None]
 _WAIT_SHARE = 0.05  # a run that waits for data longer than this share of its time reports it
@@ -27,10 +35,7 @@ def silent(sentence: str) -> None:
 
 @contextlib.contextmanager
 def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Give a function for the metrics of each step. It moves a bar on a terminal, else logs about twenty lines.
-
-    With `curve` a terminal also shows the loss of all steps so far.
-    """
+    """Give a function for the metrics of each step: a bar on a terminal (with a `curve` of the loss), or log lines."""
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
 
@@ -88,19 +93,6 @@ def summary(row: Mapping[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def _handled(handler: Callable[[int, Any], None], *names: signal.Signals) -> Iterator[None]:
-    """Let signals call `handler` while the block runs. Outside the main thread Python has no handlers."""
-    before: dict[signal.Signals, Any] = {}
-    try:
-        for name in names if threading.current_thread() is threading.main_thread() else ():
-            before[name] = signal.signal(name, handler)
-        yield
-    finally:
-        for name, earlier in before.items():
-            signal.signal(name, earlier)
-
-
-@contextlib.contextmanager
 def signals() -> Iterator[list[signal.Signals]]:
     """Yield a list that collects SIGTERM and Ctrl-C, which then do not end the process. A second Ctrl-C does."""
     received: list[signal.Signals] = []
@@ -111,12 +103,8 @@ def signals() -> Iterator[list[signal.Signals]]:
             signal.signal(signal.SIGINT, earlier)
 
     earlier = signal.getsignal(signal.SIGINT)
-    with _handled(note, signal.SIGTERM, signal.SIGINT):
+    with handled(note, signal.SIGTERM, signal.SIGINT):
         yield received
-
-
-class Terminated(BaseException):
-    """SIGTERM outside a training step."""
 
 
 @contextlib.contextmanager
@@ -126,5 +114,175 @@ def terminating() -> Iterator[None]:
     def end(number: int, frame: Any) -> None:
         raise Terminated
 
-    with _handled(end, signal.SIGTERM):
+    with handled(end, signal.SIGTERM):
         yield
+
+
+# Settings that may change when a run continues: they decide where and how fast it runs, not its numbers. `pretrain`
+# compares the content of the manifests, since a data set may have moved. The run folder has a copy of the tokenizer.
+CHANGEABLE = {f"data.{name}" for name in ("cache", "manifests", "on_bad_sample", "prefetch", "threads", "tokenizer")}
+CHANGEABLE |= {f"run.{n}" for n in ("figure_every", "fsdp", "keep", "max_skipped", "save_every", "tensorboard")}
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn a failed write, such as a full disk, into a UserError."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(
+            f"cannot write {path}: {reason}. Free some space or make the folder writable, then run the same command "
+            "again to continue from the last complete checkpoint."
+        ) from error
+
+
+_locked: set[tuple[int, Path]] = set()
+
+
+@contextlib.contextmanager
+def alone_in(run_dir: Path) -> Iterator[None]:
+    """Make and lock a run folder, except for the same thread. Raises UserError if another process trains there."""
+    mine = (threading.get_ident(), run_dir.resolve())
+    if mine in _locked:
+        yield
+        return
+    with writing(run_dir):
+        run_dir.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        with writing(run_dir):
+            free = stack.enter_context(lock(run_dir / ".lock"))
+        if not free:
+            raise UserError(f"another process trains in {run_dir}. Wait for it, or choose another folder with --run.")
+        _locked.add(mine)
+        stack.callback(_locked.discard, mine)
+        yield
+
+
+def begun_with(run_dir: Path) -> Config | None:
+    """Return the settings that a run started with, or None without a complete checkpoint. Raises UserError."""
+    path, done = run_dir / "config.json", steps(run_dir / "checkpoints")
+    if not done:
+        return None
+    try:
+        if path.exists():
+            return from_json(path.read_text(encoding="utf-8"), allow_retired=False)
+        path = run_dir / "checkpoints" / f"{done[-1]:08d}"
+        return from_json(read_record(path)["config"], allow_retired=False)
+    except (ConfigError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} cannot be read ({error}). Choose another run folder, or repair the file.") from None
+
+
+def open_run(run_dir: Path, config: Config) -> None:
+    """Make a run folder with its config.json, or check that its run started with equal settings. Raises UserError."""
+    path = run_dir / "config.json"
+    with writing(path):
+        (run_dir / "figures").mkdir(parents=True, exist_ok=True)
+        if not continues(run_dir, config) or not path.exists():
+            atomic_write(path, to_json(config) + "\n")
+
+
+def continues(run_dir: Path, config: Config) -> bool:
+    """Return whether a folder has a run to continue. Raises UserError for changed settings, but those CHANGEABLE."""
+    if (begun := begun_with(run_dir)) is None:
+        return False
+    before, now = _flat(dataclasses.asdict(begun)), _flat(dataclasses.asdict(config))
+    changed = [
+        f"{name} was {before.get(name)!r} and is now {now.get(name)!r}"
+        for name in sorted(before.keys() | now.keys())
+        if name not in CHANGEABLE and before.get(name) != now.get(name)
+    ]
+    if changed:
+        longer = f", or start from its weights by --init {run_dir} and another --run folder"
+        raise UserError(
+            f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. Use the same settings to "
+            f"continue it, or choose another run folder{longer if before['run.steps'] != now['run.steps'] else ''}."
+        )
+    return True
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return a nested dict as {dotted name: value}, with lists as tuples."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        value = tuple(value) if isinstance(value, list) else value
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return flat
+
+
+class Record:
+    """metrics.jsonl from step `start` on. Later and incomplete lines, of a killed run, are removed.
+
+    `skipped` counts the skipped steps so far, and `in_a_row` those at the end without a break. With `tensorboard` the
+    numbers also go to an event file. Only the `lead` process writes. Raises UserError for a full disk.
+    """
+
+    def __init__(self, run_dir: Path, start: int, *, tensorboard: bool = False, lead: bool = True) -> None:
+        self.path = run_dir / "metrics.jsonl"
+        self.skipped = self.in_a_row = 0
+        self._board = _tensorboard(run_dir, start) if tensorboard and lead else None
+        with writing(self.path):
+            for row in _cut(self.path, start, rewrite=lead):
+                self._count(row)
+            self._file: TextIO | None = self.path.open("a", encoding="utf-8") if lead else None
+
+    def write(self, step: int, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Append the line of a step and return it. A number that is not finite becomes null, as JSON has no NaN."""
+        row: dict[str, Any] = {"step": step}
+        for name, value in numbers.items():
+            value = value.item() if hasattr(value, "item") else value
+            row[name] = None if isinstance(value, float) and not math.isfinite(value) else value
+        self._count(row)
+        row["skipped_batches"] = self.skipped
+        if self._file:
+            with writing(self.path):
+                self._file.write(json.dumps(row, allow_nan=False) + "\n")
+                self._file.flush()
+        if self._board is not None:
+            for name, value in row.items():
+                if name != "step" and isinstance(value, int | float):
+                    self._board.add_scalar(name, value, step)
+        return row
+
+    def sync(self) -> None:
+        """Flush the lines to disk, so that a checkpoint never has steps that are missing here."""
+        if self._file:
+            with writing(self.path):
+                os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the files. `write` has reported what could not be written."""
+        for file in (self._file, self._board):
+            with contextlib.suppress(OSError):
+                if file is not None:
+                    file.close()
+
+    def _count(self, row: Mapping[str, Any]) -> None:
+        self.in_a_row = self.in_a_row + 1 if row.get("skipped") else 0
+        self.skipped += bool(row.get("skipped"))
+
+
+def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
+    """Remove the lines of step `start` and later, and incomplete ones, and return the rest."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True) if path.exists() else []
+    rows: dict[str, dict[str, Any]] = {}
+    for line in lines:
+        with contextlib.suppress(ValueError):
+            row = parse_json(line)
+            step = row.get("step") if isinstance(row, dict) else None
+            if line.endswith("\n") and isinstance(step, int) and step < start:
+                rows[line] = row
+    if rewrite and len(rows) < len(lines):
+        atomic_write(path, "".join(rows))
+    return list(rows.values())
+
+
+def _tensorboard(run_dir: Path, start: int) -> Any:
+    """Return a writer of TensorBoard events, from step `start` on."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise UserError(
+            "--run.tensorboard needs tensorboardX. Run pip install 'anytouch-jax[tensorboard]', or leave it off."
+        ) from None
+    return SummaryWriter(str(run_dir / "tensorboard"), purge_step=start)

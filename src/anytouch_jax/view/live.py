@@ -1,7 +1,5 @@
 """Live touch for the page: a camera or a film in its place, with contact, class, nearest touches and recordings."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
@@ -16,7 +14,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.data.cameras import CameraSettings, open_source
@@ -25,29 +22,24 @@ from anytouch_jax.data.images import encode, open_video
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
 from anytouch_jax.data.transforms import Flip, orient_frame
-from anytouch_jax.encoder.arrays import unit_rows
+from anytouch_jax.encoder.arrays import Array, unit_rows
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.encoder.fields import Fields, Measure
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.encoder.stream import Embedded, stream
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.measured import field_numbers, last_clip, measured_layer
-from anytouch_jax.view.space import FeatureMap
-from anytouch_jax.view.tables import LAYERS, MEASURED, scale_down, touch_layer
+from anytouch_jax.view import tables
+from anytouch_jax.view.tables import FeatureMap
 from anytouch_jax.view.teach import LiveRecorder, Teacher
 
-Array = npt.NDArray[Any]
 _KEPT = 600  # frames whose times make p50 and p99, as on the page
 _SEARCH = 0.5  # seconds between searches for the nearest touches
 _LOOK = 0.005  # seconds between looks for a new packet
 
 
 class LoopedFilm:
-    """A film that takes the place of a camera: frames come at its frame rate, again and again.
-
-    Frames that are not fetched in time are lost, as with a camera. Raises UserError for a film without frames.
-    """
+    """A film in place of a camera, again and again; late frames are lost. Raises UserError for one without frames."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._video, self._due = path.absolute(), open_video(path), 0.0
@@ -109,8 +101,7 @@ class _Kept(NamedTuple):
 class Live:
     """The newest frame of a source, with everything that the page shows of it. `start` begins, `stop` ends.
 
-    `space` holds known touches of the same encoder. Recordings go into the folder `out`, where a head can be taught. It
-    takes the place of `head`.
+    `space` holds known touches of the encoder. A head can be taught in the folder `out`, and replaces `head`.
     """
 
     kind = "live"
@@ -145,7 +136,7 @@ class Live:
         return {
             "encoder": self._encoder.source, "sensor": self._sensor, "head": self._head and self._head.label,
             "source": self.source, "table": self._space and self._space.table,
-            "layers": [name for name in LAYERS if self._encoder.measures or name not in MEASURED],
+            "layers": [name for name in tables.LAYERS if self._encoder.measures or name not in tables.MEASURED],
         }  # fmt: skip
 
     def start(self) -> None:
@@ -180,10 +171,7 @@ class Live:
             self.set_background(self._setup.turned(self._kept[-1].raw))
 
     async def packets(self, layer: str) -> AsyncIterator[bytes]:
-        """Yield each newest frame as a layer for one page: length u32, JSON, length u32, JPEG, little endian.
-
-        It waits without a thread: pages that wait for a stopped camera must not take those of other requests.
-        """
+        """Yield each newest frame as a layer: length u32, JSON, length u32, JPEG, little endian. It takes no thread."""
         seen = 0
         while not self._stopped:
             newest = self._newest
@@ -200,7 +188,7 @@ class Live:
 
     def _with_gel(self, rotate: int, flip: Flip, gel: Array | None, running: RunningGel | None = None) -> _Setup:
         estimate = running or RunningGel() if gel is None or running else None
-        small = None if gel is None else (scale_down(gel), UntouchedGel(gel))
+        small = None if gel is None else (tables.scale_down(gel), UntouchedGel(gel))
         known = self._sensor or UNIVERSAL, gel
         measure = self._encoder.measure_of(*known, log=lambda _: None) if self._encoder.measures else None
         # Frames are turned before, so the encoder's preprocessing does not.
@@ -264,11 +252,11 @@ class Live:
             return
         *_, picture, _, setup = kept[-1]
         threshold = THRESHOLDS.get(self._sensor or UNIVERSAL, DEFAULT_THRESHOLD)
-        score, fields = touch_layer(picture, setup.small, threshold, "frame")[1], None
+        score, fields = tables.touch_layer(picture, setup.small, threshold, "frame")[1], None
         if score == score and setup.measure is not None:
             like = [one.prepared for one in kept if (one.setup.rotate, one.setup.flip) == (setup.rotate, setup.flip)]
             fields = self._fields(setup.measure, picture, like)
-        measured = {} if fields is None else field_numbers(fields)
+        measured = {} if fields is None else tables.field_numbers(fields)
         self.recorder.add(picture, score, frame.values)
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
@@ -286,7 +274,7 @@ class Live:
 
     def _fields(self, measure: Measure, picture: Array, prepared: list[Array]) -> Fields:
         """Measure a picture, the last of some prepared frames."""
-        clip = last_clip(prepared, self._encoder.config.model.frames)
+        clip = tables.last_clip(prepared, self._encoder.config.model.frames)
         row, aspect = np.array([self._row], np.int32), np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
         return measure(self._encoder.encode_and_measure(clip[None], row, aspect)[1], picture)
 
@@ -318,11 +306,11 @@ def _packet(shown: _Shown, layer: str) -> bytes:
     """Return a frame for the page (see `Live.packets`)."""
     about, jpeg = {"layer": layer, "sent": 1e3 * time.time(), **shown.about}, b""
     if shown.picture is not None:
-        gel = shown.gel if layer != LAYERS[0] else None  # its score is known already
-        view, score = touch_layer(shown.picture, gel, about["threshold"], layer)
-        about["layer"] = "frame" if score != score or (layer in MEASURED and shown.fields is None) else layer
-        if shown.fields is not None and about["layer"] in MEASURED:
-            view = measured_layer(view, shown.fields, layer)
+        gel = shown.gel if layer != tables.LAYERS[0] else None  # its score is known already
+        view, score = tables.touch_layer(shown.picture, gel, about["threshold"], layer)
+        about["layer"] = "frame" if score != score or (layer in tables.MEASURED and shown.fields is None) else layer
+        if shown.fields is not None and about["layer"] in tables.MEASURED:
+            view = tables.measured_layer(view, shown.fields, layer)
         jpeg = encode(view, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 85)
     text = json.dumps(about).encode()
     return struct.pack("<I", len(text)) + text + struct.pack("<I", len(jpeg)) + jpeg

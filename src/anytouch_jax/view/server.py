@@ -1,8 +1,7 @@
 """The server of the page: an ASGI application with JSON, pictures and the live stream.
 
-It answers with what the given sources hold, as JSON and as pictures that it has decoded and encoded itself. No address
-names a file. Other web sites cannot read or change anything. The name of the host is checked, there are no CORS
-headers, and every change needs a header that another site cannot send.
+No address names a file. Other web sites cannot read or change anything. The name of the host is checked, there are no
+CORS headers, and every change needs a header that another site cannot send.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ from anytouch_jax.data.images import encode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
-from anytouch_jax.view.tables import LAYERS, SIDE, Run, Table, open_examples, open_film, open_folder, scale_down, title
+from anytouch_jax.view import tables
+from anytouch_jax.view.tables import LAYERS, SIDE, FeatureMap, Run, Table, open_examples, open_film, scale_down, title
 
 if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
     from anytouch_jax.view.live import Live
-    from anytouch_jax.view.space import FeatureMap
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 HEADER = "x-anytouch"  # of every request that changes something: another site would need CORS to send it
@@ -59,10 +58,7 @@ Source: TypeAlias = "StartPage | Table | FeatureMap | Run | Live"
 
 
 class StartPage:
-    """The first page without anything to show: the cameras of this machine, each by its number and name.
-
-    `open_camera` opens one of them.
-    """
+    """The first page without anything to show: the cameras of this machine, which `open_camera` opens."""
 
     kind, name = "start", "start"
 
@@ -77,12 +73,9 @@ class StartPage:
 def open_sources(paths: Sequence[Path]) -> list[Source]:
     """Return what the page shows of each path: a manifest, a folder, a film, features or a run. Raises UserError.
 
-    Features show the pictures of a table among the paths, or of the manifest that they were made from if it lies in
-    their own folder.
+    Features show the pictures of a table among the paths, or of the manifest in their folder that they were made from.
     """
-    tables: list[Table] = []
-    sources: list[Source] = []
-    features: list[Path] = []
+    tables, sources, features = list[Table](), list[Source](), list[Path]()
     for path in paths:
         if str(path) == "examples" and not path.exists():
             tables.append(open_examples())
@@ -96,8 +89,6 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
             tables.append(_open_table(path))
     numbered = list(tables)
     for path in features:
-        from anytouch_jax.view.space import FeatureMap
-
         space = FeatureMap(path, numbered)
         if space.table is None and (own := _own_manifest(path, space)) is not None:
             numbered.append(own)
@@ -113,7 +104,7 @@ def _open_table(path: Path) -> Table:
         return open_film(path)
     inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
     inside.sort(key=lambda file: file.stem != "manifest")
-    return Table(manifests.read(inside[0]), title(inside[0])) if inside else open_folder(path)
+    return Table(manifests.read(inside[0]), title(inside[0])) if inside else tables.open_folder(path)
 
 
 def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
@@ -126,8 +117,7 @@ def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
 def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
     """Return the ASGI application of the page.
 
-    With a `token`, every request for data needs it. Requests to other names than `hosts` are refused. A camera that
-    the page opens is added to `sources`.
+    With a `token`, requests for data need it. Other names than `hosts` are refused. Cameras are added to `sources`.
     """
 
     def source(request: Request, kind: str) -> Any:
@@ -152,9 +142,7 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
         view, score, fields = table.layer(request.path_params["row"], _layer(request))
         headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
         if fields is not None:
-            from anytouch_jax.view.measured import field_numbers
-
-            headers["X-Fields"] = json.dumps(field_numbers(fields))
+            headers["X-Fields"] = json.dumps(tables.field_numbers(fields))
         return _picture(view, headers)
 
     def recorded(request: Request, live: Live) -> Response:

@@ -1,25 +1,24 @@
-"""What the page shows of files: touches of a manifest, a folder of pictures or a film, and run folders.
+"""What the page shows of files: touches of a manifest, a folder of pictures or a film, features, and run folders.
 
-A touch is the recordings (sequences) that share a value of `touch`, by any sensors. A recording without one is a touch
-by itself. Pictures are read when they are shown.
+A touch is the recordings (sequences) that share a value of `touch`, or one without. Pictures are read when shown, and
+libraries that take seconds are imported when they are needed.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax import encoder
-from anytouch_jax.config import parse_json
+from anytouch_jax.config import UNIVERSAL, parse_json
 from anytouch_jax.data.gels import FRAMES, UnitGels, recording_gel
 from anytouch_jax.data.images import QUIET, count_frames, decode, list_images, open_video, to_rgb
 from anytouch_jax.data.manifest import manifest as manifests
@@ -27,12 +26,13 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel, contact_score, scale_picture
 from anytouch_jax.data.transforms import subtract_background
+from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
+    from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.fields import Fields
 
-Array = npt.NDArray[Any]
 UNKNOWN, UNUSED = "unknown", "unused"  # the sensor and the split of a folder or a film, which the page leaves out
 EXAMPLES = Path(encoder.__file__).with_name("examples")  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg
 LAYERS = ("frame", "difference", "contact", "depth", "surface")  # of a touch, by which the page shows it
@@ -41,6 +41,12 @@ SIDE = 640  # pixels of the long side of a picture on the page
 _MOST_ROWS, _MOST_CLIPS, _MOST_CHOICES = 5000, 12, 500  # frames of a clip, clips of a touch, values of a filter
 _CLIP = 3  # frames on which a touch is measured
 _LINES = 2_000  # points of a loss curve on the page
+_SHARP = 480  # pixels of the long side of a picture with arrows, at least
+_SIDE = 72  # cells of a surface along the long side of the picture
+_ONE_BY_ONE = threading.Lock()
+METHODS = {"pca": 20_000, "tsne": 2_000}  # and how many points each draws
+_NAMES = 20  # values of a column with a colour each
+_NEAR = 40  # frames of a recording that may be nearer than the next recording, on average
 _BLOCK = 1 << 22  # bytes of metrics.jsonl that are read at once
 _FILTERS = ("sensor", "object", "split", "dataset", "unit")
 _TINTED = (np.arange(256)[None, :, None] / 2 + (127, 60, 0)).astype(np.uint8)  # colours of contact
@@ -62,10 +68,7 @@ class Table:
         return about | {"filters": self._filters, "layers": LAYERS}
 
     def touch(self, place: int, filters: dict[str, str]) -> dict[str, Any]:
-        """Return touch `place` among those that pass `filters` {column: value}: its clips, and how many there are.
-
-        Raises UserError for a column that is no filter.
-        """
+        """Return touch `place` among those that pass `filters` {column: value}, and their number. Raises UserError."""
         if unknown := sorted(filters.keys() - self._filters.keys()):
             raise UserError(f"{unknown[0][:50]} is no filter of this table.")
         chosen = tuple(sorted(filters.items()))
@@ -97,28 +100,24 @@ class Table:
         return decode(self.manifest.file(row, "image_path"))
 
     def layer(self, row: int, name: str) -> tuple[Array, float, Fields | None]:
-        """Return a layer of a row (see `touch_layer`), its contact score, NaN without an untouched gel, and its fields.
-
-        Fields are for the layers MEASURED.
-        """
+        """Return a layer of a row (see `touch_layer`), its contact score, and its fields for the layers MEASURED."""
         frame, gel = self.frame(row), self._untouched(row)
         view, score = touch_layer(frame, gel, self.threshold(row), name)
         if name not in MEASURED or gel is None or score != score:
             return view, score, None
-        from anytouch_jax.view.measured import measured_layer
-
         fields = self._measured(row)
         return measured_layer(view, fields, name), score, fields
 
     def _measure(self, row: int) -> Fields:
-        from anytouch_jax.view.measured import measure_recorded
-
         order, starts = self._order
         end = self._position(row) + 1
         rows = order[max(starts[starts < end][-1], end - _CLIP) : end].tolist()
         gel, sensor = self._untouched(row), self.manifest.value(row, "sensor")
         frames = [self.frame(one) for one in rows]
-        return measure_recorded(frames, gel and gel[0], None if sensor == UNKNOWN else sensor)
+        with _ONE_BY_ONE:  # the first call takes seconds
+            clip = last_clip(frames, _encoder().config.model.frames)[None]
+            name = UNIVERSAL if sensor == UNKNOWN else sensor
+            return _encoder().measure(clip, gel and gel[0], name, log=lambda _: None)
 
     def threshold(self, row: int) -> float:
         """Return the contact score above which a frame of the row's sensor shows contact."""
@@ -248,14 +247,11 @@ def scale_down(picture: Array, side: int = SIDE) -> Array:
     return picture if max(picture.shape[:2]) <= side else scale_picture(picture, side)
 
 
-def touch_layer(
-    frame: Array, gel: tuple[Array, UntouchedGel] | None, threshold: float, name: str
-) -> tuple[Array, float]:
+def touch_layer(frame: Array, gel: tuple[Array, UntouchedGel] | None, limit: float, name: str) -> tuple[Array, float]:
     """Return one of LAYERS as a picture RGB u8 (h, w, 3), and the contact score.
 
-    They are the frame, its difference from the untouched gel as an encoder reads it, and its contact. For MEASURED, it
-    is the frame, which is not measured here. Without a `gel` (scaled down) of the same proportions, the frame is
-    returned, and the score is NaN. Raises UserError for another name.
+    Without a `gel` (scaled down) of the same proportions, it is the frame, and the score is NaN. For MEASURED it is the
+    frame, too. Raises UserError for another name.
     """
     if name not in LAYERS:
         raise UserError(f"A touch has the layers {', '.join(LAYERS)}, not {name[:20]}.")
@@ -271,7 +267,7 @@ def touch_layer(
         background = gel[0] if gel[0].shape == view.shape else cv2.resize(gel[0], (width, height))
         (view,) = subtract_background([view], background)
     elif name == "contact":
-        mask, tinted = (cv2.resize(change, (width, height)) > threshold).astype(np.uint8), cv2.LUT(view, _TINTED)
+        mask, tinted = (cv2.resize(change, (width, height)) > limit).astype(np.uint8), cv2.LUT(view, _TINTED)
         view = cv2.convertScaleAbs(view, alpha=1 / 3, beta=40)
         cv2.copyTo(tinted, mask, view)
     return view, contact_score(change)
@@ -334,10 +330,7 @@ class Run:
         return {}
 
     def losses(self, start: int) -> dict[str, Any]:
-        """Return lines {step, loss, ...} of metrics.jsonl from byte `start`, the byte after them, and the figures.
-
-        A file that has become shorter is read from its beginning.
-        """
+        """Return lines {step, loss, ...} of metrics.jsonl from byte `start`, the byte after them, and the figures."""
         file = self._folder / "metrics.jsonl"
         lines: list[dict[str, float]] = []
         if file.is_file():
@@ -371,3 +364,137 @@ class Run:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and abs(value) < 1e300  # not NaN: no comparison with it is true
+
+
+@cache
+def _encoder() -> Encoder:
+    from anytouch_jax.encoder.encoder import load_encoder
+
+    return load_encoder("anytouch-tiny")  # measures recordings, by which no encoder is named
+
+
+def last_clip(frames: Sequence[Array], length: int) -> Array:
+    """Return the last frames as a clip (length, h, w, 3). Before the first of them nothing moved."""
+    same = [frame for frame in frames[-length:] if frame.shape == frames[-1].shape]
+    return np.stack([same[0]] * (length - len(same)) + same)
+
+
+def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
+    """Return what was measured of a frame as a picture u8 (h, w, 3): "depth" on the frame, or a "surface" in grey."""
+    from anytouch_jax.encoder.fields import depth_levels, overlay
+
+    if name == "depth":
+        larger = max(1.0, _SHARP / max(frame.shape[:2]))  # lines on few pixels would be thick
+        return overlay(cv2.resize(frame, None, fx=larger, fy=larger), measured, text=False)
+    scale = _SIDE / max(1.0, measured.shape)
+    small = cv2.resize(measured.depth[0], (round(scale), round(scale * measured.shape)))
+    return cv2.cvtColor(depth_levels(small, measured.width_mm)[0], cv2.COLOR_GRAY2RGB)
+
+
+def field_numbers(measured: Fields) -> dict[str, Any]:
+    """Return what the page writes of a frame; `high` is the depth of a white place of the surface, in widths."""
+    from anytouch_jax.encoder.fields import depth_levels
+
+    about, unit = measured.summary(), "widths" if measured.width_mm is None else "mm"
+    curves = {"force, N": about["force_z"], f"depth, {unit}": about["depth"]}
+    curves["slip"] = about["slip"] if measured.area[0] > 0 else 0.0
+    _, high = depth_levels(measured.depth[0], measured.width_mm)
+    return {
+        "curves": {name: round(value, 4) for name, value in curves.items() if value is not None},
+        "force": None if measured.force is None else [about[f"force_{axis}"] for axis in "xyz"],
+        "force_std": about["force_z_std"], "sideways_std": about["force_x_std"], "depth": about["depth"],
+        "depth_std": about["depth_std"], "area": about["area"], "unit": unit, "faults": measured.faults,
+        "high": high / (measured.width_mm or 1.0),
+    }  # fmt: skip
+
+
+class FeatureMap:
+    """A features file of `anytouch embed`, with pictures of the first of `tables` that has its rows; or UserError."""
+
+    kind = "space"
+
+    def __init__(self, path: Path, tables: list[Table]) -> None:
+        from anytouch_jax.encoder.embed import load_index
+
+        self.name, self.index = title(path), load_index(path)
+        self._rows = self.index.rows
+        self.table = next((number for number, table in enumerate(tables) if self._has_rows_of(table)), None)
+        self.map = lru_cache(len(METHODS))(self._map)
+
+    def about(self) -> dict[str, Any]:
+        """Return the number of features, the columns that colour them, and where they come from."""
+        about = {"count": len(self._rows), "columns": sorted(self.index.keys), "table": self.table}
+        about["sensors"] = len(np.unique(self.index.keys.get("sensor", np.zeros(1))))
+        return about | {"methods": list(METHODS), "from": self.index.about}
+
+    def _map(self, method: str) -> dict[str, Any]:
+        """Return points {x, y, rows} in -1..1 of at most METHODS[method] rows, evenly spread. Raises UserError."""
+        if method not in METHODS:
+            raise UserError(f"A map is by {' or '.join(METHODS)}, not {method[:20]}.")
+        rows = np.unique(np.linspace(0, len(self._rows) - 1, min(METHODS[method], len(self._rows))).astype(int))
+        values = self.index.values[rows]
+        if method == "tsne":
+            from anytouch_jax.evaluate.plots import tsne
+
+            points = tsne(values)
+        else:
+            centred = values - values.mean(0)
+            points = centred @ np.linalg.eigh(centred.T @ centred)[1][:, :-3:-1]
+            points = np.pad(points, ((0, 0), (0, 2 - points.shape[1])))
+        points = points - (points.max(0) + points.min(0)) / 2
+        points = points / max(float(np.abs(points).max()), 1e-9)
+        return {"x": points[:, 0].round(4).tolist(), "y": points[:, 1].round(4).tolist(), "rows": rows.tolist()}
+
+    def colours(self, method: str, column: str) -> dict[str, Any]:
+        """Return {values} of a column of numbers, or {codes, names}, for the points of a map. Raises UserError."""
+        if column not in self.index.keys:
+            raise UserError(f"The features have no column {column[:50]}.")
+        values = self.index.keys[column][self.map(method)["rows"]]
+        if values.dtype.kind in "iuf" and len(np.unique(values)) > _NAMES:
+            return {"values": [None if not np.isfinite(value) else float(value) for value in values]}
+        distinct, codes, counts = np.unique(values.astype(str), return_inverse=True, return_counts=True)
+        shown = np.sort(np.argsort(-counts, kind="stable")[:_NAMES])
+        place = np.full(len(distinct), len(shown))
+        place[shown] = np.arange(len(shown))
+        names = [*distinct[shown].tolist(), *(["others"] if len(distinct) > len(shown) else [])]
+        return {"codes": place[codes].tolist(), "names": names}
+
+    def neighbours(self, row: int, *, others: bool) -> dict[str, Any]:
+        """Return a row and its ten nearest of other recordings, by cosine; of other sensors with `others`."""
+        if not 0 <= row < len(self._rows):
+            raise UserError(f"There are {len(self._rows)} features, no row {row}.")
+        allowed = np.ones(len(self._rows), bool)
+        allowed[row] = False
+        for name in ("sequence", *(["sensor"] if others else [])):
+            if name in self.index.keys:
+                allowed &= self.index.keys[name] != self.index.keys[name][row]
+        found = self.near(self.index.values[row], np.flatnonzero(allowed))
+        return {"row": self._describe(row), "hits": found}
+
+    def near(self, values: Array, among: Array | None = None, count: int = 10) -> list[dict[str, Any]]:
+        """Return the nearest of `among` rows (m,) to unit features (d,) with cosines, one frame of a recording."""
+        from anytouch_jax.encoder.embed import nearest
+
+        among = np.arange(len(self._rows)) if among is None else among
+        if not len(among):
+            return []
+        stored = self.index.values if len(among) == len(self._rows) else self.index.values[among]
+        places, cosines = nearest(stored, values[None], min(_NEAR * count, len(among)))
+        rows = among[places[0]]
+        if "sequence" in self.index.keys:
+            rows = rows[np.sort(np.unique(self.index.keys["sequence"][rows], return_index=True)[1])]
+        cosine = dict(zip(among[places[0]].tolist(), cosines[0].tolist(), strict=True))
+        return [self._describe(row) | {"cosine": round(cosine[row], 4)} for row in rows[:count].tolist()]
+
+    def _describe(self, row: int) -> dict[str, Any]:
+        return {"row": row, "table_row": int(self._rows[row]), "about": self.index.describe(row)}
+
+    def _has_rows_of(self, table: Table) -> bool:
+        """Whether the rows of the file are rows of a table: the same frames at the first, middle and last."""
+        few = self._rows[[0, len(self._rows) // 2, -1]]
+        if few.min() < 0 or self._rows.max() >= len(table.manifest):
+            return False
+        keys = [name for name in ("path", "frame_index") if name in self.index.keys]
+        ours = {name: self.index.keys[name][[0, len(self._rows) // 2, -1]].astype(str).tolist() for name in keys}
+        there = {name: [str(table.manifest.value(row, name)).rpartition("/")[2] for row in few] for name in keys}
+        return bool(keys) and all([one.rpartition("/")[2] for one in ours[name]] == there[name] for name in keys)

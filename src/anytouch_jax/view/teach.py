@@ -1,10 +1,8 @@
 """Recordings of live touch, and a classifier that is taught by them.
 
 A recording is a touch with a name: frames in a folder, and rows in its manifest.parquet. The head is fitted as
-`anytouch probe label --save` does. Whole recordings are left out to calibrate it, and to compare it with raw pixels.
+`anytouch probe label --save` does. Recordings are left out to calibrate it, and to compare it with raw pixels.
 """
-
-from __future__ import annotations
 
 import math
 import os
@@ -23,7 +21,6 @@ from typing import IO, Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from anytouch_jax.config import UNIVERSAL
@@ -33,18 +30,16 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.manifest.schema import EMPTY
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
+from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.embed import Features, Pooling, embed_rows, save_npz
 from anytouch_jax.encoder.encoder import Encoder
-from anytouch_jax.encoder.linear_head import LinearHead, load_head, save_head
-from anytouch_jax.encoder.novelty import COVERAGE, FALSE_ALARMS
+from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS, LinearHead, load_head, save_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, heads, probing, splits
 from anytouch_jax.evaluate.heads import Scaling
 from anytouch_jax.evaluate.tasks import TaskRows
-from anytouch_jax.view.space import FeatureMap
-from anytouch_jax.view.tables import Table
+from anytouch_jax.view.tables import FeatureMap, Table
 
-Array = npt.NDArray[Any]
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 _WAITING = 64  # pictures that wait for the disk: more are dropped and counted
 _FRAMES = 20  # frames of a recording that are fitted on, evenly spread
@@ -54,11 +49,7 @@ SCORE = "label.contact_score"
 
 
 class LiveRecorder:
-    """Writes frames of recordings into a folder, and after each recording its manifest.parquet.
-
-    An unfinished recording is in a hidden folder. The manifest has whole recordings only. Frames of a recording that
-    fails stay in its folder.
-    """
+    """Writes frames of recordings into a folder, which is hidden until it is whole, and then its manifest.parquet."""
 
     def __init__(self, out: Path, sensor: str | None) -> None:
         self.out, self.named, self.sensor = out.expanduser().resolve(), out, sensor or UNIVERSAL
@@ -155,10 +146,7 @@ class LiveRecorder:
 
 
 class Teacher:
-    """The recordings of a folder, and the `head` that was fitted on them, with the features of what it was fitted on.
-
-    Both lie in the folder, so that the next start of the page continues.
-    """
+    """The recordings of a folder, and the `head` that was fitted on them with its features, for the next start too."""
 
     def __init__(
         self, encoder: Encoder, recorder: LiveRecorder, pooling: Pooling = "class", log: Callable[[str], None] = print
@@ -289,9 +277,8 @@ class Teacher:
         features, paths = self._recorder.features, table.text_column("path")[ids].tolist()
         unknown = [place for place, path in enumerate(paths) if path not in features]
         if unknown:
-            found, values = embed_rows(
-                self._encoder, table, ids[unknown], 1, self._pooling, batch=_BATCH, log=self._log
-            )
+            about: dict[str, Any] = {"pooling": self._pooling, "batch": _BATCH, "log": self._log}
+            found, values = embed_rows(self._encoder, table, ids[unknown], **about)
             if len(found) < len(unknown):
                 raise UserError(f"{len(unknown) - len(found)} recorded frames have no picture of the untouched gel.")
             features |= {paths[place]: one for place, one in zip(unknown, values, strict=True)}

@@ -4,9 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anytouch_jax.sim.world import captions
-from anytouch_jax.sim.world.captions import caption
-from anytouch_jax.sim.world.objects import MATERIALS, PRIMITIVE_KINDS, catalogue, hardness_of, roughness_of
+from anytouch_jax.sim.world import objects as captions
+from anytouch_jax.sim.world.objects import MATERIALS, PRIMITIVE_KINDS, caption, catalogue, hardness_of, roughness_of
 from anytouch_jax.sim.world.shapes import PRIMITIVES
 
 THINGS = catalogue(0, 300)

@@ -6,8 +6,7 @@ import pytest
 
 from anytouch_jax.sim.world import objects
 from anytouch_jax.sim.world.objects import MATERIALS, catalogue, draw_object, hardness_of, hold_out, roughness_of
-from anytouch_jax.sim.world.shapes import PRIMITIVES, Shape, height, relief
-from anytouch_jax.sim.world.textures import TEXTURES
+from anytouch_jax.sim.world.shapes import PRIMITIVES, TEXTURES, Shape, height, relief
 
 THINGS = catalogue(0)
 

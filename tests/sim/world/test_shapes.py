@@ -10,8 +10,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim.scene import Scenes, draw_touch
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import catalogue
-from anytouch_jax.sim.world.shapes import PRIMITIVES, Shape, base, floor, height, relief
-from anytouch_jax.sim.world.textures import TEXTURES
+from anytouch_jax.sim.world.shapes import PRIMITIVES, TEXTURES, Shape, base, floor, height, relief
 
 
 def axes(count, pitch):

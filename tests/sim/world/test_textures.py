@@ -3,8 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from anytouch_jax.sim.world.shapes import Shape, height
-from anytouch_jax.sim.world.textures import GRAINS, TEXTURES
+from anytouch_jax.sim.world.shapes import GRAINS, TEXTURES, Shape, height
 
 
 def axes(count, pitch):

@@ -1,7 +1,5 @@
 """Photographs of the touched place: a shaded height map on a table, with random view, light and background."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +9,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.errors import UserError
 from anytouch_jax.sim.world.objects import Object
 from anytouch_jax.sim.world.shapes import Shape, base, floor, layers, unroll
 
@@ -33,20 +30,16 @@ class CameraView:
 def seeded_photograph(job: tuple[Object, Any, Sequence[int]], size: int) -> np.ndarray:
     """Return `photograph` of an object, a place and a seed, for a pool of processes."""
     thing, place, seed = job
-    return photograph(
-        thing, place, np.random.default_rng([*seed, *np.asarray(place, np.float32).view(np.uint32)]), size
-    )
+    rng = np.random.default_rng([*seed, *np.asarray(place, np.float32).view(np.uint32)])
+    return photograph(thing, place, rng, size)
 
 
 def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224) -> np.ndarray:
     """Return an RGB photograph u8 (size, size, 3) of the object around `place_mm` (x, y) mm in its frame.
 
-    The place is in the middle of 30 to 40 mm. `rng` draws view, light and background. Raises UserError unless the place
-    is two finite numbers and the size at least 8.
+    The place is in the middle of 30 to 40 mm. `rng` draws view, light and background.
     """
     place = np.asarray(place_mm, np.float64)
-    if place.shape != (2,) or not np.isfinite(place).all() or size < 8:
-        raise UserError(f"a photograph needs a place of two finite mm and a size of at least 8, not {place_mm}, {size}")
     shape, view = thing.shape, _draw_view(rng)
     x, y, z, ray = _trace(shape, place, view, size)
     on_table = z <= floor(shape) + 0.25
@@ -57,7 +50,8 @@ def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int
     dip = np.clip(_blur(z, 1.2 * millimetre) - z, 0, 0.8)  # light does not reach into corners
     ambient = (1 - 0.45 * min(1.0, shape.texture_depth / 0.3) * (1 - texture)) * (1 - 0.7 * dip)
     ambient *= 0.55 + 0.45 * normal[2]
-    skin = _skin(thing, texture, grain, _noise(rng, size, 10))
+    mottle, blotch = thing.material.mottle, _noise(rng, size, 10)
+    skin = (1 + 0.3 * mottle * (grain - 0.6) + 0.12 * mottle * blotch - 0.08 * (1 - texture)).astype(np.float32)
     sky, sun = rng.uniform(0.25, 0.4), rng.uniform(0.5, 0.75)
     lamp = (1.0, rng.uniform(0.88, 1.0), rng.uniform(0.75, 1.05))
     shine = np.where(on_table, np.float32(0), _shine(thing, normal, ray, view.light, lit))
@@ -65,9 +59,8 @@ def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int
     planes = []
     for i, ground in enumerate(_table(rng, x, y, place)):
         colour = np.where(on_table, ground, skin * np.float32(thing.colour[i]))
-        planes.append(
-            colour * colour * (sky * ambient + (sun * lamp[i]) * lit) + tint[i] * shine
-        )  # colours are gamma-encoded
+        light = sky * ambient + (sun * lamp[i]) * lit
+        planes.append(colour * colour * light + tint[i] * shine)  # colours are gamma-encoded
     return _develop(planes, rng)
 
 
@@ -180,12 +173,6 @@ def _noise(rng: np.random.Generator, size: int, cells: int) -> Image:
     """Return smooth noise (size, size) of about -1 to 1, with `cells` blobs across."""
     coarse = rng.standard_normal((cells, cells), dtype=np.float32) * 0.5
     return np.asarray(cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC), np.float32)
-
-
-def _skin(thing: Object, texture: Image, grain: Image, blotch: Image) -> Image:
-    """Return the brightness of the surface relative to its colour before lighting, around 1."""
-    mottle = thing.material.mottle
-    return np.asarray(1 + 0.3 * mottle * (grain - 0.6) + 0.12 * mottle * blotch - 0.08 * (1 - texture), np.float32)
 
 
 def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -> Image:

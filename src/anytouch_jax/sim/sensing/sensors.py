@@ -1,12 +1,9 @@
 """Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`, see also `own`.
 
-`looks.npz` has the untouched gels of camera sensors and the colours of their dents. The code that fitted it has left
-(`experiments/results/tried.md`). GelSight, GelSight Mini, DIGIT and 9DTact look like real units. GelSlim and DuraGel
-are a few lights each, set by eye. Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field
-and has no image.
+`looks.npz` has the untouched gels of camera sensors and the colours of their dents (`experiments/results/tried.md`).
+GelSight, GelSight Mini, DIGIT and 9DTact look like real units. GelSlim and DuraGel are a few lights each, set by eye.
+Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field and has no image.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
@@ -67,8 +64,8 @@ class Photometry(NamedTuple):
     """The change of one sensor's image with the tilt of its surface. Colours are RGB in 0..1.
 
     The colour of diffuse paint under a few fixed lights is a low-order polynomial of its normal (spherical harmonics,
-    Basri and Jacobs 2003). Its coefficients drift slowly over the image. So a few hundred numbers for a sensor replace
-    a table over gradient bins (Taxim, Si and Yuan 2022). They are smooth, bounded, and exactly zero without contact.
+    Basri and Jacobs 2003), whose coefficients drift slowly over the image. So a few hundred numbers replace a table
+    over gradient bins (Taxim, Si and Yuan 2022). They are smooth, bounded, and exactly zero without contact.
     """
 
     normal: Array | jax.Array  # (20, 6, 3), a colour for every power of the normal (`POWERS`) and of the position
@@ -186,11 +183,9 @@ MOST_BASES = 16  # untouched gels of a sensor; so many weights are drawn for eac
 def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Unit:
     """Return a unit of `sensor` drawn from `rng`. `real` (n, h, w, 3) replaces the untouched gels of `bases`.
 
-    Gels of F sensors (F, n, h, w, 3) are given with the number `of` the sensor, so that none is copied.
-
-    "Measured" is on real pictures scaled to 128 pixels: GelSight Mini with dots (8 gels, 39 recordings) and without (3
-    units), DIGIT (3 units), 9DTact (3 units). The number of draws does not depend on the sensor, so several sensors can
-    share a stream.
+    Gels of F sensors (F, n, h, w, 3) are given with the number `of` the sensor. "Measured" is on real pictures scaled
+    to 128 pixels: GelSight Mini with dots (8 gels, 39 recordings) and without (3 units), DIGIT (3 units), 9DTact (3
+    units). All sensors draw equally often, so that they can share a stream.
     """
     xp, spread = namespace_of(rng), sensor.spread
     share = sensor.markers.share if sensor.markers else 0.0
@@ -230,10 +225,7 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
 
 
 def _draw_base(real: Any, rng: Rng, of: Any) -> Any:
-    """Return an untouched gel: mostly one of the `real` ones (n, h, w, 3), mixed with others, with faint blotches.
-
-    A picture that is black everywhere only fills an array and does not take part.
-    """
+    """Return an untouched gel: a mix of the `real` ones (n, h, w, 3), without the black ones, with blotches."""
     xp = namespace_of(rng)
     count, height, width, _ = real.shape[-4:]
     drawn = rng.gamma(0.3, size=MOST_BASES)[:count] + 1e-9

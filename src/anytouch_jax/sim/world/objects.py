@@ -1,8 +1,7 @@
-"""Objects to touch: materials, a catalogue drawn from a seed, labels, and held-out kinds."""
-
-from __future__ import annotations
+"""Objects to touch: materials, a catalogue drawn from a seed, labels, held-out kinds, and captions of their feel."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.world.shapes import PRIMITIVES, STROKES, Shape
-from anytouch_jax.sim.world.textures import TEXTURES
+from anytouch_jax.sim.world.shapes import PRIMITIVES, STROKES, TEXTURES, Shape
 
 # In kPa: a finger dents softer materials, and a hand cannot deform harder ones.
 SOFT, HARD = 400.0, 50_000.0
@@ -92,11 +90,6 @@ MATERIALS: dict[str, Material] = {
 }  # fmt: skip
 
 
-def hardness_class(modulus: float) -> str:
-    """Return "soft", "firm" or "hard" for a modulus in kPa."""
-    return "soft" if modulus < SOFT else "firm" if modulus < HARD else "hard"
-
-
 class PrimitiveKind(NamedTuple):
     """The noun of a primitive, its range of sizes in mm (see `Shape`), and the textures that fit it."""
 
@@ -172,8 +165,7 @@ def combinations() -> list[tuple[str, str, str]]:
 def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
     """Return `count` objects with different names. A smaller count returns the first objects of a larger one.
 
-    No combination of primitive, texture and material is repeated. The least drawn one so far comes next, so primitives,
-    textures, materials and their pairs stay balanced. Raises UserError for a count below 1 or above the combinations.
+    No combination is repeated, and the least drawn one so far comes next. Raises UserError for a bad count.
     """
     left = combinations()
     if not 1 <= count <= len(left):
@@ -191,13 +183,7 @@ def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
 
 
 def draw_object(primitive: str, texture: str, material: str, seed: int) -> Object:
-    """Return an object of this kind with sizes, phases and colour drawn from `seed`.
-
-    Raises UserError for a name that is not in PRIMITIVES, TEXTURES or MATERIALS.
-    """
-    for name, table in ((primitive, PRIMITIVES), (texture, TEXTURES), (material, MATERIALS)):
-        if name not in table:
-            raise UserError(f"there is no {name!r} to make an object of; choose one of {', '.join(table)}")
+    """Return an object of this kind, its sizes, phases and colour drawn from `seed`."""
     rng = np.random.default_rng([seed, 11])
     made_of = MATERIALS[material]
     kind = TEXTURE_KINDS[texture]
@@ -211,19 +197,12 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
     letter = sorted(STROKES)[int(rng.integers(len(STROKES)))]
     grain_scale = float(rng.uniform(0.85, 1.2))
     shape = Shape(
-        primitive=primitive,
-        texture=texture,
-        size=round(float(rng.uniform(*PRIMITIVE_KINDS[primitive].size)), 3),
-        texture_pitch=round(pitch, 3),
-        texture_depth=0.0 if texture == "smooth" else round(depth, 3),
-        seed=int(rng.integers(2**20)),
-        texture_angle=round(float(rng.uniform(0, math.pi)), 4),
-        irregularity=made_of.irregularity,
-        grain=made_of.grain,
-        grain_pitch=round(made_of.grain_pitch * grain_scale, 3),
-        grain_depth=made_of.grain_depth,
-        letter=letter,
-    )
+        primitive, texture, size=round(float(rng.uniform(*PRIMITIVE_KINDS[primitive].size)), 3),
+        texture_pitch=round(pitch, 3), texture_depth=0.0 if texture == "smooth" else round(depth, 3),
+        seed=int(rng.integers(2**20)), texture_angle=round(float(rng.uniform(0, math.pi)), 4),
+        irregularity=made_of.irregularity, grain=made_of.grain,
+        grain_pitch=round(made_of.grain_pitch * grain_scale, 3), grain_depth=made_of.grain_depth, letter=letter,
+    )  # fmt: skip
     tints = (made_of.colour, *made_of.tints)
     tint = np.asarray(tints[int(rng.integers(len(tints)))])
     colour = np.clip(tint * rng.uniform(0.85, 1.15) + rng.uniform(-0.03, 0.03, 3), 0.02, 0.95)
@@ -235,8 +214,7 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
 def hold_out(objects: Sequence[Object], share: float, seed: int) -> tuple[tuple[Object, ...], tuple[Object, ...]]:
     """Split objects into (training, held out) that share no (primitive, texture) pair, in their order.
 
-    At least `share` of the objects are held out, and as few more as the pairs allow. Training objects still have every
-    primitive and every texture. Raises UserError if that is impossible.
+    At least `share` is held out. Training objects keep every primitive and texture. Raises UserError otherwise.
     """
     if not 0 < share < 1:
         raise UserError(f"the share of objects held out must lie between 0 and 1, not {share}")
@@ -265,7 +243,8 @@ def hold_out(objects: Sequence[Object], share: float, seed: int) -> tuple[tuple[
 
 def hardness_of(thing: Object) -> str:
     """Return "soft", "firm" or "hard"."""
-    return hardness_class(thing.material.modulus)
+    modulus = thing.material.modulus
+    return "soft" if modulus < SOFT else "firm" if modulus < HARD else "hard"
 
 
 def roughness_of(thing: Object) -> str:
@@ -273,3 +252,83 @@ def roughness_of(thing: Object) -> str:
     shape = thing.shape
     slope = TEXTURE_KINDS[shape.texture].slope * shape.texture_depth / shape.texture_pitch
     return "smooth" if slope == 0 else "textured" if slope < _ROUGH else "rough"
+
+
+# Captions, in the style of AnyTouch's annotations (its appendix on GPT-4o). They never name the object, its material,
+# its form or the touch, so they do not reveal those labels. Two hints remain: most words for warmth and grip belong to
+# one material, and wide spacing is rare for cones, rings and letters, which have finer textures.
+HARDNESS: dict[str, tuple[str, ...]] = {
+    "soft": ("soft", "yielding", "pliable", "squishy", "springy", "very soft"),
+    "firm": ("firm", "fairly firm", "moderately firm", "semi-rigid", "tough"),
+    "hard": ("hard", "rigid", "solid", "unyielding", "inflexible", "very hard"),
+}
+ROUGHNESS: dict[str, tuple[str, ...]] = {
+    "smooth": ("smooth", "even", "sleek", "plain", "very smooth"),
+    "textured": ("lightly textured", "slightly rough", "moderately rough", "mildly uneven", "gently textured"),
+    "rough": ("rough", "coarse", "strongly textured", "bumpy", "very rough"),
+}
+# {s} is a word for the spacing.
+PATTERN: dict[str, tuple[str, ...]] = {
+    "smooth": ("no noticeable pattern", "a uniform, unbroken finish", "hardly any surface detail",
+               "no bumps or grooves", "a consistent finish"),
+    "weave": ("a {s} woven pattern", "{s} interlaced strands", "a {s} basket-like pattern", "{s} criss-crossing fibres",
+              "a {s} pattern of interlaced strands"),
+    "knit": ("{s} knitted loops", "a {s} pattern of V-shaped stitches", "{s} rows of stitches",
+             "a {s} looped, chain-like pattern", "{s} interlocking loops"),
+    "ridges": ("{s} parallel ridges", "a {s} ribbed pattern", "{s} raised lines", "{s} parallel grooves",
+               "a {s} series of ridges and grooves"),
+    "grid": ("a {s} raised grid", "a {s} waffle-like lattice", "{s} square cells between raised lines",
+             "a {s} pattern of crossing ridges", "{s} crossing ribs"),
+    "dots": ("{s} raised dots", "{s} rounded bumps", "a {s} array of small bumps", "{s} dot-like bumps",
+             "a {s} pattern of studs"),
+    "bark": ("{s} irregular furrows", "{s} winding cracks", "a {s} fissured, bark-like surface",
+             "{s} uneven plates and creases", "a {s} pattern of irregular grooves"),
+    "sand": ("{s} sandpaper-like grains", "a {s} gritty texture", "{s} random bumps and pits", "a {s} grainy texture",
+             "{s} irregular grains"),
+}  # fmt: skip
+SPACING: dict[str, tuple[str, ...]] = {
+    "fine": ("fine", "closely spaced", "tight", "dense", "small-scale"),
+    "wide": ("broad", "widely spaced", "large-scale", "spread-out", "big"),
+}
+WIDE = 1.85  # mm; from this pitch on a pattern is called wide
+
+FIRST = (
+    "The surface feels {hard} and {rough}, with {pattern}.",
+    "The surface is {rough} and {hard}, showing {pattern}.",
+    "A {hard}, {rough} surface with {pattern}.",
+    "A {rough} surface with {pattern}; it feels {hard}.",
+    "It feels {hard} to the touch, with a {rough} finish and {pattern}.",
+    "{Hard} and {rough}, with {pattern}.",
+    "{Rough}, {hard}, {pattern}.",
+    "The object has {pattern}, giving a {rough} feel, and its body is {hard}.",
+    "One can feel {pattern} on a {hard}, {rough} surface.",
+    "To the fingertips it is {rough}, with {pattern}, and {hard} underneath.",
+)
+SECOND = (
+    "It is {feel}.",
+    "The touch is {feel}.",
+    "Overall it feels {feel}.",
+    "The sensation is {feel}.",
+    "The material seems {feel}.",
+)
+
+
+def caption(thing: Object, rng: np.random.Generator) -> str:
+    """Return one or two sentences about the object's feel. `rng` draws the words. The facts stay the same."""
+    shape = thing.shape
+
+    def pick(options: tuple[str, ...]) -> str:
+        return options[int(rng.integers(len(options)))]
+
+    spacing = "wide" if shape.texture_pitch >= WIDE else "fine"
+    words = {
+        "hard": pick(HARDNESS[hardness_of(thing)]),
+        "rough": pick(ROUGHNESS[roughness_of(thing)]),
+        "pattern": pick(PATTERN[shape.texture]).format(s=pick(SPACING[spacing])),
+        "feel": pick(thing.material.feel),
+    }
+    words |= {"Hard": words["hard"].capitalize(), "Rough": words["rough"].capitalize()}
+    text = pick(FIRST).format(**words)
+    if rng.random() < 0.75:
+        text += " " + pick(SECOND).format(**words)
+    return re.sub(r"\b([Aa]) (?=[aeiou](?!ni))", r"\1n ", text)  # "an even", but "a uniform"

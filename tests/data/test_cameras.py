@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from films import write_film
+from refused import refused
 
 from anytouch_jax.data import cameras
 from anytouch_jax.data.cameras import CameraSettings, camera_of, list_cameras, open_source
-from anytouch_jax.errors import UserError
 
 YUYV, MJPG = (int.from_bytes(name, "little") for name in (b"YUYV", b"MJPG"))
 # format -> size -> intervals, of a camera that lists its sizes and of one with a range of sizes
@@ -92,10 +92,8 @@ def test_what_a_user_may_call_a_camera(system, name, number):
 
 
 def test_a_name_of_several_cameras_and_of_none(system):
-    with pytest.raises(UserError, match=r"the name of 2 cameras, 0 \(DIGIT.*2 \(GelSight"):
-        camera_of("g")
-    with pytest.raises(UserError, match=r"no video and no camera digits; connected are 0 \(DIGIT"):
-        open_source("digits")
+    refused(r"the name of 2 cameras, 0 \(DIGIT.*2 \(GelSight", camera_of, "g")
+    refused(r"no video and no camera digits; connected are 0 \(DIGIT", open_source, "digits")
 
 
 class Played:
@@ -168,5 +166,4 @@ def test_an_address_is_a_camera_and_a_film_at_an_address_is_a_film(tmp_path):
     finally:
         server.shutdown()
         server.server_close()
-    with pytest.raises(UserError, match="cannot be opened; check the address"):
-        open_source(f"{address}/gone.mjpg")
+    refused("cannot be opened; check the address", open_source, f"{address}/gone.mjpg")

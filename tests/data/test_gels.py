@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 from press_films import LOOKS, SENSORS, gel_frame, press_film
+from refused import refused
 
 from anytouch_jax.data import gels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.prepare.contact import THRESHOLDS
 from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
-from anytouch_jax.errors import UserError
 
 
 def presses(count, look="coloured", tint=0, seed=0):
@@ -34,10 +34,8 @@ def test_the_median_of_pressed_frames_is_the_untouched_gel(look):
     free = UntouchedGel(gel_frame(look, 0))
     assert free.score(gels.untouched_gel(frames)) < 3 < 6 < min(map(free.score, frames[5:25]))
     assert np.array_equal(gels.untouched_gel(iter(frames)), gels.untouched_gel(np.stack(frames)))
-    with pytest.raises(UserError, match="too few"):
-        gels.untouched_gel(frames[:2])
-    with pytest.raises(UserError, match="2 sizes"):
-        gels.untouched_gel([*frames, frames[0][:50]])
+    refused("too few", gels.untouched_gel, frames[:2])
+    refused("2 sizes", gels.untouched_gel, [*frames, frames[0][:50]])
 
 
 @pytest.fixture

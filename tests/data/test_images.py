@@ -1,12 +1,11 @@
-import io
 import sys
-import zlib
 
 import cv2
 import numpy as np
 import pytest
 from films import write_film
 from PIL import Image, ImageOps
+from refused import refused
 
 from anytouch_jax.data import images
 from anytouch_jax.data.images import ImageError, decode, decode_bytes, encode
@@ -31,7 +30,7 @@ def test_every_format_gives_rgb(tmp_path, suffix):
     is_lossy = suffix in (".jpg", ".webp")
     picture = np.full((40, 60, 3), (200, 100, 50), np.uint8) if is_lossy else RGB
     path.write_bytes(_encoded(suffix, picture))
-    got = images.decode(path)
+    got = decode(path)
     assert got.dtype == np.uint8 and got.flags.c_contiguous
     np.testing.assert_allclose(got, picture, atol=4 * is_lossy)
     np.testing.assert_allclose(decode_bytes(encode(picture, suffix), "p"), picture, atol=4 * is_lossy)
@@ -42,57 +41,22 @@ def test_every_format_gives_rgb(tmp_path, suffix):
 def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
     grey = RGB[..., 0]
     (tmp_path / "grey.png").write_bytes(_encoded(".png", grey))
-    np.testing.assert_array_equal(images.decode(tmp_path / "grey.png"), np.stack([grey] * 3, -1))
+    np.testing.assert_array_equal(decode(tmp_path / "grey.png"), np.stack([grey] * 3, -1))
     alpha = np.concatenate([RGB[..., ::-1], grey[..., None]], -1)
     (tmp_path / "alpha.png").write_bytes(cv2.imencode(".png", alpha)[1].tobytes())
-    np.testing.assert_array_equal(images.decode(tmp_path / "alpha.png"), RGB)
+    np.testing.assert_array_equal(decode(tmp_path / "alpha.png"), RGB)
     (tmp_path / "deep.png").write_bytes(_encoded(".png", RGB.astype(np.uint16) * 257))
-    np.testing.assert_array_equal(images.decode(tmp_path / "deep.png"), RGB)
+    np.testing.assert_array_equal(decode(tmp_path / "deep.png"), RGB)
     floats = RGB.astype(np.float32) / 255
     (tmp_path / "float.tiff").write_bytes(_encoded(".tiff", floats))
-    np.testing.assert_array_equal(images.decode(tmp_path / "float.tiff"), RGB)
+    np.testing.assert_array_equal(decode(tmp_path / "float.tiff"), RGB)
     big = (RGB.astype(np.uint16) * 257).astype(">u2")
     for name, array in (
         ("b", big), ("f", floats.astype(np.float64)), ("u", RGB), ("g", grey), ("d", RGB.astype(np.uint16) * 257),
     ):  # fmt: skip
         np.save(tmp_path / f"{name}.npy", array)
         wanted = RGB if name != "g" else np.stack([grey] * 3, -1)
-        np.testing.assert_array_equal(images.decode(tmp_path / f"{name}.npy"), wanted)
-
-
-def _nan():
-    array = np.full((4, 5, 3), 0.5, np.float32)
-    array[2, 3, 1] = np.nan
-    return array
-
-
-@pytest.mark.parametrize(
-    ("array", "words"),
-    [
-        (_nan(), "NaN"), (np.full((4, 5, 3), 2.0, np.float32), r"0\.\.1"),
-        (np.full((4, 5, 3), -np.inf, np.float32), r"0\.\.1"), (np.zeros((4, 5, 2), np.uint8), "shape"),
-        (np.zeros((0, 5, 3), np.uint8), "shape"), (np.zeros((4, 5, 3), np.int64), "int64"),
-        (np.zeros((4, 5, 3), object), "cannot be read"),
-    ],
-)  # fmt: skip
-def test_bad_arrays_are_named(tmp_path, array, words):
-    path = tmp_path / "bad.npy"
-    np.save(path, array, allow_pickle=True)
-    with pytest.raises(images.ImageError, match=words) as error:
-        images.decode(path)
-    assert str(path) in str(error.value) and isinstance(error.value, UserError)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", ".npy"])
-def test_cut_files_are_named(tmp_path, suffix):
-    image, path = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8), tmp_path / f"cut{suffix}"
-    if suffix == ".npy":
-        np.save(path, image)
-    data = path.read_bytes() if suffix == ".npy" else _encoded(suffix, image)
-    for share in (0.0, 0.02, 0.3, 0.6, 0.95):
-        path.write_bytes(data[: int(share * len(data))])
-        with pytest.raises(images.ImageError, match=f"cut{suffix}"):
-            images.decode(path)
+        np.testing.assert_array_equal(decode(tmp_path / f"{name}.npy"), wanted)
 
 
 def test_a_jpeg_with_a_trailer_or_a_thumbnail_is_whole(tmp_path):
@@ -100,49 +64,26 @@ def test_a_jpeg_with_a_trailer_or_a_thumbnail_is_whole(tmp_path):
     for seed in range(5):  # phones append films; markers stand in them by chance
         path = tmp_path / f"{seed}.jpg"
         path.write_bytes(whole + np.random.default_rng(seed).bytes(200_000) + b"\xff\xda")
-        np.testing.assert_array_equal(images.decode(path), images.decode_bytes(whole, "whole"))
+        np.testing.assert_array_equal(decode(path), decode_bytes(whole, "whole"))
     thumbnail = b"\xff\xe1" + (len(whole) + 2).to_bytes(2) + whole  # an EXIF segment with a picture in it
     path.write_bytes(whole[:2] + thumbnail + whole[2 : len(whole) * 2 // 3])
-    with pytest.raises(images.ImageError, match="cut short"):
-        images.decode(path)
-
-
-@pytest.mark.parametrize("name", ["0.png", "0.jpg", "film.mp4"])
-def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
-    texts = {"a web page": "\n<!DOCTYPE html>", "a Git LFS pointer": "version https://git-lfs.github.com/spec/v1\noid"}
-    for kind, text in texts.items():
-        (tmp_path / name).write_text(text)
-        with pytest.raises(images.ImageError, match=rf"{name}.* is {kind}"):
-            images.decode(tmp_path / name) if name != "film.mp4" else next(images.timed_frames(tmp_path / name))
+    refused("cut short", decode, path)
 
 
 def test_files_that_are_no_pictures_are_named(tmp_path):
-    (tmp_path / "text.jpg").write_text("not a picture at all")
-    corrupt = bytearray(_encoded(".png"))
-    corrupt[len(corrupt) // 2] ^= 0xFF
-    (tmp_path / "corrupt.png").write_bytes(bytes(corrupt))
-    for name, words in (("text.jpg", "not a PNG"), ("corrupt.png", "corrupt"), ("none.png", "there is no file")):
-        with pytest.raises(images.ImageError, match=words) as error:
-            images.decode(tmp_path / name)
-        assert name in str(error.value)
-    with pytest.raises(images.ImageError, match="cannot be read"):
-        images.decode(tmp_path)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", "down.bmp", ".tiff", ".webp", "lossless.webp", "tags.webp"])
-def test_a_declared_size_beyond_the_limit_is_refused_before_it_is_unpacked(suffix, monkeypatch):
-    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix.startswith("lossless") else []
-    data = cv2.imencode(f".{suffix.rpartition('.')[2]}", RGB, options)[1].tobytes()
-    if suffix == "down.bmp":  # its rows come from the top
-        data = data[:22] + (-9).to_bytes(4, "little", signed=True) + data[26:]
-    if suffix == "tags.webp":  # another header
-        Image.fromarray(RGB).save(stream := io.BytesIO(), "webp", exif=b"Exif\0\0")
-        data = stream.getvalue()
-    assert images.decode_bytes(data, "x").shape == (9, 13, 3)
-    monkeypatch.setattr(images, "MAX_PIXELS", 9 * 13 - 1)
-    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
-    with pytest.raises(images.ImageError, match="it declares 13 x 9 pixels"):
-        images.decode_bytes(data, "x")
+    page, pointer, corrupt = b"\n<!DOCTYPE html>", b"version https://git-lfs.github.com/spec/v1\noid", _encoded(".png")
+    corrupt = corrupt[: len(corrupt) // 2] + b"??" + corrupt[len(corrupt) // 2 + 2 :]
+    for name, data, words in (
+        ("0.png", page, "is a web page"), ("0.mp4", page, "is a web page"), ("1.mp4", pointer, "is a Git LFS pointer"),
+        ("0.jpg", pointer, "is a Git LFS pointer"), ("1.jpg", b"no image", "not a PNG"), ("2.png", corrupt, "corrupt"),
+        ("3.png", None, "there is no file"), ("2.mp4", b"no film", "not a video"), ("3.mp4", None, "there is no video"),
+    ):  # fmt: skip
+        if data is not None:
+            (tmp_path / name).write_bytes(data)
+        with pytest.raises(ImageError, match=rf"(?s){name}.*{words}|{words}.*{name}") as error:
+            decode(tmp_path / name) if name[2:] != "mp4" else list(images.frames_from_video(tmp_path / name))
+        assert isinstance(error.value, UserError)
+    refused("cannot be read", decode, tmp_path)
 
 
 def test_a_folder_comes_in_natural_order(tmp_path):
@@ -150,7 +91,7 @@ def test_a_folder_comes_in_natural_order(tmp_path):
         image = np.full((4, 4, 3), number, np.uint8)
         cv2.imwrite(str(tmp_path / f"img{number}.png"), image)
     (tmp_path / "notes.txt").write_text("no picture")
-    assert [images.decode(file)[0, 0, 0] for file in images.list_images(tmp_path)[0]] == [1, 9, 10]
+    assert [decode(file)[0, 0, 0] for file in images.list_images(tmp_path)[0]] == [1, 9, 10]
     for name in ("background.jpg", "Photo.png"):
         assert cv2.imwrite(str(tmp_path / name), np.zeros((4, 4, 3), np.uint8))
     np.save(tmp_path / "000.npy", np.zeros((20, 20, 6), np.float32))
@@ -163,8 +104,7 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     assert frame_order(["b.png", "img10.png", "3.png"]) == (["b.png", "img10.png", "3.png"], False)
     (tmp_path / "empty").mkdir()
     for folder, words in ((tmp_path / "empty", "no pictures"), (tmp_path / "none", "there is no folder")):
-        with pytest.raises(images.ImageError, match=words):
-            images.list_images(folder)
+        refused(words, images.list_images, folder)
 
 
 def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
@@ -177,10 +117,6 @@ def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_film(tmp_path / "10:30.mp4", (np.zeros((24, 32, 3), np.uint8) for _ in range(3)))
     assert len(list(images.frames_from_video("10:30.mp4"))) == images.count_frames("10:30.mp4") == 3  # no protocol
-    (tmp_path / "bad.avi").write_bytes(b"not a video")
-    for name, words in (("bad.avi", "not a video"), ("none.avi", "there is no video")):
-        with pytest.raises(images.ImageError, match=words):
-            list(images.frames_from_video(tmp_path / name))
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "webp", "tif"])
@@ -192,7 +128,7 @@ def test_a_picture_is_turned_as_its_tag_says(tmp_path, kind, orientation):
     path = tmp_path / f"x.{kind}"
     stored.save(path, exif=tags, **{"lossless": True} if kind == "webp" else {})
     shown = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("RGB")).astype(int)
-    got = images.decode(path)
+    got = decode(path)
     assert got.shape == shown.shape == ((60, 40, 3) if orientation > 4 else (40, 60, 3))
     assert np.abs(got - shown).max() < 3
 
@@ -231,22 +167,20 @@ def test_a_tiff_of_an_unusual_type_is_a_picture_or_a_sentence(tmp_path, kind):
     values[..., 0] = 1  # blue, as OpenCV writes it
     path.write_bytes(cv2.imencode(".tiff", values)[1].tobytes())
     if kind is np.float64:
-        assert images.decode(path)[0, 0].tolist() == [0, 0, 255]
+        assert decode(path)[0, 0].tolist() == [0, 0, 255]
     else:
-        with pytest.raises(images.ImageError, match=r"odd\.tiff has pixels of type"):
-            images.decode(path)
+        refused(r"odd\.tiff has pixels of type", decode, path)
 
 
 def test_strips_and_tiffs_that_opencv_would_read_wrong_are_refused(tmp_path):
     plain, clear = Image.fromarray(RGB), Image.fromarray(np.dstack([RGB, np.full(RGB.shape[:2], 128, np.uint8)]))
     plain.save(tmp_path / "one.tif")
-    np.testing.assert_array_equal(images.decode(tmp_path / "one.tif"), RGB)
+    np.testing.assert_array_equal(decode(tmp_path / "one.tif"), RGB)
     plain.save(tmp_path / "several.tif", save_all=True, append_images=[plain, plain])
     clear.save(tmp_path / "clear.tif")
     Image.fromarray(np.zeros((1, 2000, 3), np.uint8)).save(tmp_path / "strip.tif")
     for name, sentence in (("several", "several pictures"), ("clear", "would be multiplied"), ("strip", "is a strip")):
-        with pytest.raises(images.ImageError, match=rf"{name}\.tif .*{sentence}"):
-            images.decode(tmp_path / f"{name}.tif")
+        refused(rf"{name}\.tif .*{sentence}", decode, tmp_path / f"{name}.tif")
 
 
 def test_frames_are_numbered_by_what_counts_them():
@@ -315,60 +249,6 @@ def test_series_that_share_numbers_are_apart(names, series):
     assert split_series(names) == (series or {"": names})
 
 
-def _chunk(kind, body, length=None):
-    length = len(body) if length is None else length
-    return length.to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda png: png[:33] + _chunk(b"tEXt", b"a\0b", 0x7FFFFFF0) + png[33:], "cut short"),
-        (lambda png: png[:33] + png[8:33] + png[33:], "corrupt"),
-        (lambda png: png[:8] + _chunk(b"tEXt", b"a\0b") + png[8:], "corrupt"),
-        (lambda png: png[:-12], "cut short"),
-        (lambda png: png[:-2], "cut short"),
-    ],
-)
-def test_a_png_is_walked_before_it_is_decoded(spoil, words, monkeypatch):
-    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))  # 4 GB and 13 seconds for the first
-    with pytest.raises(ImageError, match=words):
-        decode_bytes(spoil(_encoded(".png")), "x.png")
-
-
-@pytest.mark.parametrize("first", [4, 60000])
-def test_a_tiff_that_declares_two_sizes_is_refused(tmp_path, first):
-    data = bytearray(_encoded(".tiff"))
-    order = "little" if data[:2] == b"II" else "big"
-    at = int.from_bytes(data[4:8], order)
-    count = int.from_bytes(data[at : at + 2], order)
-    body = data[at + 2 : at + 2 + 12 * count]
-    sizes = b"".join(
-        tag.to_bytes(2, order) + (4).to_bytes(2, order) + (1).to_bytes(4, order) + value.to_bytes(4, order)
-        for value in (first, 60004 - first)
-        for tag in (256, 257)
-    )
-    data[4:8] = len(data).to_bytes(4, order)
-    (tmp_path / "two.tiff").write_bytes(bytes(data) + (count + 4).to_bytes(2, order) + sizes + body + bytes(4))
-    with pytest.raises(ImageError, match="a tag twice"):
-        decode(tmp_path / "two.tiff")
-
-
-@pytest.mark.parametrize(
-    ("shape", "kind", "words"),
-    [
-        ((9999999, 9999999, 3), "|u1", "cut short"), ((4, 4, 3), "|O", "Python objects"), ((0, 4, 3), "|u1", "shape"),
-        ((4, 4, 3), "<i8", "cut short"), ((2**70,), "|u1", "cut short"), ((4, 4, 3), "|V1", "type"),
-        ((-4, -4, 3), "|u1", "cannot be read"), ((4, 4, 3), "<M8[s]", "cut short"),
-    ],
-)  # fmt: skip
-def test_an_array_cannot_declare_more_than_it_has(shape, kind, words):
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
-    with pytest.raises(ImageError, match=words):
-        decode_bytes(stream.getvalue() + bytes(48), "x.npy")
-
-
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
 def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(tmp_path, monkeypatch, ending):
     av = pytest.importorskip("av")
@@ -390,5 +270,4 @@ def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(tmp_path
     for frame, grey in ((4, 140), (1, 80)):
         assert video.set(cv2.CAP_PROP_POS_FRAMES, frame) and video.read()[1].mean() == pytest.approx(grey, abs=3)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(images.ImageError, match=r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'"):
-        images.open_video(film)
+    refused(r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'", images.open_video, film)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import tokenizers
 from places import SHARED
+from refused import refused
 
 from anytouch_jax.data import tokenizer as text
-from anytouch_jax.errors import UserError
 
 CLIP = SHARED / "clip"
 CAPTIONS = ["A soft, springy surface.", "A hard, smooth surface with ridges.", "A soft and smooth edge.", "rough rough"]
@@ -63,18 +63,12 @@ def test_training_is_deterministic_and_covers_any_text(tmp_path):
 
 
 def test_mistakes_are_errors(tmp_path):
-    with pytest.raises(UserError, match=r"there is no tokenizer .*none.*tokenizer\.json"):
-        text.load_tokenizer(tmp_path / "none")
+    refused(r"there is no tokenizer .*none.*tokenizer\.json", text.load_tokenizer, tmp_path / "none")
     (tmp_path / "tokenizer.json").write_text("{}")
-    with pytest.raises(UserError, match="is not a tokenizer"):
-        text.load_tokenizer(tmp_path)
+    refused("is not a tokenizer", text.load_tokenizer, tmp_path)
     plain = tokenizers.Tokenizer(tokenizers.models.WordLevel({"a": 0}, unk_token="a"))
     plain.save(str(tmp_path / "plain.json"))
-    with pytest.raises(UserError, match="not of CLIP's kind"):
-        text.load_tokenizer(tmp_path / "plain.json")
-    with pytest.raises(UserError, match="without captions"):
-        text.train_tokenizer([], 300)
-    with pytest.raises(UserError, match="at least 258"):
-        text.train_tokenizer(CAPTIONS, 257)
-    with pytest.raises(UserError, match="length of 1"):
-        text.train_tokenizer(CAPTIONS, 300).encode(["x"], 1)
+    refused("not of CLIP's kind", text.load_tokenizer, tmp_path / "plain.json")
+    refused("without captions", text.train_tokenizer, [], 300)
+    refused("at least 258", text.train_tokenizer, CAPTIONS, 257)
+    refused("length of 1", text.train_tokenizer(CAPTIONS, 300).encode, ["x"], 1)

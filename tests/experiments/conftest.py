@@ -1,7 +1,4 @@
-"""A script of `experiments/` as a user runs it: exit status, standard output and standard error."""
-
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
@@ -13,10 +10,10 @@ class Outcome(NamedTuple):
 
 
 @pytest.fixture
-def script(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
-    """script(module, *words): run the `main` of a module in this process."""
+def script(capsys):
+    """script(module, *words): run the `main` of a module in this process, as a user runs it."""
 
-    def run(module: Any, *words: object) -> Outcome:
+    def run(module, *words):
         capsys.readouterr()
         try:
             status = module.main([str(word) for word in words])

@@ -14,14 +14,13 @@ from tiny_models import tiny_config
 from anytouch_jax import objectives
 from anytouch_jax.config import preset
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import convert, load
+from anytouch_jax.weights import load
 from experiments.benchmarks import run as bench
 from experiments.benchmarks import simulator, speed, variants, workloads
 from experiments.benchmarks.pytorch import run as pytorch
 from experiments.benchmarks.table import simulated_table
 from experiments.benchmarks.workloads import Workload, make_batch, normalised
 from experiments.records import read_records
-from tests.support.release_keys import release_names
 
 
 @pytest.fixture
@@ -56,7 +55,7 @@ def test_mistakes(tiny, tmp_path, capsys):
     assert not any(tmp_path.iterdir())
 
 
-def test_the_rival_gets_the_same_numbers_under_the_authors_names(tmp_path):
+def test_the_rival_gets_the_same_numbers(tmp_path):
     work = workloads.Workload("stage2 align", tiny_config(2, "release"), 4, 4)
     pytorch.batch_file(work, tmp_path / "batch.safetensors")
     found = load.read_weights(tmp_path / "batch.safetensors")
@@ -66,13 +65,6 @@ def test_the_rival_gets_the_same_numbers_under_the_authors_names(tmp_path):
     assert found["clip"].dtype == np.uint8 and found["text_row"].dtype == np.int64
     spec = json.loads(json.dumps(pytorch.spec(work)))
     assert spec["kind"] == "align" and spec["kept"] == 4 and spec["weights"] == [0.5, 1.0, 0.1]
-    named = release_names(work.config.model)
-    assert set(named) == set(
-        convert.to_release(build(work.config.model).init(pytorch.jax.random.key(0)), work.config.model)
-    ) - pytorch.UNUSED | ({k for k in named if k in pytorch.UNUSED})
-    old = "touch_mae_model.touch_decoder_blocks.0.attention.output.dense.weight"
-    assert pytorch.renamed(old) == "touch_mae_model.touch_decoder_blocks.0.attention.o_proj.weight"
-    assert pytorch.renamed("a.output.dense.bias") == "a.output.dense.bias"  # of the decoder's blocks only
 
 
 @pytest.mark.slow
@@ -86,10 +78,6 @@ def test_the_simulator_is_measured_and_stored(tmp_path):
     rows = simulated_table(tmp_path).rows
     assert [row[1] for row in rows] == ["28 pixels, clips, exact", "28 pixels, clips, fast"]
     assert rows[1][5] == fast["mm"]
-
-
-STAGE1 = Workload("stage1 clips", tiny_config(1), 4, 4)
-FAST = (variants.BASELINE, variants.Variant("bfloat16", variants.BFLOAT16))
 
 
 def shallow(config):
@@ -132,19 +120,15 @@ def test_useful_operations_are_nearly_all_that_xla_counts(work):
     assert 1 < counted(run, net.abstract()) / work.operations < 1.06  # the rest: norms, softmax, GELU, the loss
 
 
-NOWHERE = {"dtype": "float7"}
-
-
 @pytest.mark.slow
-def test_a_step_is_measured_and_what_does_not_run_here_is_a_row_with_a_note():
-    tried = (*FAST[:1], variants.Variant("remat", {"remat": True}), variants.Variant("seven bits", NOWHERE))
-    rows = speed.measure(STAGE1, tried, rounds=2, with_errors=False, peak_size=64)
-    base, remat, absent = rows
-    assert base.ratio == 1 and base.ratio_iqr == 0 and base.calls == 2 and base.error_loss is None
+def test_what_does_not_run_here_is_a_row_with_a_note():
+    work = Workload("stage1 clips", tiny_config(1), 4, 4)
+    tried = [variants.BASELINE, variants.Variant("remat", {"remat": True})]
+    tried.append(variants.Variant("seven bits", {"dtype": "float7"}))
+    rows = base, remat, absent = speed.measure(work, tried, rounds=2, with_errors=False, peak_size=64)
     assert base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
-    assert remat.peak_bytes > remat.temp_bytes > 0 and remat.ratio > 0 and base.copies > 0
+    assert remat.peak_bytes > remat.temp_bytes > 0 and remat.ratio > 0
     assert absent.note and np.isnan(absent.ratio) and absent.variant == "seven bits"
-    assert speed.record_of(absent)["seconds"] is None
     json.dumps([speed.record_of(row) for row in rows], allow_nan=False)
 
 

@@ -9,6 +9,7 @@ import pytest
 import synthetic
 from markdown_it import MarkdownIt
 from places import EXPERIMENTS, ROOT
+from refused import refused
 
 from anytouch_jax.errors import UserError
 from experiments.pages import __main__ as results
@@ -149,8 +150,7 @@ def test_runs_that_differ_give_no_page(tmp_path):
     settings = plan.settings(plan.FULL) | {"steps1": 999}
     for change, words in (({"simulator": 1}, "simulator version 1"), ({"settings": settings}, "steps1 400 and 999")):
         synthetic.change(tmp_path / "matrix.jsonl", "ablations-no_text-1", **change)
-        with pytest.raises(UserError, match=words):
-            results.pages(tmp_path)
+        refused(words, results.pages, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -198,5 +198,4 @@ def test_a_broken_line_is_named_and_nan_is_refused(tmp_path):
     with pytest.raises(ValueError, match="Out of range"):
         write_record(path, "b", {"value": math.nan})
     path.write_text(path.read_text() + '{"key": "b", "va')
-    with pytest.raises(UserError, match=r"study\.jsonl, line 2"):
-        read_records(path)
+    refused(r"study\.jsonl, line 2", read_records, path)

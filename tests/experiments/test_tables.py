@@ -41,22 +41,16 @@ def test_the_unseen_sensor_is_in_no_training():
             assert not any(plan.UNSEEN in name for name in names), leaf.key
 
 
-def test_files_and_identities_are_of_one_run_each():
-    assert len({leaf.key for leaf in LEAVES}) == len({leaf.identity for leaf in LEAVES}) == len(LEAVES)
+def test_an_identity_is_of_one_run_and_hangs_on_the_simulator_and_not_on_the_name_of_a_size(monkeypatch):
     again = {leaf.key: leaf.identity for leaf in plan.leaves(plan.FULL)}
-    assert plan.chosen(plan.training(plan.FULL, "anytouch", 0).config)["run"]["steps"] == plan.FULL.steps2
-    longer = {leaf.key: leaf.identity for leaf in plan.leaves(dataclasses.replace(plan.FULL, steps1=181))}
-    assert all(again[leaf.key] == leaf.identity for leaf in LEAVES)
-    assert not set(longer.values()) & set(again.values())
-
-
-def test_a_result_hangs_on_the_simulator_and_not_on_the_name_of_a_size(monkeypatch):
-    again = {leaf.key: leaf.identity for leaf in LEAVES}
+    assert len(again) == len(set(again.values())) == len(LEAVES)
+    assert again == {leaf.key: leaf.identity for leaf in LEAVES}
     named = plan.leaves(dataclasses.replace(plan.FULL, name="changed", seeds=(0, 1, 2, 3)))
     assert again.items() <= {leaf.key: leaf.identity for leaf in named}.items()
+    longer = plan.leaves(dataclasses.replace(plan.FULL, steps1=181))
+    assert not {leaf.identity for leaf in longer} & set(again.values())
     monkeypatch.setattr("anytouch_jax.sim.dataset.VERSION", plan.simulator() + 1)
-    later = {leaf.identity for leaf in plan.leaves(plan.FULL)}
-    assert not later & set(again.values())
+    assert not {leaf.identity for leaf in plan.leaves(plan.FULL)} & set(again.values())
 
 
 LEAF = next(leaf for leaf in plan.leaves(plan.QUICK) if leaf.name == "+".join(plan.SENSORS[:2]))
@@ -74,46 +68,26 @@ def write_data(folder, text):
         (folder / one.name / DONE).write_text(json.dumps({"of": works._of(one, LEAF.size), "seconds": 1}))
 
 
-class Trainer:
-    """Stands for `pretrain`: takes ten seconds of its clock, is interrupted on request."""
+def test_a_training_on_other_data_is_not_finished_and_starts_again(tmp_path, monkeypatch):
+    kept: list[bool] = []
 
-    def __init__(self, patch):
-        self.calls, self.time, self.stop = [], 0.0, False
-        patch.setattr(works, "pretrain", self)
-        patch.setattr(works.time, "perf_counter", lambda: self.time)
-
-    def __call__(self, config, run, *, init, log):
-        self.calls.append((run.name, (run / "weights").exists()))
+    def pretrain(config, run, *, init, log):
+        kept.append((run / "weights").exists())
         (run / "weights").touch()
-        self.time += 10
-        return SimpleNamespace(interrupted=7 if self.stop else None, resumed=0)
+        return SimpleNamespace(interrupted=None, resumed=0)
 
-
-@pytest.fixture
-def trainer(monkeypatch):
-    return Trainer(monkeypatch)
-
-
-@pytest.fixture
-def work(tmp_path):
+    monkeypatch.setattr(works, "pretrain", pretrain)
     write_data(tmp_path, "one")
-    lines = []
-    result = Work(tmp_path, log=lines.append)
-    result.said = lines
-    return result
-
-
-def test_a_training_on_other_data_is_not_finished_and_starts_again(work, trainer):
-    sets = {"own", "fine", "coarse", "other"}
+    work, sets = Work(tmp_path, log=(lines := []).append), {"own", "fine", "coarse", "other"}
     assert work.ready(LEAF) == sets
     for one in LEAF.trainings:
         work.train(one)
     assert work.ready(LEAF) == sets | {one.key for one in LEAF.trainings}
-    write_data(work.folder, "two")
+    write_data(tmp_path, "two")
     assert work.ready(LEAF) == sets
     work.train(FIRST)
-    assert trainer.calls[-1] == (FIRST.key, False)  # nothing is left of the first one
-    assert f"  {FIRST.key} was trained on other data: it starts again" in work.said
+    assert kept[-1] is False  # nothing is left of the first one
+    assert f"  {FIRST.key} was trained on other data: it starts again" in lines
     assert work.ready(LEAF) == sets | {FIRST.key}
 
 

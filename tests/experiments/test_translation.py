@@ -1,7 +1,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,16 +8,15 @@ import jax
 import numpy as np
 import pytest
 from pair_world import arrays, make_pairs, row
+from refused import refused
 from tiny_models import tiny_config
 
 from anytouch_jax.config import Stack
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import random_encoder
-from anytouch_jax.errors import UserError
-from anytouch_jax.weights.tree import flatten
 from experiments.translation import pairs, training
 from experiments.translation import run as translate
-from experiments.translation.generator import GENERATOR, Fit, Generator, load, save
+from experiments.translation.generator import GENERATOR, Fit, load, save
 from experiments.translation.networks import Translation
 
 A, B = "gelsight_mini", "duragel"
@@ -53,19 +51,12 @@ def test_a_pair_is_one_frame_of_one_touch_by_two_sensors():
     assert len(pairs.find_pairs(table(rows), A, B).val.target) == 3
 
 
-def test_an_object_on_both_sides_is_refused():
-    rows = plain()
-    for one in rows:
-        if one["split"] == "test" and one["touch"] == "test/2":
-            one["object"] = "train thing 1"
-    with pytest.raises(UserError, match="'train thing 1' is in the splits train and test"):
-        pairs.find_pairs(table(rows), A, B)
-    other = plain() + [r | {"object": "test thing 3"} for s in (A, B) for r in felt(s, "val", 0)]
-    with pytest.raises(UserError, match="'test thing 3' is in the splits val and test"):
-        pairs.find_pairs(table(other), A, B)
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_an_object_on_both_sides_is_refused(split):
+    rows = plain() + [one | {"object": "test thing 3"} for sensor in (A, B) for one in felt(sensor, split, 9)]
+    refused(f"'test thing 3' is in the splits {split} and test", pairs.find_pairs, table(rows), A, B)
     rows[0]["object"] = None
-    with pytest.raises(UserError, match=r"row 0 of .* has no object"):
-        pairs.find_pairs(table(rows), A, B)
+    refused(r"row 0 of .* has no object", pairs.find_pairs, table(rows), A, B)
 
 
 def test_pixels_and_fields_come_in_the_order_of_the_rows(tmp_path):
@@ -83,9 +74,6 @@ def test_pixels_and_fields_come_in_the_order_of_the_rows(tmp_path):
     np.testing.assert_array_equal(y[3], np.load(result.file(int(field_pairs.target[3]), "field_path")))
 
 
-FIT = ("--steps", 2, "--batch", 4)
-
-
 @pytest.fixture(scope="module")
 def world_of_pairs(tmp_path_factory):
     return make_pairs(tmp_path_factory.mktemp("pairs"), {"train": 6, "test": 3})
@@ -98,45 +86,30 @@ def run(tmp_path_factory, tiny_run, world_of_pairs):
     shutil.copytree(tiny_run, folder)
     for source, target in (("gelsight_mini", "duragel"), ("digit", "tac3d")):
         words = ["--fit", "--data", world_of_pairs, "--model", folder, "--source", source, "--target", target]
-        assert translate.main([str(word) for word in (*words, *FIT)]) == 0
+        assert translate.main([*map(str, words), "--steps", "2", "--batch", "4"]) == 0
     return folder
 
 
-def picture(world: Path, number: int = 0) -> Path:
-    return world.parent / f"test{number}_1_gelsight_mini.png"
-
-
 @pytest.mark.slow
-def test_a_translation_is_trained_scored_and_kept(run, world_of_pairs):
+def test_a_translation_is_trained_scored_and_kept(run):
     home = run / "generators" / "gelsight_mini-duragel"
     report = json.loads((home / "report.json").read_text())
-    assert report["test pairs"] == 6 and report["error"] > 0 and report["mean target"] > 0
-    assert len(report["losses"]) == 2
+    assert report["test pairs"] == 6 and min(report["error"], report["mean target"]) > 0 and len(report["losses"]) == 2
     design = load(home).design
     assert (design.source, design.target, design.pairs, design.fit.batch) == ("gelsight_mini", "duragel", 12, 4)
 
 
 @pytest.mark.slow
-def test_an_image_becomes_an_image(run, world_of_pairs, script, tmp_path):
-    out = tmp_path / "new" / "a.png"
-    words = ("--model", run, "--source", "gelsight_mini", "--target", "duragel", "--out", out)
-    lines = script(translate, picture(world_of_pairs), *words)
-    assert lines.status == 0 and lines.out.strip() == str(out)
-    made = cv2.imread(str(out))[..., ::-1]
-    given = cv2.imread(str(picture(world_of_pairs)))[..., ::-1]
-    np.testing.assert_array_equal(made, load(run / "generators" / "gelsight_mini-duragel")(given[None])[0])
-
-
-@pytest.mark.slow
-def test_several_images_and_fields(run, world_of_pairs, script, tmp_path):
-    images = [picture(world_of_pairs, k) for k in range(2)]
+def test_images_become_images_or_fields(run, world_of_pairs, script, tmp_path):
+    images = [world_of_pairs.parent / f"test{number}_1_gelsight_mini.png" for number in range(2)]
     lines = script(translate, *images, "--model", run, "--out", tmp_path)
-    assert lines.status == 0
-    assert sorted(file.name for file in tmp_path.iterdir()) == [f"{image.stem}_duragel.png" for image in images]
+    files = [tmp_path / f"{image.stem}_duragel.png" for image in images]
+    assert lines.status == 0 and lines.out.split() == [str(file) for file in files]
+    given, made = (np.stack([cv2.imread(str(path))[..., ::-1] for path in paths]) for paths in (images, files))
+    np.testing.assert_array_equal(made, load(run / "generators" / "gelsight_mini-duragel")(given))
     lines = script(translate, images[0], "--model", run, "--source", "digit", "--target", "tac3d", "--out", tmp_path)
-    assert lines.status == 0
     field = np.load(tmp_path / f"{images[0].stem}_tac3d.npy")
-    assert field.shape == (20, 20, 6) and field.dtype == np.float32
+    assert lines.status == 0 and field.shape == (20, 20, 6) and field.dtype == np.float32
 
 
 X, Y, FIELDS = arrays(24)
@@ -145,23 +118,6 @@ MODEL = ENCODER.config.model
 IMAGE = Translation(MODEL, decoder=Stack(16, 1, 2, 32), hidden=16, channels=(4, 8, 8))
 FIELD = replace(IMAGE, field=(20, 20, 6))
 SENSORS = {"source": "gelsight_mini", "target": "duragel"}
-
-
-@pytest.fixture(scope="module")
-def made() -> Generator:
-    return training.fit(ENCODER, X, Y, **SENSORS, options=Fit(steps=2, batch=8), shape=IMAGE)[0]
-
-
-@pytest.fixture(scope="module")
-def regressed() -> Generator:
-    options = Fit(steps=2, batch=8)
-    return training.fit(ENCODER, X, FIELDS, source="digit", target="tac3d", options=options, shape=FIELD)[0]
-
-
-@pytest.mark.slow
-def test_frozen_encoders_stay_bit_for_bit(made):
-    for name, value in flatten(ENCODER.params).items():
-        np.testing.assert_array_equal(flatten(made.params["encoder"])[name], value)
 
 
 @pytest.mark.slow
@@ -178,13 +134,14 @@ def test_the_state_that_does_best_on_other_objects_is_kept():
 
 
 @pytest.mark.slow
-def test_a_saved_generator_comes_back_bit_for_bit(made, regressed, tmp_path):
-    for one, images in ((made, X), (regressed, X)):
-        folder = tmp_path / one.design.target
-        save(one, folder)
-        assert [file.name for file in folder.iterdir()] == [GENERATOR]
-        back = load(folder)
-        assert back.design == one.design
-        jax.tree.map(np.testing.assert_array_equal, back.params, jax.tree.map(np.asarray, one.params))
-        np.testing.assert_array_equal(back(images), one(images))
-        assert load(folder / GENERATOR).design == one.design
+@pytest.mark.parametrize(("target", "shape", "wanted"), [("duragel", IMAGE, Y), ("tac3d", FIELD, FIELDS)])
+def test_a_saved_generator_comes_back_and_its_frozen_encoder_is_unchanged_bit_for_bit(tmp_path, target, shape, wanted):
+    sensors = {"source": "gelsight_mini", "target": target}
+    made, _ = training.fit(ENCODER, X, wanted, **sensors, options=Fit(steps=2, batch=8), shape=shape)
+    jax.tree.map(np.testing.assert_array_equal, made.params["encoder"], ENCODER.params)
+    save(made, tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == [GENERATOR]
+    back = load(tmp_path)
+    assert back.design == made.design == load(tmp_path / GENERATOR).design
+    jax.tree.map(np.testing.assert_array_equal, back.params, jax.tree.map(np.asarray, made.params))
+    np.testing.assert_array_equal(back(X), made(X))

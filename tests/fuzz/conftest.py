@@ -14,7 +14,6 @@ from weights_world import params_of, save_run
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import Config
 from anytouch_jax.encoder.linear_head import LinearHead, save_head
-from tests.fuzz.harness import total, try_all
 
 
 @dataclass(frozen=True)
@@ -53,14 +52,3 @@ def things(tmp_path_factory):
     arrays = (np.zeros((12, 1)), np.zeros(1), np.zeros(12), np.ones(12))
     save_head(paths["head"], LinearHead(np.array(["ball", "cube"]), *arrays, "object", "class", 1, fingerprint))
     return Things(manifest, frames, run, config, **paths)
-
-
-@pytest.fixture
-def survives(tmp_path, things):
-    """survives(make, count): every one of `count` inputs is answered as it should be; a share of all if below 1."""
-
-    def survive(make, count):
-        lines = try_all(make, count if count >= 1 else round(count * total()), tmp_path, things)
-        assert not lines, "\n" + "\n".join(lines)
-
-    return survive

@@ -9,7 +9,6 @@ import resource
 import shutil
 import signal
 import sys
-import tempfile
 import time
 import traceback
 import warnings
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 
 from anytouch_jax.cli.app import guarded, main
 
@@ -28,7 +28,6 @@ MEMORY = 1 << 30  # bytes that a command may take more
 _LIMIT = 6 << 30  # bytes of address space that it gets, so that a bomb hurts nobody
 _TICK = 2  # seconds from one look at a command to the next
 LETTERS, LINES = 600, 60  # of one line of a message, of a message
-_ANSWERS = {0, 1, 2}
 # How `info` and `contact` report what they could not use, with status 0.
 _DAMAGE = re.compile("cannot be used|cannot embed|cannot be read|frames can be read|is damaged")
 _RULE = re.compile(r"[-|: ]*[╭╰─╮╯│]")  # the option parser draws boxes
@@ -43,18 +42,7 @@ class Case(NamedTuple):
     name: str
     words: tuple[object, ...] | Callable[[], int]
     corrupt: bool = False
-    check: Callable[[Outcome], str | None] | None = None
-
-
-class Outcome(NamedTuple):
-    """What a command did. `status` is None after a hang; `trace` is a traceback or ""."""
-
-    status: int | None
-    out: str
-    err: str
-    trace: str
-    seconds: float
-    memory: int
+    check: Callable[[], str | None] | None = None
 
 
 Make = Callable[[np.random.Generator, Path, Any], Case]
@@ -64,77 +52,56 @@ class _HangError(BaseException):
     """A command that takes longer than `SECONDS`."""
 
 
-def total() -> int:
-    """The number of inputs of all kinds in a long run."""
-    return int(os.environ.get("FUZZ_INPUTS", 5000))
+def try_all(kind: str, make: Make, count: int, folder: Path, things: Any, capfd: Any) -> list[str]:
+    """Try `count` inputs of a kind and return a line for each fault; FUZZ_FIRST is the number of the first input.
 
-
-def try_all(make: Make, count: int, folder: Path, things: Any) -> list[str]:
-    """Try `count` inputs of a kind and return a line for each fault; FUZZ_FIRST is the number of the first input."""
+    Each input has its own random numbers: input 7 is the same in a run of 10 and of 1000.
+    """
     first, lines = int(os.environ.get("FUZZ_FIRST", 0)), []
     for number in range(first, first + count):
         place = folder / str(number)
         place.mkdir()
-        case = make(generator(make, number), place, things)
-        found = faults(case)
-        if found:
+        case = make(np.random.default_rng([zlib.crc32(f"test_{kind}".encode()), number]), place, things)
+        if found := faults(case, capfd):
             words = case.words if callable(case.words) else " ".join(str(word)[:150] for word in case.words)
             lines += [f"{number} ({case.name}): {fault}\n    {words}" for fault in found]
-            for line in lines[-len(found) :]:
-                print(line, flush=True)
         shutil.rmtree(place, ignore_errors=True)
     return lines
 
 
-def generator(make: Make, number: int) -> np.random.Generator:
-    """The random numbers of one input, which are its own: input 7 is the same in a run of 10 and of 1000."""
-    return np.random.default_rng([zlib.crc32(make.__module__.rpartition(".")[2].encode()), number])
-
-
-def faults(case: Case) -> list[str]:
-    """Run the command of a case and return its faults."""
-    done = run(case.words)
-    found = []
-    if done.status is None:
-        found.append(f"no answer within {SECONDS} s")
-    if done.trace or "Traceback (most recent" in done.err:
-        found.append("traceback: " + " / ".join((done.trace or done.err).strip().splitlines()[-5:]))
-    elif done.status is not None and done.status not in _ANSWERS:
-        found.append(f"status {done.status}")
-    if done.memory > MEMORY:
-        found.append(f"{done.memory >> 20} MB of memory")
-    if "not enough memory" in done.err:
-        found.append("it asked for more memory than there is")
-    lines = [line for text in (done.err, done.out) for line in text.splitlines() if not _RULE.match(line)]
-    long = [line for line in lines if len(line) > LETTERS]
-    if long:
-        found.append(f"a line of {len(long[0])} letters: {long[0][:160]}")
-    if len(lines) > LINES:
-        found.append(f"{len(lines)} lines: {lines[-1][:160]}")
-    if done.status == 2 and not done.err.strip():
-        found.append("status 2 without a sentence")
-    if done.status == 0 and case.corrupt and not _DAMAGE.search(done.out):
-        found.append("accepted: " + (done.out.strip().splitlines() or [""])[-1][:160])
-    if done.status == 0 and not case.corrupt and case.check is not None and (wrong := case.check(done)):
-        found.append(wrong)
-    return found
-
-
-def run(words: tuple[object, ...] | Callable[[], int]) -> Outcome:
-    """Run a command in this process as `anytouch` does, with its output caught at the level of file descriptors."""
-    status, trace, start = None, "", time.monotonic()
-    before = _memory("VmRSS")
+def faults(case: Case, capfd: pytest.CaptureFixture[str]) -> list[str]:
+    """Run the command of a case in this process, as `anytouch` does, and return its faults."""
+    status, trace, before = None, "", _memory("VmRSS")
+    capfd.readouterr()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")  # forget the largest memory so far
-    with _caught() as texts, warnings.catch_warnings(), _bounded():
+    with warnings.catch_warnings(), _bounded():
         warnings.simplefilter("default")  # as in a command; pytest makes errors of warnings
         try:
+            words = case.words
             status = guarded("anytouch", words) if callable(words) else main([str(word) for word in words])
         except _HangError:
             pass
         except BaseException as error:
-            status, trace = -1, "".join(traceback.format_exception(error))
-    return Outcome(status, *texts, trace, time.monotonic() - start, max(0, _memory("VmHWM") - before))
+            trace = "".join(traceback.format_exception(error))
+    memory = _memory("VmHWM") - before
+    out, err = capfd.readouterr()
+    if trace or "Traceback (most recent" in err:
+        return ["traceback: " + " / ".join((trace or err).strip().splitlines()[-5:])]
+    lines = [line for text in (err, out) for line in text.splitlines() if not _RULE.match(line)]
+    long = max(lines, key=len, default="")
+    last = (out.strip().splitlines() or [""])[-1]
+    wrong = case.check() if status == 0 and not case.corrupt and case.check is not None else None
+    found = [
+        (status is None, f"no answer within {SECONDS} s"), (status not in (None, 0, 1, 2), f"status {status}"),
+        (memory > MEMORY, f"{memory >> 20} MB of memory"), (wrong, wrong),
+        ("not enough memory" in err, "it asked for more memory than there is"),
+        (len(long) > LETTERS, f"a line of {len(long)} letters: {long[:160]}"),
+        (len(lines) > LINES, f"{len(lines)} lines: {lines[-1:]}"),
+        (status == 2 and not err.strip(), "status 2 without a sentence"),
+        (status == 0 and case.corrupt and not _DAMAGE.search(out), f"accepted: {last[:160]}"),
+    ]  # fmt: skip
+    return [str(fault) for is_fault, fault in found if is_fault]
 
 
 def _memory(name: str) -> int:
@@ -177,30 +144,6 @@ def _bounded() -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
         signal.signal(signal.SIGALRM, handler)
         resource.setrlimit(resource.RLIMIT_AS, before)
-
-
-@contextmanager
-def _caught() -> Iterator[list[str]]:
-    """Give a list that gets what was written to descriptors 1 and 2 and to `sys.stdout` and `sys.stderr`."""
-    texts: list[str] = []
-    streams, copies = (sys.stdout, sys.stderr), (os.dup(1), os.dup(2))
-    files = [tempfile.TemporaryFile("w+b") for _ in streams]  # noqa: SIM115
-    try:
-        for number, file in enumerate(files, 1):
-            os.dup2(file.fileno(), number)
-        sys.stdout, sys.stderr = (open(n, "w", encoding="utf-8", buffering=1, closefd=False) for n in (1, 2))  # noqa: SIM115
-        yield texts
-    finally:
-        for stream in (sys.stdout, sys.stderr):
-            with suppress(ValueError, OSError):
-                stream.flush()
-        sys.stdout, sys.stderr = streams
-        for number, (copy, file) in enumerate(zip(copies, files, strict=True), 1):
-            os.dup2(copy, number)
-            os.close(copy)
-            file.seek(0)
-            texts.append(file.read(1 << 24).decode("utf-8", "replace"))
-            file.close()
 
 
 def pick(rng: np.random.Generator, choices: Any) -> Any:

@@ -26,6 +26,8 @@ PHRASES = (
 _FORBIDDEN = re.compile(r"\b(" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
 _SENTENCE_END = re.compile(r"(?<=[.!?:])[\"')\]*]*\s+(?=[\"'(\[*`]*(?:[A-Z0-9`*]|code\b))")
 _ABBREVIATION = re.compile(r"\b(e\.g|i\.e|Eq|Sec|Fig|App|No|vs|cf|al)\.\s")
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+MESSAGE = re.compile(r"\w+Error|log|warn")  # what is called with a message
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,.]*%?(?!\w)")
 
 
@@ -129,39 +131,26 @@ def page_faults(file: Path, text: str) -> Iterator[Fault]:
         yield Fault(file, 1, f"{total} words, at most {README_WORDS}")
 
 
-def docstring_faults(file: Path, text: str) -> Iterator[Fault]:
-    """Yield the faults of the docstrings of a module: long sentences and phrases."""
-    for node in ast.walk(ast.parse(text)):
-        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            continue
-        if not (docstring := ast.get_docstring(node)):
-            continue
-        line = node.body[0].lineno
-        for block in re.split(r"\n\s*\n|\n(?=\s*[-*>]\s)", docstring):
-            if block.startswith("    ") or block.lstrip().startswith(">>>"):
-                continue  # code
-            prose = plain(" ".join(block.split()))
-            if found := _FORBIDDEN.search(prose):
-                yield Fault(file, line, f"the phrase {found[0]!r}")
-            for sentence in sentences(prose.replace("; ", ". ")):
-                if len(words(sentence)) > WORDS:
-                    yield Fault(file, line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
+def text_faults(file: Path, line: int, text: str) -> Iterator[Fault]:
+    """Yield the faults of a docstring or a message: long sentences and phrases."""
+    if found := _FORBIDDEN.search(text):
+        yield Fault(file, line, f"the phrase {found[0]!r}")
+    for sentence in sentences(text.replace("; ", ". ")):
+        if len(words(sentence)) > WORDS:
+            yield Fault(file, line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
 
 
-def message_faults(file: Path, text: str) -> Iterator[Fault]:
-    """Yield the faults of the messages of a module, which go to errors and logs: long sentences and phrases."""
+def code_faults(file: Path, text: str) -> Iterator[Fault]:
+    """Yield the faults of a module, in its docstrings and in its messages, which go to errors and logs."""
     for node in ast.walk(ast.parse(text)):
-        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
-            continue
-        if not (node.func.id.endswith("Error") or node.func.id in ("log", "warn")):
-            continue
-        parts = node.args[0].values if isinstance(node.args[0], ast.JoinedStr) else [node.args[0]]
-        prose = "".join(str(part.value) if isinstance(part, ast.Constant) else "code" for part in parts)
-        if found := _FORBIDDEN.search(prose):
-            yield Fault(file, node.lineno, f"the phrase {found[0]!r}")
-        for sentence in sentences(prose.replace("; ", ". ")):
-            if len(words(sentence)) > WORDS:
-                yield Fault(file, node.lineno, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
+        if isinstance(node, DOCUMENTED) and (docstring := ast.get_docstring(node)):
+            for block in re.split(r"\n\s*\n|\n(?=\s*[-*>]\s)", docstring):
+                if not block.startswith("    ") and not block.lstrip().startswith(">>>"):  # code
+                    yield from text_faults(file, node.body[0].lineno, plain(" ".join(block.split())))
+        elif isinstance(node, ast.Call) and node.args and MESSAGE.fullmatch(ast.unparse(node.func)):
+            parts = node.args[0].values if isinstance(node.args[0], ast.JoinedStr) else [node.args[0]]
+            prose = "".join(str(part.value) if isinstance(part, ast.Constant) else "code" for part in parts)
+            yield from text_faults(file, node.lineno, prose)
 
 
 def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
@@ -172,16 +161,18 @@ def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
     )
 
 
+def texts(root: Path, patterns: Sequence[str]) -> dict[Path, str]:
+    """Return the files of `patterns` below `root` that are not made from others, and their texts."""
+    files = (file.relative_to(root) for pattern in patterns for file in root.glob(pattern))
+    own = sorted({file for file in files if not file.as_posix().startswith(MADE)})
+    return {file: (root / file).read_text(encoding="utf-8") for file in own}
+
+
 def faults(root: Path) -> list[Fault]:
-    """Return the faults of all pages, docstrings and messages below `root`."""
-    result: list[Fault] = []
-    rules = (PAGES, page_faults), (CODE, docstring_faults), (CODE, message_faults), (NOTEBOOKS, notebook_faults)
-    for patterns, check in rules:
-        for file in sorted({file for pattern in patterns for file in root.glob(pattern)}):
-            if file.relative_to(root).as_posix().startswith(MADE):
-                continue
-            result += check(file.relative_to(root), file.read_text(encoding="utf-8"))
-    return result
+    """Return the faults of all pages, modules and notebooks below `root`."""
+    rules = (PAGES, page_faults), (CODE, code_faults), (NOTEBOOKS, notebook_faults)
+    each = (check(file, text) for patterns, check in rules for file, text in texts(root, patterns).items())
+    return [fault for found in each for fault in found]
 
 
 def main(argv: Sequence[str] = ()) -> int:

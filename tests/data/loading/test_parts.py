@@ -3,13 +3,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refused import refused
 
 from anytouch_jax.config import Config
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleReader
 from anytouch_jax.data.loading.sampling import PartSampler, Shard
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.errors import UserError
 from tests.data.manifest.test_containers import write_tar
 from tests.support.tiny_models import touch_model
 
@@ -40,10 +40,8 @@ def test_64_hosts_share_a_corpus():
 
 def test_too_few_shards_or_an_uneven_batch_is_an_error():
     shard = np.repeat(np.arange(3), 5)
-    with pytest.raises(UserError, match="divide"):
-        PartSampler(shard, 6, 4, 0, 0)
-    with pytest.raises(UserError, match="lower it"):
-        PartSampler(shard, 8, 4, 0, 0)
+    refused("divide", PartSampler, shard, 6, 4, 0, 0)
+    refused("lower it", PartSampler, shard, 8, 4, 0, 0)
 
 
 @pytest.fixture
@@ -90,5 +88,4 @@ def test_hosts_read_their_own_shards_and_together_the_batch_of_one(corpus, monke
 
 
 def test_parts_are_for_stage_1_without_weights(corpus):
-    with pytest.raises(UserError, match="leave one of them out"):
-        Loader(corpus, config(weights=(("mine", 2.0),)))
+    refused("leave one of them out", Loader, corpus, config(weights=(("mine", 2.0),)))

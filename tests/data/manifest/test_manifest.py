@@ -5,12 +5,12 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from checked_world import columns, plain_rows
+from refused import refused
 
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import content, schema
 from anytouch_jax.data.manifest import manifest as m
 from anytouch_jax.data.prepare.verify import verify
-from anytouch_jax.errors import UserError
 
 HEAD = "path,sensor,sequence,frame_index,split"
 
@@ -63,8 +63,7 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
     up = m.read(tmp_path / "up.parquet")
     assert up.value(0, "path") == "deep/a.png"
     assert up.file(0) == first.file(0)
-    with pytest.raises(m.ManifestError, match=r"line 2 of .*manifest\.csv.*is not inside .*elsewhere"):
-        m.write(first, tmp_path / "elsewhere" / "x.csv")
+    refused(r"line 2 of .*manifest\.csv.*is not inside .*elsewhere", m.write, first, tmp_path / "elsewhere" / "x.csv")
 
 
 @pytest.mark.parametrize(
@@ -72,15 +71,11 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
     [
         (GOOD.replace(",split", ",slit"), ["lacks the column 'split'", "slit"]),
         (GOOD.replace("s,2,train", "s,two,train"), ["line 3 of", "'frame_index'", "whole number", "'two'"]),
-        (GOOD.replace("s,2,train", "s,2.5,train"), ["line 3 of", "'frame_index'", "'2.5'"]),
-        (GOOD.replace("s,2,train", "s,1e30,train"), ["line 3 of", "'frame_index'", "'1e30'"]),
         (GOOD.replace("s,2,train", "s,1_0,train"), ["line 3 of", "'frame_index'", "'1_0'"]),
-        (GOOD.replace("s,2,train", "s,0x10,train"), ["line 3 of", "'frame_index'", "whole number", "'0x10'"]),
         (GOOD.replace("s,2,train", "s,,train"), ["line 3 of", "'frame_index' is empty"]),
         (GOOD.replace("c.png", "  "), ["line 4 of", "'path' is empty"]),
         (GOOD.replace("test", "tset"), ["line 4 of", "'split'", "'tset'", "background", "did you mean test?"]),
         (GOOD.replace("test", "Validation"), ["line 4 of", "'split'", "'Validation'", "did you mean val?"]),
-        (GOOD.replace("test", "te st"), ["line 4 of", "'split'", "'te st'", "did you mean test?"]),
         (GOOD.replace("train,2,t,0", "train,0,t,0"), ["line 3 of", "'stride'", "at least 1, is 0"]),
         (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["line 2 of", "'commercial'", "0 or 1", "'yes'"]),
         (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["line 3: 10 cells for 11 columns", "b.png,"]),
@@ -91,12 +86,8 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
 )
 def test_a_bad_table_is_named_by_file_column_and_row(tmp_path, text, words):
     path = _file(tmp_path, text)
-    with pytest.raises(m.ManifestError) as error:
-        m.read(path)
-    assert isinstance(error.value, UserError)
-    for word in [str(path), *words]:
-        assert word in str(error.value)
-    assert "\n" not in str(error.value)
+    sentence = refused(".", m.read, path)
+    assert all(word in sentence for word in [str(path), *words])
 
 
 def test_other_ways_to_give_no_manifest(tmp_path):
@@ -107,15 +98,13 @@ def test_other_ways_to_give_no_manifest(tmp_path):
         (tmp_path / "x.parquet", "cannot be read as a parquet"), (tmp_path / "latin.csv", "cannot be read as a csv"),
         (_file(tmp_path, GOOD, "x.txt"), "ends in .csv or .parquet"), ([], "no manifest is given"),
     ]:  # fmt: skip
-        with pytest.raises(m.ManifestError, match=words):
-            m.read(path)
+        refused(words, m.read, path)
     link, cached = tmp_path / "link.csv", tmp_path / "cached.csv"
     link.symlink_to(_file(tmp_path, GOOD))
     assert len(m.read(link)) == 3
     (tmp_path / "3f2a").write_text(GOOD)
     cached.symlink_to(tmp_path / "3f2a")
-    with pytest.raises(m.ManifestError, match=r"cached.csv is a link into a cache.*--local-dir"):
-        m.read(cached)
+    refused(r"cached.csv is a link into a cache.*--local-dir", m.read, cached)
 
 
 def test_types_in_memory_are_enforced(tmp_path):
@@ -123,13 +112,11 @@ def test_types_in_memory_are_enforced(tmp_path):
     gaps = m.from_columns(columns(stride=[3.0], sensor=coded), tmp_path / "x")
     assert gaps.table["stride"].type == pa.int64() and gaps.value(0, "sensor") == "digit"
     for odd in ({"split": ["train", "val"]}, {"frame_index": [10**20]}):
-        with pytest.raises(m.ManifestError, match="make no table"):
-            m.from_columns(columns(**odd), tmp_path / "x.csv")
+        refused("make no table", m.from_columns, columns(**odd), tmp_path / "x.csv")
     for name, cell in (("a", "soft"), ("b", ["soft"])):
         file = tmp_path / f"{name}.parquet"
         m.write(m.from_columns(columns(**{"label.x": [cell]}), file), file)
-    with pytest.raises(m.ManifestError, match="cannot be joined"):
-        m.read([tmp_path / "a.parquet", tmp_path / "b.parquet"])
+    refused("cannot be joined", m.read, [tmp_path / "a.parquet", tmp_path / "b.parquet"])
 
 
 def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):
@@ -146,17 +133,16 @@ def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):
     touch = both.codes("touch", own=True)
     assert touch[1] == touch[2] != touch[4] == touch[5] and touch[0] == touch[3] == -1
     assert both.clips(2).tolist() == [[0, 1], [3, 4]]
-    with pytest.raises(m.ManifestError, match="given twice"):
-        m.read([one, one])
+    refused("given twice", m.read, [one, one])
 
 
 def test_rows_of_names_the_file_of_an_empty_split(tmp_path):
     got = m.read(_file(tmp_path, GOOD))
     assert got.rows_of("train").tolist() == [0, 1]
-    with pytest.raises(m.ManifestError, match=r"manifest\.csv: column 'split' has no row 'val'; it has test, train"):
-        got.rows_of("val")
-    with pytest.raises(m.ManifestError, match="unknown split 'trian'"):
-        got.rows_of("trian")
+    refused(r"manifest\.csv: column 'split' has no row 'val'; it has test, train", got.rows_of, "val")
+    refused("unknown split 'trian'", got.rows_of, "trian")
+    wide = m.from_columns(columns(**{f"label.c{i}": [i] for i in range(3000)}), tmp_path / "m.csv")
+    assert len(refused("has no column 'gone'; it has path.* more", wide.column, "gone")) < 600
 
 
 def test_resolve_keeps_inside_the_folder(tmp_path):
@@ -170,26 +156,21 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
     assert m.resolve_path(root, "in/../in/a.png") == root / "in" / "a.png"
     assert m.resolve_path(root, "inside.png") == root / "in" / "a.png"
     for bad in ("../secret.png", "in/../../secret.png", "../data2/x"):
-        with pytest.raises(m.ManifestError, match=r"leaves the folder of the manifest, .*/data$"):
-            m.resolve_path(root, bad)
+        refused(r"leaves the folder of the manifest, .*/data$", m.resolve_path, root, bad)
     for bad in ("link.png", "out/x.png"):
-        with pytest.raises(m.ManifestError, match=r"leaves the folder .*, by a link; put the files there, or"):
-            m.resolve_path(root, bad)
+        refused(r"leaves the folder .*, by a link; put the files there, or", m.resolve_path, root, bad)
     for bad in ("in\\a.png", r"C:\data\a.png", r".\in\a.png", "C:/data/a.png"):
-        with pytest.raises(m.ManifestError, match=r"as on Windows; write it relative .* forward slashes"):
-            m.resolve_path(root, bad)
+        refused(r"as on Windows; write it relative .* forward slashes", m.resolve_path, root, bad)
     (root / r"odd\name.png").write_bytes(b"x")
     assert m.resolve_path(root, r"odd\name.png").is_file()
     for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name"), (str(root / "a.png"), "absolute")):
-        with pytest.raises(m.ManifestError, match=words):
-            m.resolve_path(root, bad)
+        refused(words, m.resolve_path, root, bad)
 
 
 def test_sensor_rows(tmp_path):
     text = f"{HEAD}\na,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
     got, model = m.read(_file(tmp_path, text)), preset("tiny").model
-    with pytest.raises(m.ManifestError, match=r"line 4 of .*manifest\.csv.*unknown sensor 'newfinger'"):
-        m.sensor_rows(got, model)
+    refused(r"line 4 of .*manifest\.csv.*unknown sensor 'newfinger'", m.sensor_rows, got, model)
     ids, notes = m.sensor_rows(got, model, unknown="skip")
     assert ids.tolist() == [1, -1, -1, 6] and ids.dtype == np.int32
     assert any("1 rows of tac3d" in note for note in notes) and any("newfinger" in note for note in notes)
@@ -208,8 +189,7 @@ def test_sensor_rows(tmp_path):
 def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
     got = m.read(_file(tmp_path, f"{HEAD}\na,digit,s,0,train\nb,digit,r,7,train\nc,digit,r,7,train\n"))
     assert len(got.clips(1)) == 3
-    with pytest.raises(m.ManifestError, match=r"line 4 of .* repeats frame_index 7 of sequence 'r', as in line 3 of"):
-        got.clips(2)
+    refused(r"line 4 of .* repeats frame_index 7 of sequence 'r', as in line 3 of", got.clips, 2)
 
 
 def test_joined_manifests_written_as_one_keep_their_keys_apart(tmp_path):
@@ -227,8 +207,7 @@ def test_columns_of_any_kind_are_carried_along(tmp_path):
     assert one.content_hash != two.content_hash
     m.write(one, tmp_path / "m.parquet")
     assert m.read(tmp_path / "m.parquet").column("box").to_pylist() == [[1, 2]]
-    with pytest.raises(m.ManifestError, match="cannot be written"):
-        m.write(one, tmp_path / "m.csv")
+    refused("cannot be written", m.write, one, tmp_path / "m.csv")
     assert not (tmp_path / "m.csv").exists()
 
 
@@ -267,15 +246,13 @@ def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
         ('1.png,digit,s,1,train,,"open', "the quote in line 5 is not closed"),
         ('1.png,digit,s,1,train,,"open\n1.png,digit,s,1,train,,"2', "the quote in line 5 is not closed"),
     ):
-        with pytest.raises(m.ManifestError, match=words):
-            m.read(_file(tmp_path, f"{head}\n{good}{bad}\n2.png,digit,s,2,train,,3\n"))
+        refused(words, m.read, _file(tmp_path, f"{head}\n{good}{bad}\n2.png,digit,s,2,train,,3\n"))
     for cells, words in (
         (["Wood", "clay", "wood"], "line 7 of .*csv: column 'label.x' has 'wood', and line 5 of .* has 'Wood'"),
         ([*map(str, range(9)), "12,5"], "line 14 of .*csv: column 'label.x' has '12,5' among numbers"),
     ):
         lines = "".join(f'{i + 1}.png,digit,s,{i + 1},train,,"{cell}"\n' for i, cell in enumerate(cells))
-        with pytest.raises(m.ManifestError, match=words):
-            m.read(_file(tmp_path, f"{head}\n{good}{lines}"))
+        refused(words, m.read, _file(tmp_path, f"{head}\n{good}{lines}"))
 
 
 def test_labels_of_a_csv_keep_what_they_say(tmp_path):
@@ -313,8 +290,7 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     assert notes == ["2 rows got a caption by 'frame_index'", "2 rows already had a caption"]
     nested = m.replace_column(got, "extra", pa.array([[0]] * len(got)))
     pa.parquet.write_table(pa.table({"extra": ["0"], "text": ["x"]}), tmp_path / "e.parquet")
-    with pytest.raises(UserError, match="the key 'extra' must be a plain column, is list"):
-        m.attach_text(nested, tmp_path / "e.parquet")
+    refused("the key 'extra' must be a plain column, is list", m.attach_text, nested, tmp_path / "e.parquet")
     over, _ = m.attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True)
     assert over.column("text").to_pylist() == ["new", "one", 'soft, "very" and round', "new", "one", None]
 
@@ -334,10 +310,8 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
 )
 def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words):
     (tmp_path / "t.csv").write_text(text)
-    with pytest.raises(UserError, match=words):
-        m.attach_text(make(plain_rows()), tmp_path / "t.csv", **options)
-    with pytest.raises(UserError, match="No such file"):
-        m.attach_text(make(plain_rows()), tmp_path / "none.csv")
+    refused(words, m.attach_text, make(plain_rows()), tmp_path / "t.csv", **options)
+    refused("No such file", m.attach_text, make(plain_rows()), tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(
@@ -355,9 +329,8 @@ def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words
 def test_a_parquet_with_a_missing_or_mistyped_column_is_named(tmp_path, change, words):
     given = {name: values for name, values in columns(2, **change).items() if values is not None}
     pa.parquet.write_table(pa.table(given), tmp_path / "m.parquet")
-    with pytest.raises(m.ManifestError, match=words) as error:
-        verify(m.read(tmp_path / "m.parquet"))
-    assert "m.parquet" in str(error.value) and "\n" not in str(error.value)
+    error = refused(words, m.read, tmp_path / "m.parquet")
+    assert "m.parquet" in error
 
 
 def _with_broken_text(name):
@@ -375,8 +348,7 @@ GOOD_COLUMNS = columns(2, object=["mug"] * 2, note=["n"] * 2) | {"label.x": ["u"
 @pytest.mark.parametrize("name", ["path", "split", "object", "label.x", "note"])
 def test_text_of_a_parquet_that_is_not_utf8_is_named(tmp_path, name):
     pa.parquet.write_table(_with_broken_text(name), tmp_path / "m.parquet")
-    with pytest.raises(m.ManifestError, match=f"row 1 of .*parquet: column '{name}' must be UTF-8 text"):
-        m.read(tmp_path / "m.parquet")
+    refused(f"row 1 of .*parquet: column '{name}' must be UTF-8 text", m.read, tmp_path / "m.parquet")
 
 
 @pytest.mark.parametrize("kind", [pa.large_string(), pa.string_view(), pa.dictionary(pa.int8(), pa.large_string())])
@@ -396,23 +368,20 @@ def test_labels_of_every_text_type_are_text(tmp_path, kind):
 @pytest.mark.parametrize("read", [m.read, m.summarise_file])
 def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name, text, kind, read):
     (tmp_path / name).write_text(text)
-    with pytest.raises(m.ManifestError, match=rf"{name} is {kind}"):
-        read(tmp_path / name)
+    refused(rf"{name} is {kind}", read, tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["path", "split", "object", "label.x"])
 def test_a_huge_cell_is_named_and_never_printed(tmp_path, name):
     huge = GOOD_COLUMNS | {name: ["train", "Z" * 1_000_000]}
     pa.parquet.write_table(pa.table(huge), tmp_path / "m.parquet")
-    with pytest.raises(m.ManifestError, match=f"row 1 of .*: column '{name}' has a text of 1000000 bytes") as error:
-        m.read(tmp_path / "m.parquet")
-    assert len(str(error.value)) < 400
+    error = refused(f"row 1 of .*: column '{name}' has a text of 1000000 bytes", m.read, tmp_path / "m.parquet")
+    assert len(error) < 400
     long = huge | {name: ["train", "Z" * 9_000], "frame_index": [0, 0]}  # is read, and shortened in messages
     pa.parquet.write_table(pa.table(long), tmp_path / "m.parquet")
     if name == "split":
-        with pytest.raises(m.ManifestError, match="unknown split 'ZZZ") as error:
-            m.read(tmp_path / "m.parquet")
-        assert len(str(error.value)) < 500
+        error = refused("unknown split 'ZZZ", m.read, tmp_path / "m.parquet")
+        assert len(error) < 500
     else:
         report = verify(m.read(tmp_path / "m.parquet"))
         assert not report.ok and max(map(len, report.to_markdown().splitlines())) < 1000
@@ -421,42 +390,27 @@ def test_a_huge_cell_is_named_and_never_printed(tmp_path, name):
 def test_a_table_of_too_many_rows_is_refused_before_it_is_read(tmp_path, monkeypatch):
     pa.parquet.write_table(pa.table(GOOD_COLUMNS), tmp_path / "m.parquet")
     monkeypatch.setattr(schema, "MAX_ROWS", 1)
-    with pytest.raises(m.ManifestError, match="has 2 rows, more than 1; split it"):
-        m.read(tmp_path / "m.parquet")
-
-
-def test_a_wide_table_is_read_in_few_parts_and_a_long_one_by_column(tmp_path, monkeypatch):
-    wide = GOOD_COLUMNS | {f"label.c{i}": [i, i + 1] for i in range(3000)}
-    pa.parquet.write_table(pa.table(wide), tmp_path / "m.parquet")
-    opened, real = [], pa.parquet.ParquetFile
-    monkeypatch.setattr(pa.parquet, "ParquetFile", lambda path: opened.append(path) or real(path))
-    assert m.read(tmp_path / "m.parquet").column("label.c2999").to_pylist() == [2999, 3000]
-    assert len(opened) == 2
-    monkeypatch.setattr(schema, "_PART", 2 * 1000)
-    assert m.read(tmp_path / "m.parquet").content_hash and len(opened) == 2 + 1 + 4
-    with pytest.raises(m.ManifestError, match=r"has no column 'gone'; it has path.* more") as error:
-        m.read(tmp_path / "m.parquet").column("gone")
-    assert len(str(error.value)) < 600
+    refused("has 2 rows, more than 1; split it", m.read, tmp_path / "m.parquet")
 
 
 def test_a_description_in_blocks_equals_the_whole_table(tmp_path, monkeypatch):
     monkeypatch.setattr(schema, "BLOCK", 7)
     monkeypatch.setattr(content, "BLOCK", 5)
-    count, rng = 40, np.random.default_rng(0)
-    cells = {
-        "path": [f"{i}.png" for i in range(count)], "sensor": rng.choice(["digit", "taxim", "gelslim"], count).tolist(),
-        "sequence": [f"r{i // 9}" for i in range(count)], "frame_index": [i % 9 for i in range(count)],
-        "split": rng.choice(["train", "test"], count).tolist(), "stride": [1, 2] * (count // 2),
-        "object": [None if i % 3 else "ball" for i in range(count)], "label.b": [[i] for i in range(count)],
-        "label.a": [None if i == 9 else i / 7 for i in range(count)], "extra": [b"a", None] * (count // 2),
-    }  # fmt: skip
+    count, rng, file = 40, np.random.default_rng(0), tmp_path / "m.parquet"
+    cells = columns(
+        count, sensor=rng.choice(["digit", "taxim", "gelslim"], count).tolist(), stride=[1, 2] * (count // 2),
+        sequence=[f"r{i // 9}" for i in range(count)], frame_index=[i % 9 for i in range(count)],
+        split=rng.choice(["train", "test"], count).tolist(), object=[None if i % 3 else "ball" for i in range(count)],
+        extra=[b"a", None] * (count // 2),
+    )  # fmt: skip
+    cells |= {"label.b": [[i] for i in range(count)], "label.a": [None if i == 9 else i / 7 for i in range(count)]}
     order = rng.permutation(count)
     cells = {name: [values[i] for i in order] for name, values in cells.items()}
-    pa.parquet.write_table(pa.table(cells), tmp_path / "m.parquet", row_group_size=11)
-    table = m.read(tmp_path / "m.parquet")
+    pa.parquet.write_table(pa.table(cells), file, row_group_size=11)
+    table = m.read(file)
     for kept in (1 << 20, 3):  # bytes of text that are kept
         monkeypatch.setattr(content, "_KEPT", kept)
-        got = m.summarise_file(tmp_path / "m.parquet")
+        got = m.summarise_file(file)
         assert got.digest == table.content_hash
     assert (got.rows, got.recordings, got.clips) == (count, 5, len(table.clips(3)))
     assert list(got.filled) == list(cells) and got.filled["object"] == table.present("object").sum()
@@ -465,20 +419,14 @@ def test_a_description_in_blocks_equals_the_whole_table(tmp_path, monkeypatch):
         assert got.counts[name] == (list(zip(values.tolist(), rows.tolist(), strict=True)), len(values))
     (tmp_path / "m.csv").write_text(GOOD)
     assert m.summarise_file(tmp_path / "m.csv").digest == m.read(tmp_path / "m.csv").content_hash
-    cells["frame_index"][30] = cells["frame_index"][20]
-    cells["sequence"][30] = cells["sequence"][20]
-    cells["split"][30] = cells["split"][20]
-    for name, value, words in (
-        ("frame_index", None, r"row 30 of .*m\.parquet repeats frame_index \d of sequence 'r\d', as in row 20 of"),
-        ("split", "tset", r"row 33 of .*m\.parquet: column 'split' .* did you mean test"),
-        ("path", None, r"row 33 of .*m\.parquet: column 'path' is empty"),
+    twice = {name: cells[name][20] for name in ("frame_index", "sequence", "split")}
+    for row, changes, words in (
+        (30, twice, r"row 30 of .*m\.parquet repeats frame_index \d of sequence 'r\d', as in row 20 of"),
+        (33, {"split": "tset"}, r"row 33 of .*m\.parquet: column 'split' .* did you mean test"),
+        (33, {"path": None}, r"row 33 of .*m\.parquet: column 'path' is empty"),
     ):
-        changed = cells | (
-            {} if value is None and name != "path" else {name: [*cells[name][:33], value, *cells[name][34:]]}
-        )
-        pa.parquet.write_table(pa.table(changed), tmp_path / "m.parquet", row_group_size=11)
-        with pytest.raises(m.ManifestError, match=words):
-            m.summarise_file(tmp_path / "m.parquet")
+        changed = {name: [*of[:row], changes.get(name, of[row]), *of[row + 1 :]] for name, of in cells.items()}
+        pa.parquet.write_table(pa.table(changed), file, row_group_size=11)
+        refused(words, m.summarise_file, file)
     for name in ("gone.parquet", "gone.csv", "m.txt"):
-        with pytest.raises(m.ManifestError, match=name):
-            m.summarise_file(tmp_path / name)
+        refused(name, m.summarise_file, tmp_path / name)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from chat_server import GOOD, KEY, chat, serve
+from refused import refused
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import close_shards
@@ -16,7 +17,6 @@ from anytouch_jax.data.prepare import captions
 from anytouch_jax.data.prepare.captions import AnnotateError, Endpoint, annotate, sample_sheet
 from anytouch_jax.data.prepare.prompts import find_caption_jobs, make_prompt
 from anytouch_jax.data.prepare.shards import pack
-from anytouch_jax.errors import UserError
 from anytouch_jax.files import lock
 
 
@@ -43,6 +43,16 @@ def _ask(server, **options):
     return asyncio.run(_ask_at(server.url, **options))
 
 
+FAILED = (captions._QuestionError, captions.BadAnswer, AnnotateError)
+
+
+def _failed(answer, words, **options):
+    """Ask a server that always answers so. Return the sentence of the failure and how often it was asked."""
+    with serve(lambda *_: answer) as server, pytest.raises(FAILED, match=words) as error:
+        _ask(server, **options)
+    return str(error.value), len(server.asked)
+
+
 def _rows(count=3, dataset="touch_and_go", **extra):
     """`count` sequences of three frames."""
     return [
@@ -54,6 +64,12 @@ def _rows(count=3, dataset="touch_and_go", **extra):
 def _run(manifest, server, folder, **options):
     endpoint = end(server, **options.pop("endpoint", {}))
     return annotate(manifest, endpoint, folder, **{"confirm": lambda _: True} | options)
+
+
+def _asked(manifest, folder, behave=None, **options):
+    """Annotate with a server that answers so. Return what was done, and the server, which has stopped."""
+    with serve(behave) if behave else serve() as server:
+        return _run(manifest, server, folder, **options), server
 
 
 def _pictures(body):
@@ -72,8 +88,7 @@ def _words(body):
 
 def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, tmp_path):
     loose = make(_rows())
-    with serve() as server:
-        done = _run(loose, server, tmp_path / "answers", threads=3)
+    done, server = _asked(loose, tmp_path / "answers", threads=3)
     assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
     assert len(server.asked) == 3 and done.requests == 3 and (done.tokens_in, done.tokens_out) == (300, 60)
     for body, (path, headers) in zip(server.asked, server.heads, strict=True):
@@ -89,16 +104,14 @@ def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, t
 def test_one_photograph_and_one_touch_by_two_sensors_are_asked_about_once_and_pictures_are_made_small(make, tmp_path):
     rows = [row | {"dataset": "tacquad", "touch": f"p{i // 3}", "image_path": "a.png"} for i, row in enumerate(_rows())]
     told = []
-    with serve() as server:
-        done = _run(make(rows), server, tmp_path / "one", confirm=lambda estimate: told.append(estimate) or True)
+    done, server = _asked(make(rows), tmp_path / "one", confirm=lambda estimate: told.append(estimate) or True)
     assert len(server.asked) == done.requests == told[0].questions == 1
     assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 9
     rows = _rows(2, "tacquad", touch="place")
     rows += [{"sequence": "alone", "dataset": "tacquad", "image_path": "big.png"}]
     loose = make(rows)
     cv2.imwrite(str(tmp_path / "big.png"), np.zeros((300, 600, 3), np.uint8))
-    with serve() as server:
-        done = _run(loose, server, tmp_path / "answers", side=128)
+    done, server = _asked(loose, tmp_path / "answers", side=128)
     assert len(server.asked) == 2 and [len(c.job.rows) for c in done.captions] == [6, 1]
     assert sorted(_decoded(_pictures(body)[0]).shape for body in server.asked) == [(40, 40, 3), (64, 128, 3)]
 
@@ -106,16 +119,14 @@ def test_one_photograph_and_one_touch_by_two_sensors_are_asked_about_once_and_pi
 def test_objectfolder_sends_two_photographs_and_the_touch_and_says_so(make, tmp_path):
     loose = make(_rows(1, "objectfolder_real", image2_path="side.png"))
     cv2.imwrite(str(tmp_path / "side.png"), np.full((20, 20, 3), 200, np.uint8))
-    with serve() as server:
-        done = _run(loose, server, tmp_path / "answers")
+    done, server = _asked(loose, tmp_path / "answers")
     (body,) = server.asked
     first, second, touch = (_decoded(url) for url in _pictures(body))
     assert (first.shape, second.shape, touch.shape) == ((40, 40, 3), (20, 20, 3), (12, 16, 3))
     assert abs(second.mean() - 200) < 2
     assert "first two pictures are photographs" in _words(body) and "last picture is the imprint" in _words(body)
     assert [column for _, column in done.captions[0].job.images] == ["image_path", "image2_path", "path"]
-    with serve() as server:
-        _run(make(_rows(1, "objectfolder_real")), server, tmp_path / "other")
+    _, server = _asked(make(_rows(1, "objectfolder_real")), tmp_path / "other")
     assert len(_pictures(server.asked[0])) == 2 and "first picture is a photograph" in _words(server.asked[0])
 
 
@@ -132,8 +143,7 @@ def test_phrases_are_expanded_once_and_kept(make, tmp_path):
         assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 5 + [None]
         assert done.manifest.column("phrase").to_pylist() == ['soft, {fuzzy} "wool"'] * 3 + ["hard"] * 2 + [None]
         assert done.left_out == {"no phrase to expand": 1}
-        with pytest.raises(UserError, match=r"nothing to annotate.*5 rows: expanded before"):
-            _run(done.manifest, server, tmp_path / "answers")
+        refused(r"nothing to annotate.*5 rows: expanded before", _run, done.manifest, server, tmp_path / "answers")
         again = find_caption_jobs(done.manifest, overwrite=True)[0]  # of the phrases, not of what became of them
         assert sorted(str(job.phrase) for job in again) == ["hard", 'soft, {fuzzy} "wool"']
 
@@ -150,13 +160,11 @@ def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):
     assert sorted(left_out.values()) == [3, 3, 3, 3]
     assert any("'mine' has no prompt" in reason and "--family mine" in reason for reason in left_out)
     several = make([row | {"dataset": f"mine {i % 3}"} for i, row in enumerate(_rows(2))])
-    with pytest.raises(UserError, match=r"--family 'mine 2' photograph") as told:
-        find_caption_jobs(several)
-    assert str(told.value).count("touch_and_go") == 1
+    told = refused(r"--family 'mine 2' photograph", find_caption_jobs, several)
+    assert told.count("touch_and_go") == 1
     assert len(find_caption_jobs(loose, families={"mine": "photograph"}, overwrite=True)[0]) == 3
     assert len(find_caption_jobs(loose, split="train")[0]) == 1
-    with pytest.raises(UserError, match="no prompt family 'photo'"):
-        find_caption_jobs(loose, families={"mine": "photo"})
+    refused("no prompt family 'photo'", find_caption_jobs, loose, families={"mine": "photo"})
 
 
 def test_nothing_is_asked_before_it_is_confirmed(make, tmp_path):
@@ -225,91 +233,47 @@ def test_a_passing_failure_is_tried_again_and_a_refusal_is_not():
         assert len(server.asked) == 3
     refusal = {"error": {"message": "bad\nimage " + "x" * 999}}
     for status in (400, 413):
-        with (
-            serve(lambda *_, s=status: (s, {}, refusal)) as server,
-            pytest.raises(captions._QuestionError, match=f"{status}: bad image x") as error,
-        ):
-            _ask(server)
-        assert len(server.asked) == 1 and len(str(error.value)) < 300 and "\n" not in str(error.value)
+        sentence, asked = _failed((status, {}, refusal), f"{status}: bad image x")
+        assert asked == 1 and len(sentence) < 300 and "\n" not in sentence
 
 
 @pytest.mark.parametrize(
     "answer",
     [b"", b"<html>busy</html>", b"null", b"{}", b'{"choices": []}', b'{"choices": [{"message": null}]}',
-     b'{"choices": {"a": 1}}', b"[" * 100_000, b"\xff\xfe\x00"],
+     b'{"choices": {"a": 1}}', b"[" * 100_000, b"\xff\xfe\x00", json.dumps(chat("\udfff")).encode()],
 )  # fmt: skip
 def test_an_answer_that_is_no_chat_completion_is_bad(answer):
-    with (
-        serve(lambda *_: (200, {"Content-Type": "application/json"}, answer)) as server,
-        pytest.raises(captions.BadAnswer, match="not"),
-    ):
-        _ask(server)
+    _failed((200, {"Content-Type": "application/json"}, answer), "not")
 
 
-def test_waits_for_a_server_are_bounded(monkeypatch):
-    with (
-        serve(lambda *_: ("stall", {}, b"")) as server,
-        pytest.raises(captions._QuestionError, match=r"no answer within 0\.1 seconds"),
+def test_odd_numbers_of_tokens_are_unknown_and_the_answer_is_kept():
+    for usage in (
+        [],
+        {"prompt_tokens": "x"},
+        {"prompt_tokens": -7},
+        {"prompt_tokens": 10**400, "completion_tokens": 2.5},
     ):
-        _ask(server, timeout=0.1, tries=2)
-    assert len(server.asked) == 2
-    with (  # a byte now and then, for ever
-        serve(lambda *_: (200, {"Content-Length": "400000"}, b"{")) as server,
-        pytest.raises(captions._QuestionError, match=r"no answer within 0\.3 seconds"),
-    ):
-        _ask(server, tries=1, timeout=0.3)
-    monkeypatch.setattr(captions, "_LONGEST_WAIT", 0.1)
-    with (
-        serve(lambda *_: (429, {"Retry-After-Ms": "60000"}, b"")) as server,
-        pytest.raises(captions._QuestionError, match="no answer"),
-    ):
-        _ask(server, tries=2, timeout=0.1)
-    with pytest.raises(captions._QuestionError, match="cannot be reached"):
-        _ask(server, tries=1)  # the server has stopped
+        with serve(lambda *_, usage=usage: (200, {}, chat(GOOD, usage=usage))) as server:
+            assert _ask(server) == (json.dumps(GOOD), "stop", 0, 0)
 
 
 @pytest.mark.parametrize("wait", ["1000000000", "1e999", "Fri, 01 Jan 2100 00:00:00 GMT", "soon", "-5", "\xff"])
-def test_a_server_that_asks_for_a_long_wait_is_reported_and_not_obeyed(wait):
-    reports, headers = [], {"Retry-After": wait, "Retry-After-Ms": None}
-
-    async def ask(url):
-        client = captions._Client(Endpoint(url, "gpt-4o", timeout=5.0, tries=2), reports.append)
-        async with client.connect() as connection:
-            await client.ask(connection, [])
-
-    start = time.monotonic()
-    with (
-        serve(lambda *_: (429, headers, {"error": "too many"})) as server,
-        pytest.raises(captions._QuestionError, match="429: too many and asks to wait"),
-    ):
-        asyncio.run(ask(server.url))
-    assert time.monotonic() - start < 10
-    assert len(reports) == len(server.asked) and "429" in reports[0] and "Retry-After" in reports[0]
+def test_a_server_that_asks_for_a_long_wait_is_not_obeyed(wait):
+    begun, headers = time.monotonic(), {"Retry-After": wait, "Retry-After-Ms": None}
+    _failed((429, headers, {"error": "too many"}), "429: too many and asks to wait", tries=2)
+    assert time.monotonic() - begun < 10
 
 
-@pytest.mark.parametrize(
-    "usage", [[], {"prompt_tokens": "x"}, {"prompt_tokens": -7}, {"prompt_tokens": 10**400, "completion_tokens": 2.5}]
-)
-def test_odd_numbers_of_tokens_are_unknown_and_the_answer_is_kept(usage):
-    with serve(lambda *_: (200, {}, chat(GOOD, usage=usage))) as server:
-        assert _ask(server) == (json.dumps(GOOD), "stop", 0, 0)
-
-
-def test_half_of_a_unicode_pair_is_a_bad_answer_and_no_crash(make, tmp_path):
-    half = GOOD | {"caption": "Soft and \ud800 warm."}
-    answers = [
-        (200, {}, chat(json.dumps(half, ensure_ascii=False))), (200, {}, chat(half)), (200, {}, chat("\udfff")),
-        (400, {}, {"error": "\ud800 no"}), (200, {}, chat(GOOD | {"object": "\ud83d"})), (200, {}, chat(GOOD)),
-    ]  # fmt: skip
-    with serve(lambda number, _: answers[number % 6]) as server:
-        done = _run(make(_rows(3)), server, tmp_path / "answers", threads=1)
-    assert [failure.reason.split(":")[0] for failure in done.failures] == [
-        "bad answer (not a chat completion)", "the endpoint answers 400"
-    ]  # fmt: skip
-    assert len(done.captions) == 1 and len(server.asked) == 6
-    path = tmp_path / "answers" / "answers.jsonl"
-    path.write_text(path.read_text() + '{"key": "x", "caption": "\\ud800", "object": ""}\n')
-    assert "x" not in captions._AnswerStore(tmp_path / "answers").answers
+def test_waits_for_a_server_are_bounded(monkeypatch):
+    assert _failed(("stall", {}, b""), r"no answer within 0\.1 seconds", timeout=0.1, tries=2)[1] == 2
+    drip = (200, {"Content-Length": "400000"}, b"{")  # a byte now and then, for ever
+    _failed(drip, r"no answer within 0\.3 seconds", tries=1, timeout=0.3)
+    monkeypatch.setattr(captions, "_LONGEST_WAIT", 0.1)
+    _failed((429, {"Retry-After-Ms": "60000"}, b""), "no answer", tries=2, timeout=0.1)
+    with serve() as server:
+        pass
+    with pytest.raises(captions._QuestionError, match="cannot be reached"):
+        _ask(server, tries=1)  # it has stopped
 
 
 def test_an_unusable_endpoint_ends_the_waits_of_other_questions(make, tmp_path):
@@ -329,8 +293,7 @@ def test_bad_answers_are_asked_again_then_counted_and_listed(make, tmp_path):
         row = round(float(_decoded(_pictures(body)[0])[..., 0].mean()))
         return 200, {}, chat(answers[number % len(answers)] if row < 4 else GOOD)
 
-    with serve(behave) as server:
-        done = _run(loose, server, tmp_path / "answers", threads=2)
+    done, server = _asked(loose, tmp_path / "answers", behave, threads=2)
     assert len(server.asked) == 3 + 2 and len(done.captions) == 2 and done.requests == 5
     (failure,) = done.failures
     assert failure.rows == 3 and failure.where == loose.where(0) and "bad answer" in failure.reason
@@ -365,22 +328,14 @@ def test_the_key_is_in_no_file_and_no_message(make, tmp_path, capfd):
     assert KEY.encode() not in b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
     assert KEY not in "".join([*said, *capfd.readouterr(), repr(done.failures), repr(end(server))])
     for status, padding in ((401, ""), (404, ""), (500, ""), (400, ""), (400, "x" * 190)):
-        with (
-            serve(lambda *_, s=status, p=padding: (s, {}, {"error": f"{p} bad key {KEY}"})) as server,
-            pytest.raises((captions._QuestionError, AnnotateError)) as error,
-        ):
-            _ask(server, tries=1)
-        assert KEY[:8] not in str(error.value) and ("[key]" in str(error.value)) == (not padding)
+        sentence, _ = _failed((status, {}, {"error": f"{padding} bad key {KEY}"}), ".", tries=1)
+        assert KEY[:8] not in sentence and ("[key]" in sentence) == (not padding)
 
 
 def test_the_key_does_not_follow_a_redirect():
     for status in (301, 302, 303, 307, 308):
-        with (
-            serve() as elsewhere,
-            serve(lambda *_, s=status, u=elsewhere.url: (s, {"Location": u}, b"")) as server,
-            pytest.raises(AnnotateError, match="redirects to another address"),
-        ):
-            _ask(server)
+        with serve() as elsewhere:
+            _failed((status, {"Location": elsewhere.url}, b""), "redirects to another address")
         assert not elsewhere.heads
 
 
@@ -399,9 +354,8 @@ def test_the_key_does_not_follow_a_redirect():
 )  # fmt: skip
 def test_bad_addresses_and_keys_are_named_without_showing_the_key(monkeypatch, url, key, words):
     monkeypatch.setenv("OPENAI_API_KEY", key)
-    with pytest.raises(AnnotateError, match=words) as error:
-        Endpoint(url, "m").read_key()
-    assert "Injected" not in str(error.value) and KEY not in str(error.value)
+    error = refused(words, lambda: Endpoint(url, "m").read_key())
+    assert "Injected" not in error and KEY not in error
 
 
 def test_a_local_server_needs_no_key_and_a_distant_one_is_warned_about(monkeypatch, make, tmp_path):
@@ -425,8 +379,7 @@ def test_a_notebook_may_ask_and_a_missing_client_is_one_sentence(monkeypatch, ma
 
     assert len(asyncio.run(cell()).captions) == 2  # in a loop that is running
     monkeypatch.setitem(sys.modules, "openai", None)
-    with pytest.raises(AnnotateError, match=r"pip install .*annotate"):
-        Endpoint("https://api.example.org/v1", "m").read_key()
+    refused(r"pip install .*annotate", Endpoint("https://api.example.org/v1", "m").read_key)
 
 
 def test_other_servers_can_be_spoken_to():
@@ -442,8 +395,7 @@ def test_other_servers_can_be_spoken_to():
 def test_the_sheet_holds_its_pictures_and_escapes_words(make, tmp_path):
     loose = make(_rows(5))
     tricky = {"object": "<script>", "caption": "Soft & <b>warm</b> to the touch."}
-    with serve(lambda *_: (200, {}, chat(tricky))) as server:
-        done = _run(loose, server, tmp_path / "answers")
+    done, _ = _asked(loose, tmp_path / "answers", lambda *_: (200, {}, chat(tricky)))
     page = sample_sheet(done.manifest, done.captions, tmp_path / "deep" / "sheet.html", count=3)
     text = page.read_text()
     assert text.count("<article>") == 3 and "3 of 5 captions" in text
@@ -453,8 +405,7 @@ def test_the_sheet_holds_its_pictures_and_escapes_words(make, tmp_path):
     assert [file.name for file in page.parent.iterdir()] == ["sheet.html"]
     loose.file(1, "image_path").unlink()
     assert "see0_1.png" in sample_sheet(done.manifest, done.captions, tmp_path / "b.html").read_text()
-    with pytest.raises(UserError, match="no captions"):
-        sample_sheet(done.manifest, (), tmp_path / "none.html")
+    refused("no captions", sample_sheet, done.manifest, (), tmp_path / "none.html")
 
 
 def test_many_pictures_that_cannot_be_read_bar_no_question(make, tmp_path):
@@ -462,8 +413,7 @@ def test_many_pictures_that_cannot_be_read_bar_no_question(make, tmp_path):
     loose.file(1, "image_path").unlink()
     for job in range(1, 30):
         loose.file(3 * job + 1, "image_path").write_bytes(b"no picture")
-    with serve() as server:
-        done = _run(loose, server, tmp_path / "answers")
+    done, server = _asked(loose, tmp_path / "answers")
     assert len(server.asked) == len(done.captions) == 10 and len(done.failures) == 30
     assert "see0_1.png" in done.failures[0].reason and "not a PNG" in done.failures[1].reason
     assert len((tmp_path / "answers" / "failures.jsonl").read_text().splitlines()) == 30
@@ -490,8 +440,7 @@ def test_what_failed_the_last_time_is_asked_last(make, tmp_path):
 
 
 def test_many_questions_that_are_always_refused_do_not_keep_back_the_answers(make, tmp_path):
-    with serve(ten) as server:
-        done = _run(make(_rows(60)), server, tmp_path / "answers", threads=1)
+    done, server = _asked(make(_rows(60)), tmp_path / "answers", ten, threads=1)
     assert len(server.asked) == 35 and len(done.captions) == 10 and len(done.failures) == 50
     assert done.failures[-1].reason.startswith("not asked")
     assert done.manifest.present("text").sum() == 30  # three rows a touch

@@ -51,6 +51,21 @@ def test_pins_are_contact_and_moved_dots_are_not(look):
     assert dots.score(moved) < THRESHOLDS["gelsight"] < UntouchedGel(free).score(moved)
 
 
+def test_a_deeper_press_scores_more_at_any_resolution_and_light():
+    clean, light = gel_frame("coloured", 0), np.array([25, -15, 10])
+    gel, lamp = UntouchedGel(clean), np.linspace(30, -10, 160)[:, None] * np.array([1, 0.3, -0.5])
+    scores = [gel.score(gel_frame("coloured", depth, seed=1)) for depth in (0, 0.1, 0.3, 1)]
+    assert scores == sorted(scores) and scores[0] < 2 and gel.score(clean) == 0
+    pressed = gel_frame("coloured", 1, seed=1)
+    assert UntouchedGel(pressed).score(clean) == pytest.approx(scores[-1], rel=0.1)
+    assert gel.score(np.repeat(np.repeat(pressed, 2, 0), 2, 1)) == pytest.approx(scores[-1], rel=0.1)
+    assert UntouchedGel(np.rot90(clean)).score(np.rot90(pressed)) == pytest.approx(scores[-1], rel=0.1)
+    for change in (light, lamp):
+        free, other = (np.clip(one + change, 0, 255).astype(np.uint8) for one in (clean, pressed))
+        assert np.abs(free.astype(int) - clean).mean() > 7 and gel.score(free) < 1.5
+        assert gel.score(other) == pytest.approx(scores[-1], rel=0.1)
+
+
 def test_estimates_of_one_unit_agree_or_do_not():
     free = [UntouchedGel(gel_frame("coloured", 0, seed=seed)) for seed in range(3)]
     pressed = [UntouchedGel(gel_frame("coloured", 1, "pins", seed=seed)) for seed in range(2)]
@@ -68,4 +83,3 @@ def test_pictures_of_other_proportions_are_refused():
             gel.score(frame)
     with pytest.raises(ValueError, match="thin"):
         UntouchedGel(np.zeros((6, 160, 3), np.uint8)).score(np.zeros((6, 160, 3), np.uint8))
-    assert gel.score(np.repeat(np.repeat(gel_frame("coloured", 0), 2, 0), 2, 1)) < 2  # another resolution

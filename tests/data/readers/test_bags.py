@@ -4,10 +4,10 @@ import sys
 
 import numpy as np
 import pytest
+from refused import refused
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.readers import bags
-from anytouch_jax.errors import UserError
 from tests.data.manifest.test_containers import png
 
 rosbags = pytest.importorskip("rosbags.rosbag2")
@@ -58,38 +58,20 @@ def write_ros(folder, version):
     return target
 
 
-def write_mcap(file):
-    """Foxglove's JSON: compressed pictures."""
-    with file.open("wb") as stream:
-        writer = mcap.Writer(stream)
-        writer.start()
-        schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
-        other = writer.register_schema("force", "jsonschema", b"{}")
-        image = writer.register_channel("/gel", "json", schema)
-        force = writer.register_channel("/force", "json", other)
-        for i in range(3):
-            data = {"timestamp": {"sec": 7, "nsec": i}, "data": base64.b64encode(png(i)).decode(), "format": "png"}
-            writer.add_message(image, log_time=i * 10, publish_time=0, data=json.dumps(data).encode())
-            writer.add_message(force, log_time=7 * 10**9 + i, publish_time=0, data=json.dumps({"f": [0, i]}).encode())
-        writer.finish()
-
-
 def write_protobuf(file):
-    """Foxglove's protobuf: a topic of compressed pictures, one of raw pictures, a number, and a type of no picture."""
+    """Foxglove's protobuf: a topic of compressed pictures, and one of a number."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
     stamp = descriptor_pb2.FileDescriptorProto()
     timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
-    types = {"TYPE_BYTES": 12, "TYPE_STRING": 9, "TYPE_FIXED32": 7, "TYPE_DOUBLE": 1, "TYPE_MESSAGE": 11}
+    types = {"TYPE_BYTES": 12, "TYPE_STRING": 9, "TYPE_DOUBLE": 1, "TYPE_MESSAGE": 11}
     ours = descriptor_pb2.FileDescriptorProto(
         name="foxglove.proto", package="foxglove", dependency=[stamp.name], syntax="proto3"
     )
     for name, fields in {
         "CompressedImage": {"data": "TYPE_BYTES", "format": "TYPE_STRING"},
-        "RawImage": {"width": "TYPE_FIXED32", "height": "TYPE_FIXED32", "encoding": "TYPE_STRING",
-                     "step": "TYPE_FIXED32", "data": "TYPE_BYTES"},
         "Force": {"z": "TYPE_DOUBLE"},
-    }.items():  # fmt: skip
+    }.items():
         kind = ours.message_type.add(name=name)
         kind.field.add(
             name="timestamp", number=1, type=types["TYPE_MESSAGE"], label=1, type_name=".google.protobuf.Timestamp"
@@ -100,13 +82,11 @@ def write_protobuf(file):
     pool.Add(stamp)
     pool.Add(ours)
     content = descriptor_pb2.FileDescriptorSet(file=[stamp, ours]).SerializeToString()
-    row = bytes([0, 0, 200, 9])  # blue, green, red and a byte of padding
     with file.open("wb") as stream:
         writer = mcap.Writer(stream)
         writer.start()
         for topic, name, values in (
             ("/gel", "CompressedImage", lambda i: {"data": png(i), "format": "png"}),
-            ("/raw", "RawImage", lambda i: {"width": 1, "height": 2, "encoding": "bgr8", "step": 4, "data": row * 2}),
             ("/ft", "Force", lambda i: {"z": 1.5 * i}),
         ):
             kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
@@ -123,8 +103,7 @@ def write_protobuf(file):
 def test_images_of_a_bag_have_their_times_and_the_nearest_force(read, tmp_path, version):
     write_ros(tmp_path, version)
     values = ("force_z=/ft:wrench.force.z",)
-    with pytest.raises(UserError, match="--export"):
-        read("bags", sensor="digit", values=values)
+    refused("--export", read, "bags", sensor="digit", values=values)
     table = read("bags", sensor="digit", values=values, export=True)
     assert table["path"] == [f"run/gel.left/{i:06d}.png" for i in range(4)] and table["frame_index"] == [0, 1, 2, 3]
     assert table["time"] == [START + i * 50_000_000 for i in range(4)]  # of the header, not of the log
@@ -134,47 +113,34 @@ def test_images_of_a_bag_have_their_times_and_the_nearest_force(read, tmp_path, 
 
 
 def test_json_in_mcap_is_read_and_topics_are_chosen(read, tmp_path):
-    write_mcap(tmp_path / "run.mcap")
+    forces = ("/force", "force", [(i / 30, {"f": [0, i]}) for i in range(4)])
+    write_topics(tmp_path / "run.mcap", [GEL, ("/other", GEL[1], GEL[2]), forces])
     table = read("bags", sensor="digit", keys=("/gel",), values=("f=/force:f[1]",), export=True)
-    assert table["time"] == [7 * 10**9 + i for i in range(3)] and table["label.f"] == [0, 1, 2]
-    assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 1, 2]
-    with pytest.raises(UserError, match="without images"):
-        read("bags", sensor="digit", keys=("/other",), export=True)
+    assert table["time"] == [round((1000 + i / 30) * 1e9) for i in range(4)] and table["label.f"] == [0, 1, 2, 3]
+    assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 10, 20, 30]
+    refused("without images", read, "bags", sensor="digit", keys=("/none",), export=True)
     for value, words in {"f=/force": "NAME=TOPIC:FIELD", "f=/force:g": "have no g", "f=/force:f": "no number"}.items():
-        with pytest.raises(UserError, match=words):
-            read("bags", sensor="digit", values=(value,), export=True)
+        refused(words, read, "bags", sensor="digit", values=(value,), export=True)
 
 
-def test_protobuf_in_mcap_is_read(read, tmp_path):
+def test_protobuf_in_mcap_is_read_and_without_its_package_only_its_messages_are_an_error(read, tmp_path, monkeypatch):
     pytest.importorskip("mcap_protobuf")
     write_protobuf(tmp_path / "run.mcap")
     table = read("bags", sensor="digit", values=("z=/ft:z",), export=True)
-    assert [row["time"] for row in table.rows.values()] == [7 * 10**9 + i for i in range(3)] * 2
-    assert table["label.z"] == [0, 1.5, 3] * 2
-    pictures = [decode(tmp_path / path) for path in table["path"]]
-    assert [picture[0, 0, 0] for picture in pictures[:3]] == [0, 1, 2]
-    assert pictures[3].tolist() == [[[200, 0, 0]]] * 2
-
-
-def test_without_the_package_for_protobuf_only_its_messages_are_an_error(read, tmp_path, monkeypatch):
-    write_mcap(tmp_path / "plain.mcap")
-    write_protobuf(tmp_path / "run.mcap")
+    assert table["time"] == [7 * 10**9 + i for i in range(3)] and table["label.z"] == [0, 1.5, 3]
+    assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 1, 2]
+    write_topics(tmp_path / "plain.mcap", [GEL])
     monkeypatch.setitem(sys.modules, "mcap_protobuf.decoder", None)
-    with pytest.raises(UserError, match=r"run\.mcap needs a package.*anytouch_jax\[bags\]"):
-        read("bags", sensor="digit", export=True)
+    refused(r"run\.mcap needs a package.*anytouch_jax\[bags\]", read, "bags", sensor="digit", export=True)
     (tmp_path / "run.mcap").unlink()
-    assert len(read("bags", sensor="digit", export=True)["path"]) == 3
+    assert len(read("bags", sensor="digit", export=True)["path"]) == 4
 
 
-def test_a_damaged_recording_is_one_sentence(read, tmp_path):
-    write_mcap(tmp_path / "run.mcap")
-    (tmp_path / "run.mcap").write_bytes((tmp_path / "run.mcap").read_bytes()[:300])
-    with pytest.raises(UserError, match="cannot be read"):
-        read("bags", sensor="digit", export=True)
-    (tmp_path / "run.mcap").unlink()
-    (tmp_path / "run.bag").write_bytes(b"nothing")
-    with pytest.raises(UserError, match="cannot be read"):
-        read("bags", sensor="digit", export=True)
+@pytest.mark.parametrize("name", ["run.mcap", "run.bag"])
+def test_a_damaged_recording_is_one_sentence(read, tmp_path, name):
+    write_topics(tmp_path / name, [GEL])
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:300])
+    refused("cannot be read", read, "bags", sensor="digit", export=True)
 
 
 def write_topics(file, topics):

@@ -57,11 +57,3 @@ def test_hash_splits_are_stable_disjoint_and_of_the_wanted_share():
     assert all(hash_split("x", name, wider) != "train" for name, split in of.items() if split != "train")
     assert {hash_split("x", f"o{k}", IndexOptions(0, 0)) for k in range(50)} == {"train"}
     assert {hash_split("x", f"o{k}", IndexOptions(0, 1)) for k in range(50)} == {"test"}
-
-
-def test_numbers_order_frames_and_folders_naturally(tmp_path):
-    fill(tmp_path, ["f10/x.png", "f9/x.png", "2.png", "10.png", "1.png", "٣.png"])
-    rows = DatasetIndex("x", tmp_path)
-    folders, files = rows.listing(".")
-    assert folders == ["f9", "f10"]
-    assert list(rows.frames("", r"([0-9]+)\.png", files).values()) == ["1.png", "2.png", "10.png"]

@@ -2,7 +2,6 @@ import io
 import json
 import tarfile
 
-import fsspec
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
@@ -54,21 +53,6 @@ def test_rows_stay_in_their_shards_with_the_licence_of_their_source(corpus):
     assert licences["gelslam"] == ("MIT", True) and licences["sparsh_force"] == ("CC-BY-NC-4.0", False)
     assert licences["mystery"] == ("not stated", False) and "unknown source" in " ".join(report.skipped)
     assert rows[0]["label.markered"] == 1
-
-
-def test_shards_in_an_object_store_are_indexed_by_their_metadata(corpus, tmp_path, monkeypatch):
-    system, here = fsspec.filesystem("memory"), tmp_path / "here"
-    system.put(str(corpus), "/far", recursive=True)
-    here.mkdir()
-    monkeypatch.setenv("ANYTOUCH_CACHE", str(tmp_path / "cache"))
-    try:
-        report, rows = table_of(here, "gelsight_mini_pretrain", url="memory://far/")
-        _, near = table_of(corpus, "gelsight_mini_pretrain")
-        assert [row["path"] for row in rows] == [f"memory://far/{row['path']}" for row in near]
-        assert not (tmp_path / "cache").exists()
-        assert decode(report.manifest.file(1))[0, 0, 0] == 11
-    finally:
-        system.rm("/far", recursive=True)
 
 
 def write_samples(file, samples):

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from films import write_film
 from reader_world import fill
+from refused import refused
 
 from anytouch_jax.data.images import decode
-from anytouch_jax.errors import UserError
 from tests.data.manifest.test_containers import png
 
 
@@ -27,8 +27,7 @@ def write_batch(folder, sensor, *, split_forces=True):
 def test_slides_of_tacbench_have_forces_and_slip(read, tmp_path):
     write_batch(tmp_path / "sphere" / "batch_1", "digit")
     write_batch(tmp_path / "flat" / "batch_1", "gelsight")
-    with pytest.raises(UserError, match="--export"):
-        read("tacbench_force")
+    refused("--export", read, "tacbench_force")
     table = read("tacbench_force", export=True)
     used = [row for row in table.rows.values() if row["split"] != "unused"]
     assert [row["split"] for row in used] == ["test"] * 4 + ["train"] * 4
@@ -50,8 +49,7 @@ class Harm:
 def test_a_pickle_that_runs_code_is_refused(read, tmp_path, capsys, content):
     write_batch(tmp_path / "sphere" / "batch_1", "digit")
     (tmp_path / "sphere" / "batch_1" / "dataset_digit_00.pkl").write_bytes(pickle.dumps(content))
-    with pytest.raises(UserError, match="no pickle of plain values"):
-        read("tacbench_force", export=True)
+    refused("no pickle of plain values", read, "tacbench_force", export=True)
     assert "harm" not in capsys.readouterr().out
 
 
@@ -95,8 +93,7 @@ def test_films_of_freetacman(read, tmp_path):
     times.write_text("".join(f"{100 + i / 30}\n" for i in range(5)))
     poses = "".join(f"{i},{0.1 * i},{40 - i},up\n" for i in range(5))
     (tmp_path / "Cast" / "Cast_1_traj.csv").write_text(f"timestamp,TCP_x,gripper_distance,note\n{poses}")
-    with pytest.raises(UserError, match="--export"):
-        read("freetacman")
+    refused("--export", read, "freetacman")
     table = read("freetacman", export=True)
     assert len(table.rows) == 5 and set(table["unit"]) == {"tactile_left"} and set(table["object"]) == {"Cast"}
     assert table["time"][4] == pytest.approx(100 + 4 / 30) and "film of another camera" in table.reasons

@@ -2,6 +2,7 @@ import os
 
 import pytest
 from reader_world import fill, fill_ycb
+from refused import refused
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import replace_column
@@ -24,10 +25,8 @@ def test_the_manifest_may_lie_above_the_data_but_not_elsewhere(tmp_path, read):
     assert next(iter(table.rows)) == "a b/ycb/real/mug/dataset_0/frames/frame_0000000.jpg"
     with pytest.raises(UserError, match=r"must lie in .* or in a folder above it"):
         index("ycb_slide", tmp_path / "a b", tmp_path / "c" / "m.parquet")
-    with pytest.raises(UserError, match=r"ends in .csv or .parquet"):
-        index("ycb_slide", tmp_path / "a b", tmp_path / "m.json")
-    with pytest.raises(UserError, match="there is no folder"):
-        index("ycb_slide", tmp_path / "nowhere")
+    refused(r"ends in .csv or .parquet", index, "ycb_slide", tmp_path / "a b", tmp_path / "m.json")
+    refused("there is no folder", index, "ycb_slide", tmp_path / "nowhere")
 
 
 def test_a_failed_write_is_an_error_and_leaves_the_old_file(tmp_path, monkeypatch):
@@ -46,8 +45,7 @@ def test_folders_that_lead_elsewhere_are_refused(tmp_path):
     (tmp_path / "root" / "real").symlink_to(tmp_path / "big" / "real")
     (tmp_path / "root" / "ssvtp" / "images_rgb").symlink_to(tmp_path / "images_rgb")  # of photographs
     for name, folder in (("ycb_slide", "frames"), ("ssvtp", "images_rgb")):
-        with pytest.raises(UserError, match=f"{folder} leads out of"):
-            index(name, tmp_path / "root")
+        refused(f"{folder} leads out of", index, name, tmp_path / "root")
     assert not list((tmp_path / "root").glob("*.parquet"))
 
 
@@ -68,8 +66,7 @@ EMPTY = "visgel cloth objectfolder_real ycb_slide octopi tacquad tvl ssvtp feel 
 )
 def test_a_renamed_or_empty_folder_is_an_error(tmp_path, read, name, renamed, says):
     fill(tmp_path, [renamed] if renamed else [])
-    with pytest.raises(UserError, match=says):
-        read(name)
+    refused(says, read, name)
 
 
 @pytest.fixture
@@ -94,8 +91,7 @@ def test_an_edited_manifest_is_not_replaced_without_keep(tmp_path, read, edited,
     before = out.read_bytes()
     options = IndexOptions(sensor="digit", val=0, test=0)
     says = rf"hand{ending} has other values of split \(3 rows\), label.material, which index does not write: .*--keep"
-    with pytest.raises(UserError, match=says):
-        index("recordings", tmp_path, out, options=options)
+    refused(says, index, "recordings", tmp_path, out, options=options)
     assert out.read_bytes() == before
     fill(tmp_path, ["mug/3.png", "mug/more/0.png", "cup/0.png"])
     (tmp_path / "ball" / "2.png").unlink()
@@ -116,5 +112,4 @@ def test_what_index_wrote_itself_is_replaced(tmp_path, read):
         fill(tmp_path, ["cup/0.png"])
         assert "cup/0.png" in read("recordings", out=out, sensor="digit", val=0, test=0).rows
     assert set(read("recordings", out=out, sensor="digit", val=0, test=1)["split"]) == {"test"}  # Parquet tells
-    with pytest.raises(UserError, match="other values of split"):
-        read("recordings", out=tmp_path / "a.csv", sensor="digit", val=0, test=1)
+    refused("other values of split", read, "recordings", out=tmp_path / "a.csv", sensor="digit", val=0, test=1)

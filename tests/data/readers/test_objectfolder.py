@@ -2,8 +2,7 @@ import json
 
 import pytest
 from reader_world import fill
-
-from anytouch_jax.errors import UserError
+from refused import refused
 
 
 def test_objectfolder_has_two_sensors_and_published_splits(tmp_path, read):
@@ -21,14 +20,11 @@ def test_objectfolder_has_two_sensors_and_published_splits(tmp_path, read):
     assert table.reasons["id that does not belong to obj2.0/touch (1.0 ends at 100)"] == 1
     assert table.reasons["picture of split.json that is not on disk"] == 1
     (tmp_path / "obj2.0/split.json").write_text(json.dumps({"train": [["1", 0]], "test": [["1", 0]]}))
-    with pytest.raises(UserError, match=r"split.json: \(1, 0\) is in train and in test"):
-        read("objectfolder")
+    refused(r"split.json: \(1, 0\) is in train and in test", read, "objectfolder")
     (tmp_path / "obj2.0/split.json").write_text(json.dumps({"train": ["1"]}))
-    with pytest.raises(UserError, match="is not as expected"):
-        read("objectfolder")
+    refused("is not as expected", read, "objectfolder")
     (tmp_path / "obj2.0/split.json").unlink()
-    with pytest.raises(UserError, match=r"expected split.json in"):
-        read("objectfolder")
+    refused(r"expected split.json in", read, "objectfolder")
 
 
 @pytest.mark.parametrize("layout", ["tactile/{}/tactile_data/{}/0/gelsight", "{}/tactile_data/{}/0/gelsight"])

@@ -1,11 +1,10 @@
 import numpy as np
-import pytest
 from reader_world import fill
+from refused import refused
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.readers import index
-from anytouch_jax.errors import UserError
 
 
 def test_real_touch_is_checked_and_rewritten(tmp_path, read):
@@ -19,11 +18,9 @@ def test_real_touch_is_checked_and_rewritten(tmp_path, read):
     assert table.rows["a/1.png"]["background_path"] == "a/bg.png"
     lost = {"file of the manifest that is not on disk": 1, "image_path that is not on disk (kept without)": 2}
     assert table.reasons == lost
-    with pytest.raises(UserError, match="the pack's own manifest"):
-        index("real_touch", tmp_path, tmp_path / "manifest.csv")
+    refused("the pack's own manifest", index, "real_touch", tmp_path, tmp_path / "manifest.csv")
     (tmp_path / "manifest.csv").write_text(head + lines[0] + lines[0])
-    with pytest.raises(UserError, match="repeats frame_index 0"):
-        read("real_touch")
+    refused("repeats frame_index 0", read, "real_touch")
 
 
 def test_taxim_presses_become_pictures(tmp_path, read):
@@ -42,5 +39,4 @@ def test_taxim_presses_become_pictures(tmp_path, read):
     assert decode(manifests.read(table.report.out).file(3))[0, 0].tolist() == [0, 0, 3]
     assert table.reasons == {"sensor without dataPack.npz": 1}
     (calib / "gelsight/dataPack.npz").write_bytes(b"broken")
-    with pytest.raises(UserError, match=r"dataPack.npz is not a calibration pack"):
-        read("taxim_presses", root, lists=calib)
+    refused(r"dataPack.npz is not a calibration pack", read, "taxim_presses", root, lists=calib)

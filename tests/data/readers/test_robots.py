@@ -1,9 +1,7 @@
 import json
 
-import pytest
 from reader_world import fill
-
-from anytouch_jax.errors import UserError
+from refused import refused
 
 
 def test_ycb_slide_clips_take_every_third_frame(tmp_path, read):
@@ -74,8 +72,7 @@ def test_cloth_has_its_properties(tmp_path, read):
     assert table.reasons["video that is not unpacked (expected gelsight_frame/0000.png)"] == 1
     for wrong in ([1, 2], [None] * 11, [1.5] * 11, "eleven"):
         (tmp_path / "Data_ICRA18/cloth_metadata.json").write_text(json.dumps({"11": wrong}))
-        with pytest.raises(UserError, match="cloth '11' must have 11 whole numbers"):
-            read("cloth")
+        refused("cloth '11' must have 11 whole numbers", read, "cloth")
 
 
 def test_octopi_follows_its_sample_files(tmp_path, read):
@@ -93,8 +90,7 @@ def test_octopi_follows_its_sample_files(tmp_path, read):
     assert (row["split"], row["object"], row["sensor"]) == ("test", "tea_towel", "gelsight_mini")
     assert len(table.clips(3)) == 4  # frames with gaps: only 0, 1, 2 of each sample
     (tmp_path / "processed/val_samples.json").write_text(json.dumps({"x": [samples[0]]}))
-    with pytest.raises(UserError, match=f"{samples[0]} is in train and in val"):
-        read("octopi")
+    refused(f"{samples[0]} is in train and in val", read, "octopi")
 
 
 def test_octopi_without_sample_files_splits_by_object(tmp_path, read):

@@ -1,7 +1,6 @@
 import pytest
 from reader_world import fill
-
-from anytouch_jax.errors import UserError
+from refused import refused
 
 VIDEO = "20220601_182052"
 
@@ -102,10 +101,8 @@ def test_lists_may_be_elsewhere(tmp_path, read):
     _list(lists, "train.txt", [(14, 3)])
     _list(lists, "test.txt", [(20, 3)])
     assert len(read("touch_and_go", root, lists=lists).rows) == 2
-    with pytest.raises(UserError, match=r"expected the list train.txt in .*fredfyyang/Touch-and-Go"):
-        read("touch_and_go", root)
-    with pytest.raises(UserError, match=r"expected dataset/.*is ROOT the folder that holds 'dataset'"):
-        read("touch_and_go", root / "dataset")
+    refused(r"expected the list train.txt in .*fredfyyang/Touch-and-Go", read, "touch_and_go", root)
+    refused(r"expected dataset/.*is ROOT the folder that holds 'dataset'", read, "touch_and_go", root / "dataset")
 
 
 @pytest.mark.parametrize(
@@ -120,8 +117,7 @@ def test_broken_lists_name_the_line(tmp_path, read, name, line, says):
     _both(tmp_path)
     with (tmp_path / name).open("a") as file:
         file.write(line + "\n")
-    with pytest.raises(UserError, match=says):
-        read("touch_and_go")
+    refused(says, read, "touch_and_go")
 
 
 def test_frames_of_a_touch_that_is_tested_are_not_trained_on(tmp_path, read):

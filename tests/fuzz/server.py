@@ -3,7 +3,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 from chat_server import GOOD, chat, serve
 
 from anytouch_jax.data.manifest import manifest as manifests
@@ -84,13 +83,8 @@ def make(rng, folder: Path, things) -> Case:
         with serve(lambda number, body: answer) as server:
             return main([*words, "--sheet", str(folder / "s.html"), "--url", server.url])
 
-    def check(_):
+    def check():
         text = manifests.read(folder / "m_captions.csv").column("text").to_pylist()[0]
         return None if isinstance(text, str) and 10 < len(text) < 1000 else f"caption {text!r}"
 
     return Case(name, ask, False, check)
-
-
-@pytest.mark.parametrize("count", [8, pytest.param(0.04, marks=pytest.mark.slow)])
-def test_odd_answers(survives, count):
-    survives(make, count)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from anytouch_jax.weights.safetensors import read_safetensors
 from tests.fuzz.harness import Case, cut, flipped, pick
@@ -67,37 +66,6 @@ def header(rng, arrays, metadata):
 
     length = int(pick(rng, (0, 1, 7, 1 << 40, (1 << 64) - 1))) if kind == "length" else None
     return f"header: {kind} of {name}", safetensors(arrays, metadata, edit, length), "safetensors", True, True
-
-
-def own_metadata(rng, arrays, metadata):
-    """The description of the network, in the metadata of our files."""
-    key = "anytouch_jax.model"
-    model = json.loads(metadata[key])
-    field = pick(rng, model)
-    values = (None, -1, 0, 1.5, "x", [], {}, 10**10, True, [1] * 1000, 10**30, "y" * 100_000, [{"a": 1}], 7)
-    value = pick(rng, [value for value in values if value != model[field] and type(value) is not type(model[field])])
-    model[field] = value
-    text = json.dumps(model)
-    kind = pick(rng, ("field",) * 4 + ("gone", "cut", "deep", "digits", "NaN", "empty", "seen", "background"))
-    edit = {
-        "gone": None, "cut": text[: len(text) // 2], "deep": "[" * 100_000, "digits": "5" * 5000,
-        "NaN": '{"patch": NaN}', "empty": "",
-    }.get(kind, text)  # fmt: skip
-    changed = {name: value for name, value in metadata.items() if name != key or edit is not None}
-    if kind == "seen":
-        changed |= {"anytouch_jax.seen": pick(rng, ("", "nothing", ",,,", "a" * 100_000, "digit,digit"))}
-    elif kind == "background":
-        changed |= {"anytouch_jax.background": pick(rng, ("", "no", "x" * 100_000))}
-    elif edit is not None:
-        changed[key] = edit
-    fine = ("gone", "seen") + (
-        ("field",) if field in ("image", "text", "frames", "dtype", "attention", "lora_rank", "lora_alpha") else ()
-    )
-    # None may be the default of a field.
-    return (
-        f"metadata: {kind} {field}={str(value)[:12]}", safetensors(arrays, changed), "safetensors", False,
-        kind not in (*fine, "field"),
-    )  # fmt: skip
 
 
 def not_finite(rng, arrays, metadata):
@@ -175,7 +143,7 @@ def raw_pickle(rng, arrays, metadata):
     return f"pickle machine: {kind}", data, "pth", True, True
 
 
-KINDS = (header, header, own_metadata, own_metadata, not_finite, other_arrays, other_arrays, bytes_damaged, raw_pickle)
+KINDS = (header, header, not_finite, other_arrays, other_arrays, bytes_damaged, raw_pickle)
 
 
 def make(rng, folder: Path, things) -> Case:
@@ -227,8 +195,3 @@ def shards(rng, folder: Path, things) -> Case:
     file.write_text(json.dumps(index))
     place = file if rng.random() < 0.7 else folder / files[0]
     return Case(*command(rng, f"shards: {kind}", place, folder, things, kind != "whole", kind != "whole"))
-
-
-@pytest.mark.parametrize("count", [25, pytest.param(0.14, marks=pytest.mark.slow)])
-def test_hostile_weights(survives, count):
-    survives(make, count)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 
 from tests.fuzz.harness import Case, cut, flipped, pick
 
@@ -194,8 +193,3 @@ def make(rng, folder: Path, things) -> Case:
     )
     opens = command in ("decode", "embed", "verify")
     return Case(f"{name}, {command}", commands[command], wrong or (wrong_files and opens and command != "embed"))
-
-
-@pytest.mark.parametrize("count", [25, pytest.param(0.2, marks=pytest.mark.slow)])
-def test_hostile_manifests(survives, count):
-    survives(make, count)

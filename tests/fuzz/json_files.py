@@ -1,11 +1,9 @@
 import json
 from pathlib import Path
 
-import pytest
-
 from anytouch_jax.weights.safetensors import read_safetensors
 from tests.fuzz.harness import Case, cut, flipped, pick
-from tests.fuzz.test_weights import safetensors
+from tests.fuzz.weights import safetensors
 
 MARK = "<<value>>"
 BAD = (
@@ -80,8 +78,3 @@ def make(rng, folder: Path, things) -> Case:
     (folder / file).write_bytes(data)
     # The folder of `simulate` holds another data set in any case.
     return Case(f"{kind}: {name}", words, kind == "simulate" or (bad and kind not in ("pack", "answers")))
-
-
-@pytest.mark.parametrize("count", [30, pytest.param(0.08, marks=pytest.mark.slow)])
-def test_hostile_json(survives, count):
-    survives(make, count)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from anytouch_jax.weights.convert import KEYMAPS
 from anytouch_jax.weights.safetensors import read_safetensors
@@ -128,8 +127,3 @@ def make(rng, folder: Path, things) -> Case:
     if kind == "features" and at == 0:
         wrong = wrong and not name.startswith(("rows", "features has", "features of"))  # info shows what there is
     return Case(f"{kind}: {name}", words, wrong)
-
-
-@pytest.mark.parametrize("count", [40, pytest.param(0.14, marks=pytest.mark.slow)])
-def test_hostile_arrays(survives, count):
-    survives(make, count)

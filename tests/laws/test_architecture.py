@@ -32,7 +32,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "weights": {"nn", "config", "files", "errors", "shown"},
     "data": {"config", "batch", "files", "errors", "bars", "shown"},
     "sim": {"data.manifest", "data.tokenizer", "config", "files", "errors"},
-    "train": {"batch", "config", "weights", "files", "errors", "shown"},
+    # ops: sums of squares for the norms of gradients and parameters
+    "train": {"batch", "config", "weights", "ops", "files", "errors", "shown"},
     # ops: unit-norm embeddings, and the contrast that fits a new sensor's tokens
     "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "files", "errors", "bars", "shown"},
     # a simulator of a user's sensor, and tokens of an encoder that are trained on it

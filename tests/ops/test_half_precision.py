@@ -11,10 +11,6 @@ SOME, OTHERS = np.arange(8) % 3 > 0, np.arange(8) % 3 == 0
 WEIGHTS = (0.5, 0.25, 0.1)
 
 
-def reconstruct(pred, target):
-    return losses.reconstruction_loss(pred, target, HIDDEN, next_frame=True)[0]
-
-
 def align(has_image, has_text, center=False):
     return lambda *z: losses.alignment_loss(*z, has_image, has_text, jnp.float32(14.0), WEIGHTS, center=center)[0]
 
@@ -39,7 +35,9 @@ def unit(*shape):
 
 
 CASES = {
-    "reconstruction": (reconstruct, [draw(2, 4, 3, 12), draw(2, 4, 3, 12)]),
+    "reconstruction": (
+        lambda *x: losses.reconstruction_loss(*x, HIDDEN, next_frame=True)[0], [draw(2, 4, 3, 12), draw(2, 4, 3, 12)],
+    ),
     "normalised patches, one constant": (losses.normalise_patches, [constant(draw(2, 3, 2, 12))]),
     "normalised vectors, one zero": (losses.normalise, [zero(draw(4, 6))]),
     "matching": (losses.matching_loss, [np.array([1e4, -1e4, 0.3]), np.array([-1e4, 1e4, 0.7])]),
@@ -47,7 +45,7 @@ CASES = {
     "alignment, centered": (align(SOME, np.arange(8) < 6, center=True), [unit(8, 16) for _ in range(3)]),
     "alignment of disjoint sets": (align(SOME, OTHERS), [unit(8, 16) for _ in range(3)]),
     "centered": (lambda x: losses.centered(x, SOME), [draw(8, 16)]),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CASES)

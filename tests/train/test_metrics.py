@@ -4,7 +4,6 @@ import functools
 import json
 import re
 import resource
-import signal
 
 import numpy as np
 import pytest
@@ -53,16 +52,14 @@ def test_a_full_disk_is_one_sentence(tmp_path):
     record = Record(tmp_path, 0)
     record.write(0, {"loss": 1.0, "skipped": 0.0})
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (record.path.stat().st_size + 10, limit[1]))
         with pytest.raises(UserError, match=r"^cannot write .*metrics\.jsonl: .*run the same command again"):
             record.write(1, {"loss": 1.0, "skipped": 0.0})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-        signal.signal(signal.SIGXFSZ, handler)
         record.close()
-    assert [row["step"] for row in [json.loads(record.path.read_text().splitlines()[0])]] == [0]
+    assert json.loads(record.path.read_text().splitlines()[0])["step"] == 0
 
 
 def begun(run):

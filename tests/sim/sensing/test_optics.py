@@ -25,14 +25,10 @@ def draw(displacement, tangential, unit, key, shadow=True):
     return optics.render(displacement, tangential, PITCH, SLIM, unit, key, resolution=SIZE, photometry=model)
 
 
-def grid():
-    y, x = (np.arange(n) - (n - 1) / 2 for n in GRID)
-    return jnp.asarray(x * PITCH)[None, :], jnp.asarray(y * PITCH)[:, None]
-
-
 def bump(x=0.0, y=0.0, height=0.8, width=1.5):
-    gx, gy = grid()
-    return (height * jnp.exp(-((gx - x) ** 2 + (gy - y) ** 2) / (2 * width**2))).astype(jnp.float32)
+    down, across = ((np.arange(n) - (n - 1) / 2) * PITCH for n in GRID)
+    away = (across[None, :] - x) ** 2 + (down[:, None] - y) ** 2
+    return jnp.asarray(height * np.exp(-away / (2 * width**2)), jnp.float32)
 
 
 STILL = jnp.zeros((*GRID, 2))

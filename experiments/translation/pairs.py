@@ -11,10 +11,9 @@ import numpy as np
 
 from anytouch_jax.config import FIELD_SENSORS, Config, DataConfig, preset
 from anytouch_jax.data.loading.samples import SampleReader
-from anytouch_jax.data.manifest.files import read_file
+from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.manifest import Manifest, select_rows
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import read_array
 
 FIELD = (20, 20, 6)  # points of a Tac3D; displacement x, y, z mm, force x, y, z N
 _THREADS = 2
@@ -140,7 +139,7 @@ def read_fields(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
             raise UserError(f"{manifest.where(row)} has no field_path; regression needs its field (.npy)")
         file = manifest.file(row, "field_path")
         try:
-            field = read_array(read_file(file))
+            field = unpack_npy(read_file(file))
         except (OSError, ValueError) as error:
             raise UserError(f"{manifest.where(row)}, column 'field_path': {file} cannot be read: {error}") from None
         if field.shape != FIELD or not np.isfinite(field).all():

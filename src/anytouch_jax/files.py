@@ -1,11 +1,10 @@
-"""Atomic writes, file locks, .npy and .npz files read with limits, and lines of CSV files."""
+"""Atomic writes, file locks, .npz files read with limits, and lines of CSV files."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import errno
-import io
 import math
 import os
 import shutil
@@ -125,19 +124,6 @@ def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = l
         raise
     except Exception as error:  # damaged bytes raise any type of error
         raise ValueError(f"it is damaged or not an .npz file ({type(error).__name__}: {str(error)[:200]})") from error
-
-
-def read_array(data: bytes) -> np.ndarray:
-    """Return the array of the bytes of an .npy file. Raises ValueError for pickled objects and for any other file."""
-    import numpy as np
-
-    try:
-        _check_header(io.BytesIO(data), len(data), "data")
-        return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    except ValueError:
-        raise
-    except Exception as error:  # damaged bytes raise any type of error
-        raise ValueError(f"it is damaged or not an .npy file ({type(error).__name__}: {str(error)[:200]})") from error
 
 
 def _check_header(file: IO[bytes], file_size: int, name: str) -> np.ndarray:

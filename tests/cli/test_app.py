@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -45,6 +46,9 @@ def test_every_help_has_an_example_and_imports_nothing_heavy(tmp_path):
         group, _, last = name.rpartition(" ")
         assert f"\n  {name} " in pages[""] and (not group or f"\n  {last} " in pages[group].replace(f"{group} ", ""))
         assert f"\nExample: anytouch {name} " in pages[name] and "--help" in pages[name]
+        for option in re.split(r"\n\s*(?=--[\w-]+[ ,])", re.sub("[╭╮╰╯─│]", "", pages[name]))[1:]:
+            words = re.sub(r"--[\w-]+|\{[^}]*\}|\((default|required)[^)]*\)", "", option)
+            assert re.search("[a-z]{3}", words), f"{name} does not explain {option[:60]}"
     for group in GROUPS:
         assert "Example: anytouch" in pages[group]
 

@@ -12,7 +12,7 @@ from checked_world import edit
 from gel_pictures import press
 from reader_world import fill
 
-from anytouch_jax.cli.index import DatasetOptions
+from anytouch_jax.cli.data import DatasetOptions
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import close_shards

@@ -13,7 +13,7 @@ PACKAGE = "anytouch_jax"
 ROOT = ROOT / "src" / PACKAGE
 MODULE_LINES, MODULE_NAMES = 600, 15
 # The design allows 31,000 lines and 160 files. These limits may only fall.
-PACKAGE_LINES, PACKAGE_FILES, EVALUATE_LINES = 36_190, 170, 3_570
+PACKAGE_LINES, PACKAGE_FILES, EVALUATE_LINES = 35_100, 150, 3_570
 # Names that every file of a room has, by convention: a command runs, a reader reads.
 BY_CONVENTION = {("cli", "run"), ("data.readers", "read"), ("data.readers", "READER")}
 

@@ -6,8 +6,7 @@ import pytest
 from tiny_models import compiled, full_model, touch_model
 
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights.compatible import serve_unseen
-from anytouch_jax.weights.convert import to_release
+from anytouch_jax.weights.convert import serve_unseen, to_release
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten

@@ -20,8 +20,7 @@ from weights_world import (
 from anytouch_jax.config import SENSORS, UNIVERSAL, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights.compatible import resize_position
-from anytouch_jax.weights.convert import to_params, to_release
+from anytouch_jax.weights.convert import resize_position, to_params, to_release
 from anytouch_jax.weights.load import first_params, load_init, load_model, read_weights
 from anytouch_jax.weights.safetensors import MODEL_KEY, export_safetensors, write_safetensors
 from tests.weights.conftest import tensor

@@ -16,26 +16,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from anytouch_jax import __version__
-from anytouch_jax.cli import (
-    adapt,
-    annotate,
-    contact,
-    embed,
-    export,
-    index,
-    info,
-    measure,
-    pack,
-    probe,
-    report,
-    retrieve,
-    sensor,
-    simulate,
-    stream,
-    train,
-    verify,
-    view,
-)
+from anytouch_jax.cli import data, embed, export, info, measure, probe, retrieve, sensor, stream, train
 from anytouch_jax.cli.arguments import RENAMED, parse_options
 from anytouch_jax.errors import CheckError, UserError, shorten
 
@@ -59,26 +40,26 @@ GROUPS = {
     "probe": "Probe frozen features with simple heads.",
 }
 COMMANDS = {
-    "data simulate": Command(simulate.SimulateOptions, simulate.run),
-    "data index": Command(index.DatasetOptions, index.run),
-    "data contact": Command(contact.ContactOptions, contact.run),
-    "data verify": Command(verify.VerifyOptions, verify.run),
-    "data annotate": Command(annotate.AnnotateOptions, annotate.run),
-    "data pack": Command(pack.PackOptions, pack.run),
+    "data simulate": Command(data.SimulateOptions, data.run_simulate),
+    "data index": Command(data.DatasetOptions, data.run_index),
+    "data contact": Command(data.ContactOptions, data.run_contact),
+    "data verify": Command(data.VerifyOptions, data.run_verify),
+    "data annotate": Command(data.AnnotateOptions, data.run_annotate),
+    "data pack": Command(data.PackOptions, data.run_pack),
     "train": Command(train.TrainOptions, train.run, train.parse),
     "embed": Command(embed.EmbedOptions, embed.run),
     "measure": Command(measure.MeasureOptions, measure.run),
-    "stream": Command(stream.StreamOptions, stream.run),
+    "stream": Command(stream.StreamOptions, stream.run_stream),
     "probe label": Command(probe.LabelOptions, probe.run_label),
     "probe tasks": Command(probe.TasksOptions, probe.run_tasks),
     "probe benchmark": Command(probe.BenchmarkOptions, probe.run_benchmark),
-    "retrieve": Command(retrieve.RetrieveOptions, retrieve.run),
-    "sensor fit": Command(sensor.FitOptions, sensor.run),
-    "report": Command(report.ReportOptions, report.run),
-    "adapt": Command(adapt.AdaptOptions, adapt.run),
+    "retrieve": Command(retrieve.RetrieveOptions, retrieve.run_retrieve),
+    "sensor fit": Command(sensor.FitOptions, sensor.run_fit),
+    "report": Command(retrieve.ReportOptions, retrieve.run_report),
+    "adapt": Command(sensor.AdaptOptions, sensor.run_adapt),
     "export": Command(export.ExportOptions, export.run),
     "info": Command(info.InfoOptions, info.run),
-    "view": Command(view.ViewOptions, view.run),
+    "view": Command(stream.ViewOptions, stream.run_view),
 }
 
 
@@ -116,10 +97,7 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def guarded(program: str, run: Callable[[], int]) -> int:
-    """Call `run` and return its exit status; `program` begins the one sentence that reports an error.
-
-    A programming error keeps its traceback.
-    """
+    """Call `run` and return its exit status. `program` begins the sentence of an error; a bug keeps its traceback."""
     status = 2
     try:
         with warnings.catch_warnings():

@@ -21,29 +21,14 @@ DEFAULT = "anytouch-tiny"  # the encoder of commands without --model; `weights.r
 
 # Old names of commands, and of options: each applies to a command without an option of the old name.
 RENAMED = {
-    "simulate": "anytouch data simulate",
-    "index": "anytouch data index",
-    "contact": "anytouch data contact",
-    "verify": "anytouch data verify",
-    "annotate": "anytouch data annotate",
-    "pack": "anytouch data pack",
+    **{name: f"anytouch data {name}" for name in ("simulate", "index", "contact", "verify", "annotate", "pack")},
     "convert": "anytouch export --to safetensors, or --to release",
-    "pour": "make pouring",
-    "translate": "make translation",
-    "bench": "make bench",
-    "parity": "make parity",
-    "--run": "--model",
-    "--input": "--data",
-    "--stream": "the command `anytouch stream`",
-    "--clip": "--clip-weights",
-    "--tasks": "the command `anytouch probe tasks`",
-    "--benchmark": "the command `anytouch probe benchmark`",
-    "--names": "--to safetensors or --to release",
-    "--loader": "--data",
-    "--loop": "--run",
-    "--optim.clip-norm": "--optim.grad-clip",
-    "--objective.centre": "--objective.center-embeddings",
-}
+    "pour": "make pouring", "translate": "make translation", "bench": "make bench", "parity": "make parity",
+    "--run": "--model", "--input": "--data", "--clip": "--clip-weights", "--loader": "--data", "--loop": "--run",
+    "--stream": "the command `anytouch stream`", "--tasks": "the command `anytouch probe tasks`",
+    "--benchmark": "the command `anytouch probe benchmark`", "--names": "--to safetensors or --to release",
+    "--optim.clip-norm": "--optim.grad-clip", "--objective.centre": "--objective.center-embeddings",
+}  # fmt: skip
 
 _TAKES = {int: "a whole number", float: "a number"}
 
@@ -68,9 +53,8 @@ def parse_options(
     kept = get_type_hints(kind, include_extras=True)
     marks = {field.name: (hint, *[tyro.conf.DisallowNone] * (field.default is None)) for field in fields(kind)}
     hints = {name: Annotated[kept[name], *more] for name, more in marks.items()}
-    shown = type(
-        kind.__name__, (kind,), {"__doc__": kind.__doc__, "__module__": kind.__module__, "__annotations__": hints}
-    )
+    about = {"__doc__": kind.__doc__, "__module__": kind.__module__, "__annotations__": hints}
+    shown = type(kind.__name__, (kind,), about)
     extra = {} if default is None else {"default": default}
     printed = io.StringIO()
     try:
@@ -112,10 +96,7 @@ def _refuse_renamed(kind: Any, args: Sequence[str]) -> None:
 
 
 class Option(NamedTuple):
-    """An option `--name`, or a positional NAME.
-
-    Its values are of the types `kinds`, again and again if it is a list. `may_be_none` allows the word None.
-    """
+    """An option `--name`, or a positional NAME, with values of the types `kinds`, again and again if it is a list."""
 
     name: str
     kinds: tuple[Any, ...]
@@ -142,10 +123,7 @@ def option_of(arg: str) -> str:
 
 
 def options_of(kind: Any, default: Any = None, prefix: str = "") -> Iterator[Option]:
-    """Yield the options of a record of options, those of a section as section.name.
-
-    `default` is a record of defaults: a part of the network that it lacks has no options.
-    """
+    """Yield the options of a record, of a section as section.name; a part that `default` lacks has none."""
     from tyro.conf import Positional
 
     hints = get_type_hints(kind, include_extras=True)
@@ -174,10 +152,7 @@ def options_of(kind: Any, default: Any = None, prefix: str = "") -> Iterator[Opt
 def check_words(
     command: str, options: Sequence[Option], args: Sequence[str], others: Mapping[str, str] = types.MappingProxyType({})
 ) -> None:
-    """Raise UserError for words `args` that are no options, and for values that are missing or not of their type.
-
-    `others` are options that `command` has elsewhere, by the name that a user may type.
-    """
+    """Raise UserError for words `args` that are no options (`others` are elsewhere), and for values that are unfit."""
     advice = f"see anytouch {command} --help"
     named = {option.name: option for option in options if not option.is_positional}
     for option in options:
@@ -208,9 +183,8 @@ def check_words(
             room = -1 if option.is_list else len(option.kinds) - 1
         else:
             missing = next((one.name for one in options if one.is_required and one not in [g[0] for g in given]), "")
-            raise UserError(
-                f"{arg!r} belongs to no option: " + (f"did you mean {missing} {arg}?" if missing else advice)
-            )
+            guess = f"did you mean {missing} {arg}?" if missing else advice
+            raise UserError(f"{arg!r} belongs to no option: {guess}")
     for option, name, values in given:
         _check_values(option, name, values, advice)
     present = [option for option, _, _ in given]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -29,10 +29,8 @@ if TYPE_CHECKING:
 class SensorOptions:
     """The options that embed, measure and stream share."""
 
-    model: Path = Path(DEFAULT)
-    """Encoder: a name of `anytouch info encoders`, a run folder, a weights file, or hf://user/repo."""
-    sensor: str | None = None
-    """Sensor of the frames. Without it, and for an unknown sensor, the universal tokens are used."""
+    model: Path = Path(DEFAULT)  # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
+    sensor: str | None = None  # Sensor of the frames. Without it, or if it is unknown, the universal tokens are used.
     background: Path | None = None  # Picture of the untouched gel: it is subtracted, and decides contact.
     rotate: Literal[0, 90, 180, 270] = 0  # Turn the frames clockwise by so many degrees, before anything else.
     flip: Literal["none", "across", "down"] = "none"
@@ -77,19 +75,9 @@ def run(options: EmbedOptions) -> int:
     """Write the features as .npz."""
     from anytouch_jax.encoder.arrays import spread_lines
 
-    data = options.data[0]
-    is_manifest = all(path.suffix.lower() in (".csv", ".parquet") for path in options.data)
-    if is_manifest:
-        per_row = ("sensor", "background", "rotate", "flip")
-        refuse_unused(options, per_row, "with a manifest, whose rows name their sensor and background")
-    elif len(options.data) != 1:
-        raise UserError(f"--data takes several manifests, or one folder or video, not {len(options.data)} paths")
-    elif not data.exists():
-        raise UserError(f"there is no manifest, folder or video at {data}. Give another path with --data.")
-    else:
-        refuse_unused(options, ("split", "column"), "with a folder or a video, which has no splits and no columns")
-        if data.is_file():
-            refuse_unused(options, ("on_bad_sample",), "with a video, which cannot be read after a bad frame")
+    data, is_manifest = options.data[0], takes_manifest(options, options.data, ("split", "column"))
+    if data.is_file() and not is_manifest:
+        refuse_unused(options, ("on_bad_sample",), "with a video, which cannot be read after a bad frame")
     check_folder(options.out, read=(options.model, *options.data), suffix=".npz")
     encoder, pooling, head = load_inputs(options)
     about: dict[str, str] = {}
@@ -109,6 +97,20 @@ def run(options: EmbedOptions) -> int:
     skipped = f", {features.skipped} skipped" if features.skipped else ""
     print(f"{options.out}: {len(features.values)} features of {features.values.shape[1]} values{skipped}")
     return 0
+
+
+def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequence[str]) -> bool:
+    """Return whether --data names manifests; else it is one folder, picture or video. Raises UserError."""
+    if all(path.suffix.lower() in (".csv", ".parquet") for path in data):
+        per_row = ("sensor", "background", "rotate", "flip")
+        refuse_unused(options, per_row, "with a manifest, whose rows name their sensor and background")
+        return True
+    if len(data) != 1:
+        raise UserError(f"--data takes several manifests, or one folder or video, not {len(data)} paths")
+    if not data[0].exists():
+        raise UserError(f"there is no manifest, folder or video at {data[0]}. Give another path with --data.")
+    refuse_unused(options, of_rows, "with a folder or a video, which has no splits and no columns")
+    return False
 
 
 def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean", "both"], LinearHead | None]:
@@ -164,10 +166,7 @@ def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
 def frames_input(
     encoder: Encoder, options: SensorOptions, data: Path, known: Mapping[str, np.ndarray]
 ) -> tuple[int, Preprocess, ContactGate, dict[str, str]]:
-    """Return the sensor's row, preprocessing, contact gate and metadata of the frames of a folder, video or camera.
-
-    `known` are the pictures of the untouched gel that a head was fitted with. What is subtracted is logged.
-    """
+    """Return sensor row, preprocessing, gate and metadata of frames, with a head's `known` gels. It logs the gel."""
     from anytouch_jax.data.gels import as_taken
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.linear_head import ContactGate
@@ -226,11 +225,9 @@ def _some_frames(data: Path) -> Iterator[np.ndarray]:
     from anytouch_jax.data import images
     from anytouch_jax.data.gels import FRAMES
 
-    is_picture = data.is_file() and data.suffix.lower() in images.SUFFIXES
-    if not data.is_dir() and not is_picture:
+    if (files := images.picture_files(data)) is None:
         yield from images.frames_from_video(data)
         return
-    files = [data] if is_picture else images.list_images(data)[0]
     for file in files[:: -(-len(files) // FRAMES)]:
         with suppress(images.ImageError):
             yield images.decode(file)
@@ -241,10 +238,9 @@ def gels_of(preprocess: Preprocess, options: FrameOptions) -> dict[str, np.ndarr
     from anytouch_jax.data.gels import reduced
     from anytouch_jax.data.transforms import orient_frame
 
-    gel = preprocess.background
-    return (
-        {} if gel is None else {options.sensor or UNIVERSAL: reduced(orient_frame(gel, options.rotate, options.flip))}
-    )
+    if (gel := preprocess.background) is None:
+        return {}
+    return {options.sensor or UNIVERSAL: reduced(orient_frame(gel, options.rotate, options.flip))}
 
 
 def log_universal(encoder: Encoder, options: SensorOptions) -> None:
@@ -340,6 +336,7 @@ def _embed_frames(
     """Embed every clip of consecutive frames of a folder or a video, keyed by its last frame."""
     import numpy as np
 
+    from anytouch_jax.data.images import count_frames
     from anytouch_jax.encoder.embed import embed_frames
 
     data, times, contact = options.data[0], list[float](), list[float]()
@@ -350,7 +347,7 @@ def _embed_frames(
             yield number, name, frame
 
     features = embed_frames(
-        encoder, tracked(frames(), "frames embedded", frame_count(data)), row, preprocess, length=options.frames,
+        encoder, tracked(frames(), "frames embedded", count_frames(data)), row, preprocess, length=options.frames,
         pooling=pooling, join=options.join, batch=options.batch,
     )  # fmt: skip
     features.predictions["contact"] = np.asarray(contact)[features.rows]
@@ -358,15 +355,6 @@ def _embed_frames(
         log_if_cut(data, len(times))
         features.keys["time"] = np.asarray(times)[features.rows]
     return features
-
-
-def frame_count(data: Path) -> int:
-    """Return the number of frames of a folder or a video, known before reading."""
-    from anytouch_jax.data import images
-
-    if data.suffix.lower() in images.SUFFIXES and data.is_file():
-        return 1
-    return len(images.list_images(data)[0]) if data.is_dir() else images.count_frames(data)
 
 
 def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[tuple[int, str, np.ndarray | None]]:
@@ -379,7 +367,7 @@ def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Itera
     from anytouch_jax.data.loading.samples import NAMED
     from anytouch_jax.data.names import frame_numbers, split_series
 
-    if data.suffix.lower() in images.SUFFIXES and data.is_file():
+    if not data.is_dir() and images.picture_files(data):
         yield 0, data.name, images.decode(data)
         return
     if not data.is_dir():

@@ -52,8 +52,7 @@ class ExportOptions:
     join: Literal["mean", "sum", "concat"] = "mean"  # jax: how the segments of a long clip are joined.
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
-    between: Path | None = None
-    """Weights: the run or file that MODEL was trained from. Writes an interpolation of the two."""
+    between: Path | None = None  # Weights: the run or file that MODEL was trained from, to interpolate between the two.
     share: Share = 0.5  # Weights: position from BETWEEN (0) to MODEL (1).
 
 
@@ -181,10 +180,10 @@ def _universal_last(params: dict[str, Any], model: ModelConfig) -> tuple[dict[st
     """Return the same model with its universal tokens in the last row, where the authors' code reads them (id -1)."""
     import numpy as np
 
-    from anytouch_jax.weights import compatible
+    from anytouch_jax.weights.convert import match_sensors
 
     if model.sensors[-1] == UNIVERSAL:
         return params, model
     names = (*(name for name in model.sensors if name != UNIVERSAL), UNIVERSAL)
-    rows = compatible.match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
+    rows = match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
     return params | {"touch": params["touch"] | {"sensor_tokens": rows}}, replace(model, sensors=names)

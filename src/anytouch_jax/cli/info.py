@@ -36,8 +36,7 @@ class InfoOptions:
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
     health: bool = False  # Check every sensor unit of a manifest, and print a verdict and what to do.
     picture: Path | None = None  # PNG with a picture and the verdict of each unit, with --health.
-    model: Path | None = None
-    """Does this encoder see contact? With --health, on rows with a contact label or background."""
+    model: Path | None = None  # Does this encoder see contact? With --health, on rows with contact or background.
 
 
 def run(options: InfoOptions) -> int:
@@ -150,11 +149,9 @@ def _pictures(path: Path) -> list[str]:
     from anytouch_jax.data.cameras import format_of
 
     use = "use it with embed and view"
-    is_picture = path.suffix.lower() in images.SUFFIXES
-    if path.is_dir() or is_picture:
-        files = [path] if is_picture else images.list_images(path)[0]
+    if (files := images.picture_files(path)) is not None:
         height, width = images.decode(files[0]).shape[:2]
-        what = "a picture" if is_picture else f"a folder of {len(files)} pictures"
+        what = f"a folder of {len(files)} pictures" if path.is_dir() else "a picture"
         return [f"{path}: {what} of {width} x {height} pixels", use]
     film = images.open_video(path)
     names = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
@@ -251,9 +248,8 @@ def _weights(path: Path, weights: Weights | None = None) -> list[str]:
     weights = load.read_weights(path) if weights is None else weights
     metadata = safetensors.read_file_metadata(path)
     layout = detect_layout(weights)
-    names = {"own": "this package's", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}.get(
-        layout, f"the authors' ({layout})"
-    )
+    known = {"own": "this package's", "clip": "HF CLIP's", "openclip": "OpenCLIP's"}
+    names = known.get(layout, f"the authors' ({layout})")
     model, unknown = load.form_of_file(path, weights)
     count = sum(array.size for array in weights.values())
     lines = [

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from anytouch_jax.bars import tracked
 from anytouch_jax.cli import embed
-from anytouch_jax.cli.output import check_apart, check_folder, log, refuse_unused
+from anytouch_jax.cli.output import check_apart, check_folder, log
 from anytouch_jax.config.parsing import Above0
 from anytouch_jax.errors import UserError
 
@@ -61,13 +61,7 @@ def run(options: MeasureOptions) -> int:
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.files import atomic_path
 
-    is_manifest = all(path.suffix.lower() in (".csv", ".parquet") for path in options.data)
-    if is_manifest:
-        refuse_unused(options, ("sensor", "background", "rotate", "flip"), "with a manifest, whose rows name theirs")
-    elif len(options.data) != 1 or not options.data[0].exists():
-        raise UserError("--data takes manifests, or one folder, picture or video that exists. Give another path.")
-    else:
-        refuse_unused(options, ("split",), "with a folder or a video, which has no splits")
+    is_manifest = embed.takes_manifest(options, options.data, ("split",))
     table, read = options.out.with_suffix(".csv"), (options.model, *options.data)
     check_folder(options.out, read=read, suffix=".npz")
     check_folder(table, read=read)
@@ -138,6 +132,7 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     import numpy as np
 
     from anytouch_jax.config import UNIVERSAL
+    from anytouch_jax.data.images import count_frames
     from anytouch_jax.data.transforms import orient_frame
 
     data, length = options.data[0], encoder.config.model.frames
@@ -145,7 +140,7 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     times, ring, last = list[float](), list[np.ndarray](), -1
     background = None if gel is None else orient_frame(gel, options.rotate, options.flip)
     for number, name, frame in tracked(
-        embed.numbered_frames(data, "error", times), "frames measured", embed.frame_count(data)
+        embed.numbered_frames(data, "error", times), "frames measured", count_frames(data)
     ):
         assert frame is not None  # an unreadable one is an error
         frame = np.ascontiguousarray(orient_frame(frame, options.rotate, options.flip))

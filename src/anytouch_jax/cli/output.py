@@ -41,10 +41,7 @@ def log_default(models: Sequence[Path]) -> None:
 
 
 def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:
-    """Raise UserError for those of the options `names` that differ from their defaults and have no effect.
-
-    `reason` ends the sentence, as in "has no effect <with a folder>".
-    """
+    """Raise UserError for those of the options `names` that were changed; `reason` ends "has no effect"."""
     defaults = {field.name: field.default for field in fields(options)}
     changed = [spelled(name) for name in names if getattr(options, name) != defaults[name]]
     if changed:
@@ -98,9 +95,8 @@ def check_folder(
         raise UserError(f"{path} must end in {suffix}. Choose another {option}.")
     try:
         if path.exists() and not path.is_file():
-            raise UserError(
-                f"{path} is {'a folder' if path.is_dir() else 'no regular file'}. Name a file with {option}."
-            )
+            kind = "a folder" if path.is_dir() else "no regular file"
+            raise UserError(f"{path} is {kind}. Name a file with {option}.")
         if path.exists() and path.resolve() in {Path(file).expanduser().resolve() for file in read}:
             raise UserError(f"{path} is a file that is read. Name another one with {option}.")
         path.parent.mkdir(parents=True, exist_ok=True)

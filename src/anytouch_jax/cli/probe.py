@@ -37,8 +37,7 @@ class LabelOptions(ProbeOptions):
     split val, or by grouped cross-validation inside train. The report is on split test.
     """
 
-    label: str = "object"
-    """Label column. The prefix "label." may be left out."""
+    label: str = "object"  # Label column. The prefix "label." may be left out.
     group: str = ""
     """Column whose values never appear in two splits (default: the first of grasp_group, object, touch, sequence that
     the manifest has and that is not the label)."""
@@ -47,8 +46,7 @@ class LabelOptions(ProbeOptions):
     where: Finite[tuple[str, float] | None] = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
     frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
-    pooling: Literal["class", "mean", "both"] = "class"
-    """Features: the class token, the mean of the patch tokens, or both."""
+    pooling: Literal["class", "mean", "both"] = "class"  # Features: class token, mean of the patch tokens, or both.
     seeds: NotNegative[int] = 5  # Bootstrap resamples of the training groups.
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says so."""
@@ -85,8 +83,7 @@ class TasksOptions(BatteryOptions):
     protocol: Literal["honest", "published"] = "honest"
     """published also reports the choice on the test split, as in the authors' code."""
     frames: Count[int | None] = None  # Frames of a touch (default: those of each task).
-    pooling: Literal["class", "mean", "both"] = "class"
-    """Features: the class token, the mean of the patch tokens, or both."""
+    pooling: Literal["class", "mean", "both"] = "class"  # Features: class token, mean of the patch tokens, or both.
     join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a clip longer than the model's are joined.
     order: Literal["right", "shuffled", "repeated"] = "right"
     """Order of the frames of a clip: as recorded, shuffled, or the last frame repeated."""

@@ -1,4 +1,4 @@
-"""`anytouch retrieve`: cross-sensor retrieval of the same touch among similar touches."""
+"""`anytouch retrieve`, cross-sensor retrieval of the same touch, and `anytouch report`, the evaluation of two runs."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from anytouch_jax.cli.arguments import DEFAULT
-from anytouch_jax.cli.output import check_folder, log, log_default, print_table, refuse_unused
+from anytouch_jax.cli.output import check_folder, check_home, log, log_default, print_table, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
-from anytouch_jax.config.parsing import Count, Range
+from anytouch_jax.config.parsing import Count, Range, Seed
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
@@ -35,9 +35,7 @@ class RetrieveOptions:
 
     data: Path | None = None  # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
     index: Path | None = None  # Features of `anytouch embed` to search in, of any sensors.
-    query: str | None = (
-        None  # What to look for in --index: a picture, a folder or video (its last clip), or a sentence.
-    )
+    query: str | None = None  # What to look for in --index: a picture, a folder or video (last clip), or a sentence.
     sensor: str | None = None  # Sensor of the query. Without it the universal tokens are used.
     background: Path | None = None  # Picture of the untouched gel of the query.
     count: Count[int] = 10  # Nearest touches to list.
@@ -45,11 +43,8 @@ class RetrieveOptions:
     model: tuple[Path, ...] = ()  # Encoders to compare: names, run folders or weights files (default: anytouch-tiny).
     split: str = "test"  # Split to retrieve in.
     frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
-    pooling: Literal["class", "mean", "both"] = "class"
-    """Features: the class token, the mean of the patch tokens, or both."""
-    gallery: Annotated[int, Range(2, math.inf, "2 or more, the touch and at least one other")] = (
-        50  # Touches in a gallery.
-    )
+    pooling: Literal["class", "mean", "both"] = "class"  # Features: class token, mean of the patch tokens, or both.
+    gallery: Annotated[int, Range(2, math.inf, "2 or more, with the touch")] = 50  # Touches in a gallery.
     by_chance: bool = False  # Draw the galleries at random, not by similarity.
     seeds: Count[int] = 5  # Galleries drawn for each query, with --by-chance.
     controls: bool = True
@@ -57,7 +52,7 @@ class RetrieveOptions:
     out: Path | None = None  # Write the results as JSON.
 
 
-def run(options: RetrieveOptions) -> int:
+def run_retrieve(options: RetrieveOptions) -> int:
     """Score cross-sensor retrieval, or search an index, print a table, and write JSON with --out."""
     if options.index is not None:
         return _search(options)
@@ -100,9 +95,8 @@ def run(options: RetrieveOptions) -> int:
     log(gels.report(rows))
     values: dict[str, Any] = {}
     for name, encoder in encoders.items():
-        kept, values[name] = embedding.embed_rows(
-            encoder, table, rows, options.frames, options.pooling, gels=gels, log=log
-        )
+        how = (options.frames, options.pooling)
+        kept, values[name] = embedding.embed_rows(encoder, table, rows, *how, gels=gels, log=log)
         if len(kept) < len(rows):
             raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest first.")
     if options.controls:
@@ -171,12 +165,10 @@ def _query(
         if pooling != "class":
             raise UserError(f"A sentence is compared with features of pooling class, not {pooling}. Embed again.")
         return encoder.encode_text(str(options.query))
-    if path.is_dir():
-        frames = [images.decode(file) for file in images.list_images(path)[0][-length:]]
-    elif path.suffix.lower() in images.SUFFIXES:
-        frames = [images.decode(path)] * length
-    else:
+    if (files := images.picture_files(path)) is None:
         frames = list(images.frames_from_video(path))[-length:]
+    else:
+        frames = [images.decode(file) for file in (files if path.is_dir() else files * length)[-length:]]
     if len(frames) < length:
         raise UserError(f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more frames.")
     preprocess = Preprocess(encoder, choose_gel(encoder, options.background, path, known)[0])
@@ -191,3 +183,33 @@ def _cells(score: Any) -> tuple[str, ...]:
     centred = "yes" if score.centred else "no"
     sizes = (str(score.gallery), str(score.queries))
     return (score.name, score.query_sensor, score.gallery_sensor, centred, *shares, *sizes)
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Report on a stage-1 and a stage-2 run: samples, losses, reconstructions, t-SNE, retrieval and probes.
+
+    Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2 runs/stage2 --out report
+    """
+
+    data: Path  # Manifest of simulated scenes, or one with the same columns.
+    stage1: Path  # Run folder of stage 1.
+    stage2: Path  # Run folder of stage 2.
+    out: Path  # Folder for report.html (one file with its pictures), report.md, report.json, figures/.
+    touches: Count[int] = 200  # Touches of the test split to use, and half as many of train and val.
+    gallery: Annotated[int, Range(2, math.inf, "2 or more")] = 50  # Touches in a retrieval gallery.
+    seed: Seed = 0  # Random seed.
+
+
+def run_report(options: ReportOptions) -> int:
+    """Write report.html, report.md, report.json and figures/."""
+    from anytouch_jax.evaluate.report import demo_report
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    check_home(options.out)
+    enable_compilation_cache()
+    demo_report(
+        options.data, options.stage1, options.stage2, options.out, log,
+        touches=options.touches, gallery_size=options.gallery, seed=options.seed,
+    )  # fmt: skip
+    return 0

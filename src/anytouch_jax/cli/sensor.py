@@ -1,4 +1,4 @@
-"""`anytouch sensor fit`: a simulator of your own sensor."""
+"""`anytouch sensor fit` and `anytouch adapt`: a simulator of your own sensor, and tokens for it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from anytouch_jax.cli.output import check_home, log
-from anytouch_jax.config.parsing import Above0
+from anytouch_jax.cli.arguments import DEFAULT
+from anytouch_jax.cli.output import check_home, log, refuse_unused
+from anytouch_jax.config import OWN_SENSOR
+from anytouch_jax.config.parsing import Above0, Count, NotNegative, Seed
+from anytouch_jax.errors import UserError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +34,7 @@ class FitOptions:
     ball_mm: Above0[float | None] = None  # All presses are of a ball of this diameter, mm. Its slopes are known.
 
 
-def run(options: FitOptions) -> int:
+def run_fit(options: FitOptions) -> int:
     """Fit a sensor and write its folder."""
     from anytouch_jax.data.images import decode, list_images, to_rgb
     from anytouch_jax.fitting.fit import check_name, fit_sensor
@@ -57,5 +60,93 @@ def run(options: FitOptions) -> int:
     print(
         f"{picture}: real pictures above simulated ones. A linear classifier knows one from the other in {share:.0%} "
         "of the cases, where 50 % is chance."
+    )
+    return 0
+
+
+@dataclass(frozen=True)
+class AdaptOptions:
+    """Make tokens for a new sensor: trained on simulated touches of it, or fitted to a few labelled frames.
+
+    Example: anytouch adapt --sensor mine.sensor --minutes 6 --out runs/mine
+
+    A sensor of `anytouch sensor fit` needs no data. Ctrl-C keeps the state, and the same command continues. Tokens
+    that find fewer simulated touches than the universal ones are not saved. With --data, tokens are fitted to --labels.
+    """
+
+    sensor: str  # Folder NAME.sensor of `anytouch sensor fit`, or a name in the column sensor of the manifest.
+    out: Path  # Run folder to write, for embed, probe and retrieve.
+    model: Path = Path(DEFAULT)  # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
+    minutes: Above0[float] = 6.0  # Minutes of training on simulated touches.
+    deep: bool = False  # Train the first blocks too, and hold the features of known sensors.
+    data: tuple[Path, ...] = ()  # Manifests with labelled frames of the sensor in split train.
+    frames: NotNegative[int] = 100
+    """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
+    labels: str | None = None  # Label column whose classes the frames are fitted to. Known sensors need examples.
+    steps: Count[int] = 200  # Steps of the fit.
+    seed: Seed = 0  # Random seed.
+
+
+def run_adapt(options: AdaptOptions) -> int:
+    """Make the tokens of a new sensor and write a run folder; 130 after Ctrl-C."""
+    from anytouch_jax.data.manifest import manifest as manifests
+    from anytouch_jax.encoder.adapt import adapt, check_empty, save
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
+    simulated = Path(options.sensor).suffix == OWN_SENSOR
+    if simulated:
+        unused = ("data", "frames", "labels", "steps")
+        refuse_unused(options, unused, f"with a sensor of {OWN_SENSOR}, which is simulated")
+    elif not options.data:
+        raise UserError(
+            f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as --sensor"
+        )
+    else:
+        refuse_unused(options, ("minutes", "deep"), "with --data, where the frames are what is fitted")
+    if not options.frames:
+        refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
+    check_empty(options.out)
+    check_home(options.out)
+    enable_compilation_cache()
+    if simulated:
+        return _simulated(options)
+    table = manifests.read([str(path) for path in options.data])
+    adapted = adapt(
+        options.model, table, options.sensor, frames=options.frames, labels=options.labels, steps=options.steps,
+        seed=options.seed, log=log,
+    )  # fmt: skip
+    save(adapted, options.model, options.out)
+    if not options.frames:
+        print(f"{options.out}: {options.sensor} has the universal tokens")
+        return 0
+    where = "of split val" if adapted.measured == "val" else "of the fit"
+    print(
+        f"{options.out}: tokens of {options.sensor} fitted to {options.frames} frames. "
+        f"The loss on frames {where} went from {adapted.before:.4f} to {adapted.after:.4f}."
+    )
+    return 0
+
+
+def _simulated(options: AdaptOptions) -> int:
+    """Train the tokens of a sensor of `anytouch sensor fit`."""
+    from anytouch_jax.encoder.adapt import save
+    from anytouch_jax.fitting.tokens import adapt_by_simulation
+
+    state = options.out.with_name(f"{options.out.name}.part.npz")
+    log("compiling the simulator: about two minutes at first")
+    adapted = adapt_by_simulation(
+        options.model, options.sensor, minutes=options.minutes, deep=options.deep, state=state, seed=options.seed,
+        log=log,
+    )  # fmt: skip
+    if adapted is None:
+        log(f"interrupted: {state} keeps the state. Run the same command again to continue.")
+        return 130
+    save(adapted, options.model, options.out)
+    state.unlink(missing_ok=True)
+    name = adapted.metadata["source"]["sensor"]
+    print(
+        f"{options.out}: tokens of {name}, {len(adapted.losses)} steps. Of held-out simulated touches by {name}, the "
+        f"nearest one by a known sensor is the same touch in {adapted.after:.1%}. With universal tokens it is in "
+        f"{adapted.before:.1%}."
     )
     return 0

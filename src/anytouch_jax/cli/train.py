@@ -87,14 +87,13 @@ class TrainRequest(NamedTuple):
 
 
 def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequest:
-    """Return the options of `train`, and the configuration of its preset, its options and its sections, in this order.
-
-    The sections are parsed second, since their defaults depend on the preset.
-    """
+    """Return the options of `train` and its configuration. Sections are second: the preset has their defaults."""
     list_all = "--help-all" in args
     plain, sections = _split_sections([arg for arg in args if arg != "--help-all"])
     defaults = TrainOptions((), Path("runs/stage1")) if list_all else None
-    options = parse_options(kind, name, plain, defaults, others=_section_options())
+    names = [option.name for option in options_of(Sections)]
+    others = {f"--{name.rpartition('.')[2]}": name for name in reversed(names)} | {name: name for name in names}
+    options = parse_options(kind, name, plain, defaults, others=others)
     config = _configure(options)
     if not sections and not list_all:
         return TrainRequest(options, config)
@@ -142,18 +141,17 @@ def _with_own_sensors(config: Config) -> Config:
     return replace(config, model=replace(config.model, sensors=tuple(names)))
 
 
-def _preset(options: TrainOptions) -> Config:
-    return preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
-
-
-def _configure(options: TrainOptions) -> Config:
-    """Return the configuration of the preset and recipe, changed by the short options and the baseline."""
+def _configure(options: TrainOptions, *, usual: bool = False) -> Config:
+    """Return the configuration of the preset and recipe, changed by the short options (unless `usual`) and baseline."""
     short = {
         "data.manifests": tuple(map(str, options.data)), "data.on_bad_sample": options.on_bad_sample,
         "data.batch_size": options.batch, "run.seed": options.seed, "run.steps": options.steps,
         "run.save_every": options.save_every, "run.tensorboard": options.tensorboard,
     }  # fmt: skip
-    config = _preset(options).with_settings({name: value for name, value in short.items() if value is not None})
+    config = preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
+    if usual:
+        return presets.apply_baseline(options.baseline, config)
+    config = config.with_settings({name: value for name, value in short.items() if value is not None})
     return presets.apply_baseline(options.baseline, config)
 
 
@@ -174,7 +172,7 @@ def _refuse_unread(options: TrainOptions, config: Config) -> None:
         unread = dict.fromkeys(reads, "in stage 2 of the paper recipe")
         if options.clip_weights:
             unread["model.temperature"] = "with --clip-weights, which has its own"
-    usual = presets.apply_baseline(options.baseline, _preset(options))
+    usual = _configure(options, usual=True)
     for field, reason in unread.items():
         value = attrgetter(field)
         if value(config) != value(usual):
@@ -191,9 +189,3 @@ def _split_sections(args: Sequence[str]) -> tuple[list[str], list[str]]:
             target = section if "." in arg.partition("=")[0] else plain
         target.append(arg)
     return plain, section
-
-
-def _section_options(default: Sections | None = None) -> dict[str, str]:
-    """Return the options of the sections by their names, and by their names without the section."""
-    names = [option.name for option in options_of(Sections, default)]
-    return {f"--{name.rpartition('.')[2]}": name for name in reversed(names)} | {name: name for name in names}

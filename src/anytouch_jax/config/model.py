@@ -85,10 +85,7 @@ class TextTower:
 @shown_short
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything that decides the shapes and the arithmetic of the network.
-
-    `sensors` names the rows of sensor tokens (Sec. 3.5), and of patch encoders if each has its own (T3).
-    """
+    """All shapes and arithmetic of the network; `sensors` names the rows of tokens, or of patch encoders too (T3)."""
 
     image_size: Size  # Side of an image, pixels.
     patch: Size  # Side of a patch, pixels.

@@ -61,10 +61,8 @@ def parse_json(text: str | bytes) -> Any:
 
     try:
         text = text.decode("utf-8") if isinstance(text, bytes) else text
-        integer: Any = functools.partial(number, kind=int)
-        value = json.loads(
-            text, parse_int=integer, parse_float=number, parse_constant=number, object_pairs_hook=distinct
-        )
+        kinds: Any = {"parse_int": functools.partial(number, kind=int), "parse_float": number, "parse_constant": number}
+        value = json.loads(text, object_pairs_hook=distinct, **kinds)
         if _depth(value) > _JSON_DEPTH:
             raise RecursionError
         json.dumps(value, ensure_ascii=False).encode()
@@ -121,9 +119,8 @@ def _rules(kind: type) -> dict[str, tuple[Any, bool, list[Range]]]:
         return typing.get_origin(hint) is Literal or any(map(has_choices, typing.get_args(hint)))
 
     full = typing.get_type_hints(kind, include_extras=True)
-    ranges = {
-        name: [x for x in getattr(hint, "__metadata__", ()) if isinstance(x, Range)] for name, hint in full.items()
-    }
+    marks = {name: getattr(hint, "__metadata__", ()) for name, hint in full.items()}
+    ranges = {name: [mark for mark in some if isinstance(mark, Range)] for name, some in marks.items()}
     return {name: (hint, has_choices(hint), ranges[name]) for name, hint in typing.get_type_hints(kind).items()}
 
 

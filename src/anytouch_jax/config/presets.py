@@ -53,9 +53,8 @@ def preset(
 class Baseline:
     """A baseline or ablation: the `stages` that it trains, and its `changes` of their configuration by section.field.
 
-    Without `changes_stage1` they are made in stage 2 only. A baseline keeps what distinguishes the method it is named
-    after (Sec. 4.1 and appendix "Baselines"). All run on this network, on the same data, from the same first weights.
-    The ablations are the rows of Table 6. Baselines with an equal stage may share its run.
+    Without `changes_stage1` they are made in stage 2 only. It keeps what distinguishes the method (Sec. 4.1, appendix
+    "Baselines"), on this network and the same data. The ablations are the rows of Table 6.
     """
 
     name: str
@@ -96,23 +95,16 @@ _ALL = (
     Baseline("anytouch", "the paper's model, both stages"),
     Baseline("no_pretraining", "the image tower as touch encoder, no tactile training (the paper's row CLIP)", ()),
     Baseline(
-        "unitouch",
-        "UniTouch: touch-vision InfoNCE on stills with a photograph, tokens of each sensor alone",
-        (2,),
+        "unitouch", "UniTouch: touch-vision InfoNCE on stills with a photograph, tokens of each sensor alone", (2,),
         {"model.text": None, "model.match_head": "none", "data.require": ("image",)} | _SENSOR_TOKENS | _STILLS,
     ),
     Baseline(
-        "tlv_link",
-        "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor tokens, no matching",
-        (2,),
-        {"model.match_head": "none", "model.sensor_tokens": 0, "data.require": ("image", "text")}
-        | _SENSOR_TOKENS
-        | _STILLS,
+        "tlv_link", "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor tokens, no "
+        "matching", (2,), {"model.match_head": "none", "model.sensor_tokens": 0, "data.require": ("image", "text"),
+                           **_SENSOR_TOKENS, **_STILLS},
     ),
     Baseline(
-        "t3",
-        "T3: one patch encoder a sensor, a shared trunk, masked autoencoding of stills",
-        (1,),
+        "t3", "T3: one patch encoder a sensor, a shared trunk, masked autoencoding of stills", (1,),
         {"model.patch_encoder": "sensor", "model.sensor_tokens": 0} | _SENSOR_TOKENS | _NO_CLIPS,
     ),
     # The paper has one model for both names: "trained solely on tactile images" in Table 4, "w/o Dynamic Perception" in
@@ -124,19 +116,16 @@ _ALL = (
         "no_text", "without text: no text tower, no touch-text and vision-text pairs", changes={"model.text": None}
     ),
     Baseline(
-        "no_vision",
-        "without vision: no image tower, no touch-vision and vision-text pairs",
+        "no_vision", "without vision: no image tower, no touch-vision and vision-text pairs",
         changes={"model.image": None, "model.lora_rank": 0},
     ),
     Baseline(
-        "no_text_aligned",
-        "no text for touches that other sensors or units recorded too",
-        changes={"data.aligned_text": False},
-        changes_stage1=False,
+        "no_text_aligned", "no text for touches that other sensors or units recorded too",
+        changes={"data.aligned_text": False}, changes_stage1=False,
     ),
     Baseline("no_stage1", "stage 2 alone, from the same first weights as stage 1", (2,)),
     Baseline("no_stage2", "stage 1 alone", (1,)),
     Baseline("no_matching", "without cross-sensor matching", changes={"model.match_head": "none"}),
     Baseline("no_universal", "without universal tokens: each sensor its own, always", changes=_SENSOR_TOKENS),
-)
+)  # fmt: skip
 BASELINES: dict[str, Baseline] = {baseline.name: baseline for baseline in _ALL}

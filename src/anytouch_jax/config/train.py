@@ -198,10 +198,7 @@ class Config:
 
     @property
     def pair_weights(self) -> tuple[float, float, float]:
-        """Factors of (TV, TL, VL) on the sum of both directions of InfoNCE (Eq. 4).
-
-        The release weighs touch and text by alpha, the paper by alpha / 2.
-        """
+        """Factors of (TV, TL, VL) on both directions of InfoNCE (Eq. 4). The release weighs touch and text by alpha."""
         objective = self.objective
         text = objective.alpha_tl if self.recipe == "release" else objective.alpha_tl / 2
         return objective.alpha_tv / 2, text, objective.alpha_vl / 2

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 import struct
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,6 @@ ADDRESSES = ("http://", "https://", "rtsp://", "rtmp://", "udp://", "tcp://")
 _FORMATS, _SIZES, _INTERVALS = 0xC0405602, 0xC02C564A, 0xC034564B  # VIDIOC_ENUM_FMT, _FRAMESIZES, _FRAMEINTERVALS
 _CAPTURE, _DISCRETE = 1, 1  # a buffer of pictures; a size or interval that is one of a list
 _PATIENCE = 10_000  # milliseconds to wait for an address
-_OTHERS = 10  # numbers that are tried where no folder lists the cameras
 
 
 class CameraSettings(NamedTuple):
@@ -70,8 +68,6 @@ class Camera(NamedTuple):
 
 def list_cameras() -> list[Camera]:
     """Return the cameras that are connected. A device that only gives metadata is left out."""
-    if sys.platform != "linux" and not SYSTEM.is_dir():
-        return [Camera(number, "unknown", "", ()) for number in range(_OTHERS) if _opens(number)]
     found = []
     for place in SYSTEM.glob("video*"):
         modes, digits = tuple(_modes(DEVICES / place.name)), place.name.removeprefix("video")
@@ -100,17 +96,15 @@ def camera_of(source: str | Path) -> int | str | None:
     word = text.strip().lower()
     cameras = [one for one in list_cameras() if word and (word in one.name.lower() or word == one.serial.lower())]
     if len(cameras) > 1:
-        raise UserError(f"{text} is the name of {len(cameras)} cameras, {_listed(cameras)}: give a number or a serial")
+        listed = ", ".join(map(str, cameras))
+        raise UserError(f"{text} is the name of {len(cameras)} cameras, {listed}: give a number or a serial")
     return cameras[0].number if cameras else None
 
 
 def open_source(
     name: str | Path, asked: CameraSettings | None = None, log: Callable[[str], None] | None = None
 ) -> tuple[Any, bool]:
-    """Return a cv2.VideoCapture of what `camera_of` takes or of a film, and whether it is a camera.
-
-    A camera is `asked` for settings, and `log` gets a sentence on what it really gives. Raises UserError.
-    """
+    """Return a cv2.VideoCapture of a camera or film, and whether it is a camera (`asked` for settings)."""
     camera = camera_of(name)
     if camera is None and Path(name).is_dir():
         raise UserError(f"{name} is a folder, not a video or a camera. `anytouch embed` takes folders.")
@@ -151,29 +145,21 @@ def format_of(source: Any) -> str:
 
 
 def _ask(source: Any, asked: CameraSettings) -> None:
-    if asked.format is not None:  # first: it decides which sizes and rates there are
-        source.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*asked.format.upper()))
-    if asked.size is not None:
-        for name, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), asked.size, strict=True):
+    code = None if asked.format is None else cv2.VideoWriter.fourcc(*asked.format.upper())
+    names = (cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+    for name, value in zip(names, (code, *(asked.size or (None, None)), asked.fps), strict=True):
+        if value is not None:  # the format first: it decides which sizes and rates there are
             source.set(name, value)
-    if asked.fps is not None:
-        source.set(cv2.CAP_PROP_FPS, asked.fps)
 
 
 def _given(source: Any, camera: int | str, asked: CameraSettings) -> str:
     """Return what a camera gives, where that is not what it was asked for, and a format that is faster."""
-    width, height, rate = (
-        source.get(name) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
-    )
-    size, form = (int(width), int(height)), format_of(source)
+    size = int(source.get(cv2.CAP_PROP_FRAME_WIDTH)), int(source.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    rate, form = source.get(cv2.CAP_PROP_FPS), format_of(source)
     words = f"{size[0]} x {size[1]} pixels" + (f", {rate:g} frames/s" if rate > 0 else "") + (f", {form}" * bool(form))
-    missed = []
-    if asked.size is not None and asked.size != size:
-        missed.append(f"{asked.size[0]} x {asked.size[1]} pixels")
-    if asked.fps is not None and abs(asked.fps - rate) > 0.5:
-        missed.append(f"{asked.fps:g} frames/s")
-    if asked.format is not None and asked.format.upper() != form:
-        missed.append(asked.format.upper())
+    missed = [f"{asked.size[0]} x {asked.size[1]} pixels"] if asked.size and asked.size != size else []
+    missed += [f"{asked.fps:g} frames/s"] if asked.fps is not None and abs(asked.fps - rate) > 0.5 else []
+    missed += [asked.format.upper()] if asked.format is not None and asked.format.upper() != form else []
     words += f", not {' and '.join(missed)} as asked for" if missed else ""
     modes = _modes(DEVICES / f"video{camera}") if isinstance(camera, int) else ()
     others = [(max(mode.rates), mode.format) for mode in modes if mode.rates and size == (mode.width, mode.height)]
@@ -183,11 +169,7 @@ def _given(source: Any, camera: int | str, asked: CameraSettings) -> str:
 
 def _connected() -> str:
     cameras = list_cameras()
-    return f"connected are {_listed(cameras)}" if cameras else "no camera is connected"
-
-
-def _listed(cameras: list[Camera]) -> str:
-    return ", ".join(map(str, cameras))
+    return f"connected are {', '.join(map(str, cameras))}" if cameras else "no camera is connected"
 
 
 def _text(file: Path) -> str:
@@ -196,14 +178,6 @@ def _text(file: Path) -> str:
         return file.read_text(errors="replace").strip()
     except OSError:
         return ""
-
-
-def _opens(number: int) -> bool:
-    with QUIET:
-        source = cv2.VideoCapture(number)
-    is_open = bool(source.isOpened())
-    source.release()
-    return is_open
 
 
 def _modes(device: Path) -> Iterator[Mode]:

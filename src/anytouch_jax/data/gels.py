@@ -8,11 +8,9 @@ The first of these counts:
 * the median of the unit's frames
 * for a live source, a running estimate
 
-A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one unit.
-
-The median is over frames of split train, if these are enough. Pressed or not, they may all take part, as presses are at
-changing places. A unit of few sequences may have one press only, as if it was named after an object. Its median is that
-of its sensor, if these look alike. `experiments/results/real.md` compares it with stored pictures.
+A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one unit. The median is
+over frames of split train, if these are enough, pressed or not. A unit of few sequences may have one press only: its
+median is that of its sensor, if these look alike.
 """
 
 from __future__ import annotations
@@ -100,10 +98,7 @@ def reduced(frame: Array) -> Array:
 
 
 def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
-    """Return the untouched gel of one frame or more of a folder or a film, and how many count for it.
-
-    With fewer than FEWEST it shows the press itself.
-    """
+    """Return the untouched gel of frames of a folder or a film, and how many count; below FEWEST it shows the press."""
     spread = Spread(reduced)
     for frame in frames:
         spread.add(frame)

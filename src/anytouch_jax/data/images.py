@@ -39,11 +39,9 @@ if hasattr(cv2, "IMREAD_COLOR_RGB"):
 _PNG, _JPEG, _TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II*\0", b"MM\0*")
 # Pillow's classes for the headers. Image.open adds a search over all formats, 40 of the 390 us that a JPEG takes.
 _HEADERS: dict[bytes, type[ImageFile.ImageFile]] = {
-    _PNG: PngImagePlugin.PngImageFile,
-    _JPEG: JpegImagePlugin.JpegImageFile,
-    b"BM": BmpImagePlugin.BmpImageFile,
+    _PNG: PngImagePlugin.PngImageFile, _JPEG: JpegImagePlugin.JpegImageFile, b"BM": BmpImagePlugin.BmpImageFile,
     b"RIFF": WebPImagePlugin.WebPImageFile,
-}
+}  # fmt: skip
 _ORIENTATION = 274  # a tag of EXIF and of a TIFF
 _WIDTH, _HEIGHT, _BITS, _ALPHA = 256, 257, 258, 338  # tags of a TIFF; _ALPHA is 2 for unassociated alpha
 
@@ -190,10 +188,7 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _check_header(data: bytes) -> int:
-    """Return the EXIF orientation of a picture, 1 for a TIFF, which OpenCV turns itself.
-
-    Raises ValueError unless `data` is whole and declares an image that OpenCV unpacks safely and correctly.
-    """
+    """Return the EXIF orientation (1 for a TIFF). Raises ValueError unless OpenCV unpacks `data` whole and safely."""
     header = next((header for start, header in _HEADERS.items() if data.startswith(start)), None)
     if header is None and not data.startswith(_TIFF):
         if kind := placeholder(data):
@@ -229,10 +224,7 @@ def _orientation(image: ImageFile.ImageFile) -> int:
 
 
 def _decoded_chunks(data: bytes) -> bytes:
-    """Return a PNG without what adds nothing to its pixels, and much to time and to libpng's warnings.
-
-    OpenCV allocates what a chunk declares, up to 4 GB, so the chunks are walked first.
-    """
+    """Return a PNG without needless chunks, walked first: OpenCV allocates what a chunk declares, up to 4 GB."""
     at, kind, headers, count, parts = 8, b"", 0, 0, [data[:8]]
     while kind != b"IEND":
         length, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
@@ -320,9 +312,8 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
                 with QUIET:
                     whole, frame = video.read()
             except cv2.error as error:
-                raise ImageError(
-                    f"frame {number} of {path} cannot be decoded: {' '.join(str(error).split())}"
-                ) from None
+                reason = " ".join(str(error).split())
+                raise ImageError(f"frame {number} of {path} cannot be decoded: {reason}") from None
             if not whole or frame is None:
                 break
             last = frame_time(video, number, last)
@@ -335,10 +326,7 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def frame_time(video: Any, number: int, last: float) -> float:
-    """Return the time stamp in seconds of frame `number` of a cv2.VideoCapture, just read, later than `last`.
-
-    Without a stamp, the number is divided by the frame rate.
-    """
+    """Return the seconds of frame `number` of a cv2.VideoCapture, later than `last`, by its stamp or the frame rate."""
     seconds = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
     if math.isfinite(seconds) and seconds > last:
         return seconds
@@ -347,7 +335,9 @@ def frame_time(video: Any, number: int, last: float) -> float:
 
 
 def count_frames(path: str | Path) -> int:
-    """Return the number of frames in a video's header, 0 if it has none."""
+    """Return the number of frames of a picture, a folder or a film's header, 0 if that has none."""
+    if (files := picture_files(Path(path))) is not None:
+        return len(files)
     video = open_video(path)
     try:
         return max(0, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
@@ -356,10 +346,7 @@ def count_frames(path: str | Path) -> int:
 
 
 def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
-    """Open a video, by PyAV if OpenCV cannot decode it.
-
-    Raises ImageError for a web page or a Git LFS pointer in its place, and for a codec that cannot be decoded.
-    """
+    """Open a video, by PyAV if OpenCV cannot decode it. Raises ImageError for no film, and for an unknown codec."""
     if Path(path).is_file() and (kind := placeholder(path)):
         raise ImageError(f"{path} is {kind}")
     place = os.path.abspath(path)  # FFmpeg takes the part of a relative name before a colon for a protocol
@@ -385,10 +372,7 @@ def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
 
 
 class PyAvFilm:
-    """A film that OpenCV cannot decode, such as AV1, with the methods of cv2.VideoCapture: frames are BGR u8 (h, w, 3).
-
-    Raises ImportError without PyAV, OSError for a file that it cannot open.
-    """
+    """A film such as AV1, BGR u8 (h, w, 3), with the methods of cv2.VideoCapture. Raises ImportError and OSError."""
 
     def __init__(self, path: str) -> None:
         self._path, self._frame = path, None
@@ -479,6 +463,13 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     if not is_clear:
         warnings.warn(f"the names in {folder} show no order of its pictures: they come by name", stacklevel=2)
     return [folder / name for name in names], named
+
+
+def picture_files(path: Path) -> list[Path] | None:
+    """Return the picture at `path`, or the frames of a folder in order; None for a film. Raises ImageError."""
+    if path.is_dir():
+        return list_images(path)[0]
+    return [path] if path.suffix.lower() in SUFFIXES else None
 
 
 def _suggestion(folder: Path) -> str:

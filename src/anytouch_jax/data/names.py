@@ -23,8 +23,8 @@ _SIDE = re.compile(r"\d|(?<![^\W_])(?:left|right|l|r|thumb|index|middle|ring|lit
 def frame_order(names: Sequence[str]) -> tuple[list[str], bool]:
     """Return the names of a folder's frames in order, series by series (`split_series`), and whether they show it.
 
-    Numbers, with their decimals, are compared by value from left to right, whatever words are between them. A number
-    that counts goes first if what stands before it is in no order.
+    Numbers are compared by value from left to right. One that counts goes first if what stands before it is in no
+    order.
     """
     ordered, is_clear = list[str](), True
     for series in split_series(sorted(names, key=natural)).values():
@@ -91,11 +91,7 @@ def looks_like_film(names: Sequence[str]) -> bool:
 
 
 def frame_numbers(names: Sequence[str]) -> list[int]:
-    """Return the numbers of frames in order.
-
-    They are the last numbers of the names that differ (`_series_of`), if these count frames: a third of the steps or
-    more are 1. Then a missing frame is a gap. Otherwise (time stamps) they are 0, 1, 2, ...
-    """
+    """Return the frames' last numbers that differ, if a third of the steps or more are 1; else (times) 0, 1, 2, ..."""
     return _counted([numbers for _, numbers in _series_of(names)]) or list(range(len(names)))
 
 
@@ -115,8 +111,8 @@ def _counted(counters: Sequence[tuple[Number, ...]]) -> list[int] | None:
 def split_series(names: Sequence[str]) -> dict[str, list[str]]:
     """Return the names of a folder by series, if they are of several recorders; else all of them under "".
 
-    left_0 and right_0 (0_A and 0_B, 0_D20012 and 0_D20345) are two fingers: two series share a number. Series of sides
-    or serial numbers that alternate are apart too, as their numbers may be times. 12-00-05 is one time.
+    left_0 and right_0 (0_A and 0_B, 0_D20012 and 0_D20345) are two fingers: they share a number. So are sides or serial
+    numbers that alternate. 12-00-05 is one time.
     """
     parts = _series_of(names)
     series: dict[str, list[str]] = {}
@@ -134,11 +130,7 @@ def split_series(names: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _series_of(names: Sequence[str]) -> list[tuple[str, tuple[Number, ...]]]:
-    """Return the series of each name, and its numbers that count frames.
-
-    The series is the words of the name with their serial numbers, which stand right behind a word (D20012, cam0). A
-    number counts frames if its word says so (frame0001), or if it is the only one that differs.
-    """
+    """Return each name's series (its words, with serials as cam0), and its numbers that count frames."""
     forms: dict[str, list[list[str]]] = {}
     pieces = _number_parts(names)
     for one in pieces:
@@ -170,10 +162,7 @@ def _counters(alike: list[list[str]]) -> list[int]:
 
 
 def _number_parts(names: Sequence[str]) -> list[list[str]]:
-    """Return the words and numbers of each name in turn, without its ending. The words are at even places.
-
-    1.5 and 1,5 are one number. In names that have 1.1 and 1.10 the point separates two.
-    """
+    """Return words and numbers of each name in turn. 1,5 is 1.5; in names with 1.1 and 1.10 the point separates two."""
     stems = [re.sub(r"(?<=\d),(?=\d)", ".", Path(name).stem) for name in names]
     fractions = [number.partition(".")[2] for stem in stems for number in _DECIMAL.findall(stem)]
     is_dotted = len(set(map(len, fractions))) > 1 and any(len(one) > 1 and one[-1] == "0" for one in fractions)

@@ -93,14 +93,8 @@ def train_tokenizer(captions: Iterable[str], vocab_size: int) -> Tokenizer:
     if vocab_size < 258:
         raise UserError(f"a tokenizer needs room for at least 258 tokens, not {vocab_size}")
     inner = tokenizers.Tokenizer(models.BPE())
-    inner.normalizer = normalizers.Sequence(
-        [
-            normalizers.NFC(),
-            normalizers.Replace(tokenizers.Regex(r"\s+"), " "),
-            normalizers.Strip(),
-            normalizers.Lowercase(),
-        ]
-    )
+    blanks = normalizers.Replace(tokenizers.Regex(r"\s+"), " ")
+    inner.normalizer = normalizers.Sequence([normalizers.NFC(), blanks, normalizers.Strip(), normalizers.Lowercase()])
     inner.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
     inner.decoder = decoders.ByteLevel()
     alphabet = pre_tokenizers.ByteLevel.alphabet()

@@ -29,12 +29,9 @@ def augmentation_rng(seed: int, epoch: int, row: int, stream: int = TOUCH) -> np
 
 
 def touch_transform(
-    frames: Sequence[np.ndarray] | np.ndarray,
-    size: int,
-    rng: np.random.Generator,
-    config: DataConfig,
+    frames: Sequence[np.ndarray] | np.ndarray, size: int, rng: np.random.Generator, config: DataConfig,
     out: np.ndarray | None = None,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), with one draw for all frames.
 
     The whole image is resized (no crop), and flipped in each direction with probability `config.flip`. It is then
@@ -73,10 +70,7 @@ def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: 
 
 
 def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarray:
-    """Return a frame (h, w, c) rotated clockwise by 0, 90, 180 or 270 degrees, then mirrored.
-
-    "across" exchanges left and right, "down" exchanges top and bottom.
-    """
+    """Return a frame (h, w, c) turned clockwise by multiples of 90 degrees, then mirrored across or down."""
     frame = np.rot90(frame, -rotate // 90) if rotate else frame
     return {"none": frame, "across": frame[:, ::-1], "down": frame[::-1]}[flip]
 
@@ -118,16 +112,14 @@ def _resize(frame: np.ndarray, target: np.ndarray) -> None:
 
 
 def colour_jitter(
-    frames: np.ndarray,
-    rng: np.random.Generator,
-    jitter: tuple[float, float, float, float],
+    frames: np.ndarray, rng: np.random.Generator, jitter: tuple[float, float, float, float],
     out: np.ndarray | None = None,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Jitter brightness, contrast, saturation and hue in a random order, the same for all frames u8 (T, h, w, 3).
 
-    This is torchvision's ColorJitter on floats. Factors are in 1 +- jitter (at least 0), the hue turns by up to
-    +-jitter of a circle, and each step is clipped. One rounding of float32 at the end keeps the error at half a grey
-    level. The result is written into `out` (`frames` is allowed) or a new array.
+    This is torchvision's ColorJitter in float32, each step clipped, with one rounding at the end. Factors are in 1 +-
+    jitter (at least 0), the hue turns by up to +-jitter of a circle. The result is written into `out` (`frames` is
+    allowed) or a new array.
     """
     spread = np.asarray(jitter)
     low, high = np.maximum(0.0, 1.0 - spread), 1.0 + spread
@@ -146,10 +138,10 @@ _IDENTITY = np.eye(3, 4)
 
 
 class _Jitter:
-    """One frame under jitter, f32 in 0..255. Brightness, contrast and saturation are affine maps of a pixel's colour.
+    """One frame under jitter, f32 in 0..255; brightness, contrast and saturation are affine maps of a pixel's colour.
 
-    `pending` (3, 4) is the map that is not yet applied to `image`. Maps are composed until a value could leave the
-    range, which `low` and `high` bound, or until the hue changes. Then the image is computed and clipped.
+    `pending` (3, 4) is not yet applied to `image`: maps are composed until a value could leave the range, bounded by
+    `low` and `high`, or until the hue changes.
     """
 
     def __init__(self, frame: np.ndarray, image: np.ndarray, spare: np.ndarray) -> None:
@@ -209,11 +201,7 @@ class _Jitter:
 def vision_transform(
     image: np.ndarray, size: int, rng: np.random.Generator, rotation: float = 20.0, flip: float = 0.5
 ) -> np.ndarray:
-    """Augment a photograph u8 (h, w, 3) -> u8 (size, size, 3): rotation, horizontal flip, CLIP's resize.
-
-    It is rotated by up to +-`rotation` degrees about its centre (corners black), flipped with probability `flip`, then
-    resized and cropped as by `vision_evaluation`.
-    """
+    """Augment a photograph u8 (h, w, 3) -> u8 (size, size, 3): turn by +-`rotation` degrees, flip, CLIP's resize."""
     angle = rng.uniform(-rotation, rotation)
     across = rng.random() < flip
     image = _shrink(image, size)
@@ -229,9 +217,8 @@ def vision_transform(
 def vision_evaluation(image: np.ndarray, size: int) -> np.ndarray:
     """Resize the short side (bicubic) and crop the centre, as CLIP does: u8 (h, w, 3) -> u8 (size, size, 3).
 
-    The kernel widens with the reduction, as in Pillow, so nothing aliases. An image more than 6 times too large is
-    first averaged down to about 3 times. Pillow itself rounds between the two passes: 13 % of the pixels would change
-    by one level.
+    The kernel widens as in Pillow, which rounds between the passes: 13 % of the pixels would change by one level. An
+    image more than 6 times too large is first averaged down to about 3 times.
     """
     image = _shrink(image, size)
     height, width = image.shape[:2]
@@ -243,10 +230,7 @@ def vision_evaluation(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _weigh(image: np.ndarray, first: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return rows (n, c) -> (size, c): row i is the sum over k of weights[k, i] * image[first[i] + k].
-
-    It adds tap by tap, because a matrix product takes fifty times longer when its BLAS threads meet the loader's.
-    """
+    """Return rows (size, c) of weighted taps. A matrix product is fifty times slower next to threads."""
     out = np.zeros((len(first), image.shape[1]), np.float32)
     part = np.empty_like(out)
     for k, weight in enumerate(weights):
@@ -267,11 +251,7 @@ def _shrink(image: np.ndarray, size: int) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _bicubic(before: int, after: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of a bicubic resize from `before` to `after` pixels, for the central `size` of them.
-
-    They are the first source pixel of each, i64 (size,), and the weights of it and the following pixels, f32 (taps,
-    size).
-    """
+    """Return a bicubic resize of the centre: first source pixels i64 (size,), weights from them on f32 (taps, size)."""
     scale = before / after
     start = round((after - size) / 2)
     centre = (np.arange(start, start + size) + 0.5) * scale

@@ -31,7 +31,7 @@ from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
 from anytouch_jax.shown import shown_short
-from anytouch_jax.weights import checkpoint, compatible, registry
+from anytouch_jax.weights import checkpoint, convert, registry
 from anytouch_jax.weights.families import load_family
 from anytouch_jax.weights.load import Loaded, load_model
 
@@ -177,7 +177,7 @@ def with_row(loaded: Loaded, params: Params, sensor: str, run: str, log: Log) ->
         raise UserError(f"{run} was trained on {sensor}; name a new sensor")
     if sensor in model.sensors and trained is None:
         log(f"{run} does not store its trained sensors: the tokens of {sensor} start from the universal ones")
-    served = compatible.serve_unseen(params["touch"], model, trained or (), universal_drawn=loaded.universal_drawn)
+    served = convert.serve_unseen(params["touch"], model, trained or (), universal_drawn=loaded.universal_drawn)
     start = np.asarray(served["sensor_tokens"])[model.universal_row]
     tokens = np.asarray(params["touch"]["sensor_tokens"])
     if sensor not in model.sensors:

@@ -17,8 +17,8 @@ from sklearn.decomposition import PCA
 from anytouch_jax.config import preset
 from anytouch_jax.data.gels import ADVICE, UnitGels
 from anytouch_jax.data.loading.samples import read_image
-from anytouch_jax.data.manifest.files import distinct_files, read_file, split_shard_path
-from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.data.manifest.files import read_file, split_shard_path
+from anytouch_jax.data.manifest.manifest import Manifest, distinct_files
 from anytouch_jax.data.transforms import FORM
 from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, read_npz, save_npz
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder

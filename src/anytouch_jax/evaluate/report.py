@@ -20,7 +20,7 @@ from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.images import decode, encode
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.files import read_file
+from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.arrays import Log
@@ -36,7 +36,7 @@ from anytouch_jax.evaluate.reconstruction import pixel_scores, reconstruction_pa
 from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
 from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.evaluate.tasks import best_rows
-from anytouch_jax.files import atomic_write, read_array
+from anytouch_jax.files import atomic_write
 
 Change = tuple[float, float | None, float | None]  # a difference with its interval
 
@@ -240,7 +240,7 @@ def _picture(manifest: Manifest, row: int | None) -> Array | None:
         return decode(manifest.file(row))
     column = "field_path" if manifest.value(row, "field_path") is not None else "path"
     try:
-        field = read_array(read_file(manifest.file(row, column)))
+        field = unpack_npy(read_file(manifest.file(row, column)))
     except ValueError as error:
         raise UserError(f"{manifest.where(row)}, column {column!r}, is no field of forces: {error}.") from None
     return np.linalg.norm(field[..., :3], axis=-1) if field.ndim == 3 else field

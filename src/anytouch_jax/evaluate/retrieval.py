@@ -15,7 +15,7 @@ import numpy as np
 from sklearn.metrics import roc_auc_score
 
 from anytouch_jax.config import FIELD_SENSORS
-from anytouch_jax.data.loading.matching import Matches, MatchKeys
+from anytouch_jax.data.loading.sampling import Matches, MatchKeys
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.encoder import Encoder

@@ -88,11 +88,7 @@ class Checkpoints:
         self._sweep()
 
     def check_space(self, state: Tree) -> None:
-        """Raise CheckpointError if the disk has less space than a checkpoint of `state` (arrays or shapes) takes.
-
-        A save would find out too, but late, and its threads may take long to give up. Each of several processes writes
-        its own share, and disks that report no size are not checked.
-        """
+        """Raise CheckpointError if the disk has less space than `state` takes: a save would find out late."""
         needed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
         disk = shutil.disk_usage(self.folder)
         if disk.total and disk.free < needed and jax.process_count() == 1:
@@ -178,10 +174,7 @@ class Checkpoints:
         self._worker.shutdown()
 
     def leave(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """`close` at the end of a context; after an error in one of several processes, do not wait for the others.
-
-        The running save then gets half a minute, or no time if another process is lost: it could not end.
-        """
+        """`close` at the end of a context; after an error in one of several processes, wait at most half a minute."""
         if error is None or jax.process_count() == 1:
             self.close()
             return
@@ -231,18 +224,14 @@ class Checkpoints:
 
 
 def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]:
-    """Return the metadata that a checkpoint was saved with, and its `step`, `config` (JSON) and `metrics`.
-
-    `folder` is a run, its checkpoints folder, or one checkpoint. Raises CheckpointError.
-    """
+    """Return metadata, `step`, `config` (JSON) and `metrics` of a run or checkpoint. Raises CheckpointError."""
     return _description(read_record(resolve(Path(folder), step)))
 
 
 def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Return (parameters as a nested dict of numpy arrays, config JSON, metadata) of a checkpoint.
 
-    `folder` is a run, its checkpoints folder, or one checkpoint. The parameters are `trainable` and `frozen` of the
-    state together. The optimiser's arrays are not read. If a running run removes the latest checkpoint meanwhile, the
+    `folder` is a run, its checkpoints folder, or one checkpoint. If a running run removes the latest meanwhile, the
     next one is read. Raises CheckpointError.
     """
     for _ in range(_TRIES if step is None else 1):
@@ -328,10 +317,7 @@ def _description(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def best_of(folder: Path) -> int | None:
-    """Return the step of lowest loss in a folder of checkpoints, the latest of equals; None if no loss is known.
-
-    A loss of few steps does not count.
-    """
+    """Return the step of lowest loss over many steps in a folder, the latest of equals; None if no loss is known."""
     losses: dict[int, float] = {}
     for step in steps(folder):
         with suppress(CheckpointError):  # `restore` reports a damaged one

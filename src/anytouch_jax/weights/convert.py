@@ -1,20 +1,36 @@
 """Weight conversion: files of the authors, HF CLIP and OpenCLIP to our parameters, and back to the authors' layout.
 
-Every key of a file is accounted for. One error counts the keys that are unknown, missing or of another shape.
+Every key of a file is accounted for. One error counts the keys that are unknown, missing or of another shape. Weights
+are fitted to a model: checks of its form, resized positions, sensor rows by name.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import UNIVERSAL, ModelConfig
-from anytouch_jax.weights.compatible import resize_position
-from anytouch_jax.weights.keymaps import Entry, Heads, KeyMap, Shape, Weights, param_shapes
-from anytouch_jax.weights.layouts import HF_CLIP, OPENCLIP, PROBE, STAGE1, STAGE2
+from anytouch_jax.config import UNIVERSAL, Config, ModelConfig
+from anytouch_jax.errors import UserError
+from anytouch_jax.nn.vit import cubic
+from anytouch_jax.weights.keymaps import (
+    HF_CLIP,
+    OPENCLIP,
+    PROBE,
+    STAGE1,
+    STAGE2,
+    Entry,
+    Heads,
+    KeyMap,
+    Shape,
+    Weights,
+    param_shapes,
+)
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten, nest
 
@@ -31,10 +47,7 @@ KEYMAPS = {keymap.name: keymap for keymap in (STAGE2, STAGE1, PROBE, OPENCLIP, H
 
 
 def detect_layout(weights: Weights) -> str:
-    """Return the name of the key map that a file follows: "stage1", "stage2", "probe", "clip", "openclip" or "own".
-
-    Raises WeightsError if none matches.
-    """
+    """Return the name of a file's key map: stage1, stage2, probe, clip, openclip or own. Raises WeightsError."""
     for keymap in KEYMAPS.values():
         if any(re.fullmatch(keymap.mark, key) for key in weights):
             return keymap.name
@@ -45,8 +58,8 @@ def detect_layout(weights: Weights) -> str:
 def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, int]]:
     """Return the model that a file was made for, from the shapes of its arrays, and stacks of unknown head counts.
 
-    Head counts leave no trace: those that neither `heads` nor a published width gives are 1 in the model, and the
-    second value has the widths of these stacks. A CLIP file gets the authors' decoder sizes. Raises WeightsError.
+    Counts that neither `heads` nor a published width gives are 1, and the second value has these widths. A CLIP file
+    gets the authors' decoder. Raises WeightsError.
     """
     layout = detect_layout(weights)
     if layout == "own":
@@ -76,9 +89,9 @@ def to_params(
 ) -> Params:
     """Return the parameters of a file as a nested dict of float32 arrays under our names.
 
-    The key map is detected. Left out are towers and heads that `model` lacks, buffers, the authors' unused arrays
-    (golden Q2) and the keys in `ignore`. Position tables of another image size are resized. A probe file gives its
-    classifier as `head`. A file may lack the parameters named in `optional`. Raises WeightsError.
+    Left out are parts that `model` lacks, buffers, the authors' unused arrays (golden Q2) and the keys in `ignore`.
+    Position tables are resized. A probe file gives its classifier as `head`. A file may lack those in `optional`.
+    Raises WeightsError.
     """
     layout, shapes = detect_layout(weights), param_shapes(model)
     keymap, entries = KEYMAPS[layout], KEYMAPS[layout].entries(model)
@@ -127,9 +140,8 @@ def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False)
     if model.patch_encoder != "shared":
         raise WeightsError("the authors' files have one patch projection for all sensors; this model has one for each")
     if model.sensors[-1] != UNIVERSAL:
-        raise WeightsError(
-            f"the authors' files keep the universal tokens in the last row; here it is {model.sensors[-1]!r}"
-        )
+        last = model.sensors[-1]
+        raise WeightsError(f"the authors' files keep the universal tokens in the last row; here it is {last!r}")
     shapes, entries = param_shapes(model), keymap.entries(model)
     check_arrays("parameters", flat, {entry.name: shapes[entry.name] for entry in entries})
     arrays = {e.key: e.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
@@ -150,12 +162,8 @@ def check_arrays(title: str, arrays: Mapping[str, Any], wanted: Mapping[str, Sha
             if key in arrays and tuple(arrays[key].shape) != shape
         ],
     }
-    problems = [
-        f"{name} ({len(rows)}): {', '.join(rows[:_LISTED])}"
-        + (f" and {len(rows) - _LISTED} more" if rows[_LISTED:] else "")
-        for name, rows in lists.items()
-        if rows
-    ]
+    more = {name: f" and {len(rows) - _LISTED} more" * (len(rows) > _LISTED) for name, rows in lists.items()}
+    problems = [f"{n} ({len(rows)}): {', '.join(rows[:_LISTED])}{more[n]}" for n, rows in lists.items() if rows]
     if problems:
         hint = _hint((*lists["unknown keys"], *lists["missing keys"]))
         raise WeightsError(f"the {title} do not fit this model; {'; '.join(problems)}{hint}")
@@ -192,3 +200,94 @@ def _hint(keys: Sequence[str]) -> str:
     }
     matching = (setting for pattern, setting in hints.items() if any(re.fullmatch(pattern, key) for key in keys))
     return next((f"; look at {setting}" for setting in matching), "")
+
+
+# Settings that must be equal: some leave no trace in shapes.
+_FORM: tuple[str, ...] = ("patch", "patch_encoder", "embed", "frames", "sensor_tokens")
+_FORM += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
+_FORM += ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps", "pre_norm")
+
+
+def check_activation(path: Path, trained: str | None, config: Config) -> None:
+    """Raise UserError if weights were trained with another activation than the run's; None means unknown."""
+    ours = config.model.activation
+    if trained not in (None, ours):
+        raise UserError(
+            f"{path} was trained with {trained}, this run would use {ours}: add --model.activation {trained}"
+        )
+
+
+def check_form(path: Path, before: ModelConfig, config: Config, preset: str = "custom") -> None:
+    """Raise UserError with the missing options if weights, of this preset, belong to another network than the run's."""
+    pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in _FORM}
+    differing = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+    if not differing:
+        return
+    trained = ", ".join(f"{name} {theirs}" for name, (theirs, _) in differing.items())
+    used = ", ".join(str(ours) for _, ours in differing.values())
+    options = " ".join(_option(name.replace("_", "-"), theirs) for name, (theirs, _) in differing.items())
+    if differing.keys() & {"touch.width", "touch.depth"} and preset not in (config.preset, "custom"):
+        trained, used, options = f"preset {preset}", f"preset {config.preset}", f"--preset {preset}"
+    raise UserError(f"{path} was trained with {trained}, this run would use {used}: add {options}")
+
+
+def _option(name: str, value: Any) -> str:
+    """Return the option that gives a setting of the model a value."""
+    return f"--model.{name} {value}" if type(value) is not bool else f"--model.{'' if value else 'no-'}{name}"
+
+
+def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) -> None:
+    """Raise UserError if CLIP's image tower has another size than the run's image tower or, with `touch`, encoder."""
+    theirs = (clip.touch.width, clip.touch.depth, clip.patch)
+    for name, stack in (("image tower", config.model.image), ("touch encoder", config.model.touch if touch else None)):
+        if stack is None or (ours := (stack.width, stack.depth, config.model.patch)) == theirs:
+            continue
+        sizes = [f"width {width}, depth {depth} and patches of {patch}" for width, depth, patch in (theirs, ours)]
+        raise UserError(
+            f"the image tower in {path} has {sizes[0]}, this run's {name} {sizes[1]}: --preset large fits ViT-L/14, "
+            "--preset base fits ViT-B/16; add the one that fits, or give other --clip-weights"
+        )
+
+
+def match_sensors(table: np.ndarray, stored: Sequence[str], wanted: Sequence[str]) -> np.ndarray:
+    """Return a table's rows (R, ...) by name from `stored` to `wanted`; a new sensor gets the universal row."""
+    return np.stack([table[stored.index(name if name in stored else UNIVERSAL)] for name in wanted])
+
+
+def map_sensors(touch: Params, model: ModelConfig, change: Callable[[np.ndarray], np.ndarray]) -> Params:
+    """Return a touch encoder with its tables of sensors changed: the tokens, and the patch kernels if each has one."""
+    changed: Params = {"sensor_tokens": change(np.asarray(touch["sensor_tokens"]))}
+    if model.patch_encoder == "sensor":
+        changed["patch"] = {"kernel": change(np.asarray(touch["patch"]["kernel"]))}
+    return touch | changed
+
+
+def serve_unseen(touch: Params, model: ModelConfig, trained: Sequence[str], *, universal_drawn: bool) -> Params:
+    """Return a touch encoder whose untrained sensors have the universal row (Sec. 3.5), or the mean if never drawn."""
+    rows = [row for row, name in enumerate(model.sensors) if name in trained and name != UNIVERSAL]
+    unseen = [row for row in range(len(model.sensors)) if row not in rows]
+    if not rows:
+        return touch
+
+    def served(table: np.ndarray) -> np.ndarray:
+        table = np.array(table)
+        table[unseen] = table[model.universal_row] if universal_drawn else table[rows].mean(axis=0)
+        return table
+
+    return map_sensors(touch, model, served)
+
+
+def resize_position(table: np.ndarray, rows: int) -> np.ndarray:
+    """Return a (1 + M, D) table of a square grid resized to (`rows`, D); row 0, the class token's, is unchanged.
+
+    Equal to torch's `interpolate(mode="bicubic", align_corners=False, antialias=False)`, computed in float64.
+    Raises ValueError if either grid is not square.
+    """
+    old, new = math.isqrt(len(table) - 1), math.isqrt(rows - 1)
+    if old**2 != len(table) - 1 or new**2 != rows - 1 or not old or not new:
+        raise ValueError(f"a position table of {len(table)} rows cannot become {rows}: the grids must be square")
+    weights = cubic(old, new)
+    grid = table[1:].astype(np.float64).reshape(old, old, -1)
+    grid = np.einsum("ij,jkd->ikd", weights, grid)
+    grid = np.einsum("kl,ild->ikd", weights, grid)
+    return np.concatenate([table[:1], grid.reshape(new * new, -1).astype(table.dtype)])

@@ -1,4 +1,4 @@
-"""Families of encoders that others published: how their files are recognised, read and fed."""
+"""Families of encoders that others published: how their files are recognised and read, and how they are fed."""
 
 from __future__ import annotations
 
@@ -17,18 +17,16 @@ from anytouch_jax.config.parsing import Above0, Count, check, read_value
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Resample, Vit, VitConfig
-from anytouch_jax.weights import compatible, layouts, load, registry
+from anytouch_jax.weights import convert, keymaps, load, registry
 from anytouch_jax.weights.convert import KEYMAPS, check_arrays, file_shapes, fill, refuse_unknown
 from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth
 from anytouch_jax.weights.safetensors import WeightsError
-from anytouch_jax.weights.stated import stated_steps
 from anytouch_jax.weights.tree import flatten, nest
 
 Size = tuple[int, int]
 ALIASES = {"mini": "gelsight_mini"}  # names of T3's files
 SHARED = ("trunk", "post_norm")  # what T3's sensors have in common
 _HEADS = {192: 3, 1152: 16} | VISION_HEADS
-_DECODER = Stack(512, 8, 16, 2048)  # a family has none
 
 
 @dataclass(frozen=True)
@@ -59,8 +57,8 @@ class Family:
     """One layout of a family's files.
 
     A file is of the family if, after one of the `prefixes`, it has all keys in `needs` and none in `lacks`, and
-    `beside` without the prefix. The first of `needs` is the patch kernel, which has five axes in a family of `video`.
-    Keys in `unused` (a regex) are not read, and neither are those without the prefix. `renamed` comes first.
+    `beside` without the prefix. The patch kernel, first of `needs`, has five axes for `video`. Keys in `unused` (a
+    regex) are not read. `renamed` comes first.
     """
 
     name: str
@@ -127,13 +125,12 @@ FAMILIES = (
             lacks=("cls_token",), unused="mask_token", image_size=(320, 240), frames=frames, video=frames == 4,
             feature="mean", tokens="patches",
         )
-        for title, table, frames, stride in (
-            ("Sparsh", layouts.SPARSH, 2, 5), ("Sparsh V-JEPA", layouts.SPARSH_VIDEO, 4, 2)
-        )
+        for title, table, frames, stride in (("Sparsh", keymaps.SPARSH, 2, 5),
+                                             ("Sparsh V-JEPA", keymaps.SPARSH_VIDEO, 4, 2))
     ),
     Family(
         "anytouch2", "AnyTouch 2", "MIT", "GelSight, DIGIT, GelSight Mini, DuraGel by tokens",
-        layouts.ANYTOUCH2, ("touch_model.embeddings.patch_embedding.weight", "sensor_token"),
+        keymaps.ANYTOUCH2, ("touch_model.embeddings.patch_embedding.weight", "sensor_token"),
         Preparation("subtract", "offset", mean=CLIP_MEAN, std=CLIP_STD),  # not ImageNet's, unlike AnyTouch
         lacks=("video_patch_embedding.weight",), prefixes=("touch_mae_model.",), eps=1e-5, frames=4, video=True,
         unused=r"(decoder|mask_token|new_position_ids).*", feature="projected", tokens="hidden",
@@ -141,23 +138,23 @@ FAMILIES = (
     ),
     Family(
         "sitr", "SITR", "MIT by its README, without a licence file", "GelSight designs, by calibration images",
-        layouts.SITR, (*_TIMM_NEEDS, "contrastive_head.weight"),
+        keymaps.SITR, (*_TIMM_NEEDS, "contrastive_head.weight"),
         Preparation("subtract", "plain", crop="square",
                     mean=(-1.2223, -1.8114, -1.7090), std=(11.7932, 12.7956, 13.6452)),
         prefixes=("base_model.", ""), unused=r"decoder_pred\..*", eps=1e-5, feature="unit",
     ),
     Family(
         "dinov3", "DINOv3 (Hugging Face)", "DINOv3 licence", _IMAGES,
-        layouts.HF_DINOV3, ("embeddings.patch_embeddings.weight", "embeddings.cls_token", "layer.0.norm1.weight"),
+        keymaps.HF_DINOV3, ("embeddings.patch_embeddings.weight", "embeddings.cls_token", "layer.0.norm1.weight"),
         prefixes=("dinov3_vit.", ""), **_DINOV3,
     ),
     Family(
         "dinov3", "DINOv3 (timm's or its authors' layout)", "DINOv3 licence", _IMAGES,
-        layouts.DINOV3, ("patch_embed.proj.weight", "cls_token", "register_tokens", "blocks.0.ls1.gamma"), **_DINOV3,
+        keymaps.DINOV3, ("patch_embed.proj.weight", "cls_token", "register_tokens", "blocks.0.ls1.gamma"), **_DINOV3,
     ),
     Family(
         "siglip", "SigLIP or SigLIP 2 (vision tower of Hugging Face)", _APACHE, _IMAGES,
-        layouts.SIGLIP, tuple(f"embeddings.{name}" for name in (
+        keymaps.SIGLIP, tuple(f"embeddings.{name}" for name in (
             "patch_embedding.weight", "patch_embedding.bias", "position_embedding.weight")),
         Preparation(filter="bicubic", mean=(0.5,) * 3, std=(0.5,) * 3), lacks=("embeddings.class_embedding",),
         prefixes=("vision_model.", "model.vision_model.", ""), resample="bicubic", feature="pooled",
@@ -165,39 +162,39 @@ FAMILIES = (
     ),
     Family(
         "vit", "DeiT III (timm's layout)", _APACHE, _IMAGES,
-        layouts.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "head.weight"), _PHOTO, lacks=("register_tokens",),
+        keymaps.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "head.weight"), _PHOTO, lacks=("register_tokens",),
         unused=_PARTS, resample="antialias", bare_class=True,
     ),
     Family(
         "dinov2", "DINOv2 (Hugging Face)", _APACHE, _IMAGES,
-        layouts.HF_DINOV2, (*_HF_NEEDS, "encoder.layer.0.layer_scale1.lambda1"), _PHOTO,
+        keymaps.HF_DINOV2, (*_HF_NEEDS, "encoder.layer.0.layer_scale1.lambda1"), _PHOTO,
         prefixes=("dinov2.", "dinov2_with_registers.", ""), resample="bicubic", **_DINOV2,
     ),
     Family(
         "dinov2", "DINOv2 with registers (timm's layout)", _APACHE, _IMAGES,
-        layouts.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "register_tokens"), _PHOTO, beside="reg_token",
+        keymaps.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "register_tokens"), _PHOTO, beside="reg_token",
         renamed=(("^reg_token$", "register_tokens"),), bare_class=True, **_DINOV2,
     ),
     Family(
         "dinov2", "DINOv2 (its authors' layout)", _APACHE, _IMAGES,
-        layouts.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma"), _PHOTO, resample="shifted", **_DINOV2,
+        keymaps.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma"), _PHOTO, resample="shifted", **_DINOV2,
     ),
     Family(
         "vit_mae", "ViT-MAE (Hugging Face)", _NON_COMMERCIAL, _IMAGES,
-        layouts.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO,
+        keymaps.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO,
         beside="decoder.mask_token", **_HF_VIT,
     ),
     Family(
         "vit", "ViT or DeiT (Hugging Face)", _APACHE, _IMAGES,
-        layouts.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO, **_HF_VIT,
+        keymaps.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO, **_HF_VIT,
     ),
     Family(
         "t3", "T3", "MIT", "one file for each sensor",
-        layouts.T3, (*_TIMM_NEEDS, "trunk.norm.weight"), replace(_PHOTO, filter="bilinear"), resample="bicubic",
+        keymaps.T3, (*_TIMM_NEEDS, "trunk.norm.weight"), replace(_PHOTO, filter="bilinear"), resample="bicubic",
     ),
     Family(
         "vit", "ViT, DeiT or MAE (timm's layout)", "that of the weights (DeiT: Apache-2.0, MAE: CC BY-NC 4.0)", _IMAGES,
-        layouts.TIMM, (*_TIMM_NEEDS, "norm.weight"), _PHOTO, unused=_PARTS, resample="antialias",
+        keymaps.TIMM, (*_TIMM_NEEDS, "norm.weight"), _PHOTO, unused=_PARTS, resample="antialias",
     ),
 )
 # fmt: on
@@ -243,10 +240,7 @@ def _refuse_relatives(path: Path, weights: Weights) -> None:
 def load_family(
     path: Path, *, heads: int | None = None, image_size: Any = None
 ) -> tuple[FamilyModel | None, Weights | None]:
-    """Return the encoder of a file or folder of a family, or None; and the arrays of the file if it was read.
-
-    See `read_family`. A folder of T3 has trunk.pth and encoders/SENSOR.pth. Raises WeightsError.
-    """
+    """Return the encoder of a family's file or folder, or None, and the arrays that were read. Raises WeightsError."""
     if not path.exists() or path.suffix.lower() == ".npz" or load.is_run_folder(path):
         return None, None
     trunks = (path / "trunk.pth",) if path.is_dir() else (path.parent / "trunk.pth", path.parent.parent / "trunk.pth")
@@ -267,18 +261,13 @@ def load_family(
     names, models = (*sensors, UNIVERSAL), []
     for one in sensors.values():
         content = weights if one == file else load.read_weights(one)
-        models.append(
-            read_family(one, {**content, **rest}, _folder(trunk), heads=heads, image_size=image_size, sensors=names)
-        )
+        whole = {**content, **rest}
+        models.append(read_family(one, whole, _folder(trunk), heads=heads, image_size=image_size, sensors=names))
     first = models[0]
     if first is None or any(model is None or model.form != first.form for model in models):
         raise WeightsError(f"the encoders {', '.join(sensors)} of {path} have different forms; load one file at a time")
-    params = {
-        name: array
-        if name.split("/")[0] in SHARED or len(models) == 1
-        else np.stack([m.params[name] for m in models if m])
-        for name, array in first.params.items()
-    }
+    several = [] if len(models) == 1 else [name for name in first.params if name.split("/")[0] not in SHARED]
+    params = first.params | {name: np.stack([m.params[name] for m in models if m]) for name in several}
     return replace(first, params=params), None
 
 
@@ -300,8 +289,8 @@ def read_family(
 ) -> FamilyModel | None:  # fmt: skip
     """Return the encoder of a file, None for a file of no family.
 
-    `folder` is the config.json in its folder. It gives the number of heads, the epsilon of LayerNorms and changes of
-    the preparation. `image_size` is a side or (height, width). `sensors` are T3's. Raises WeightsError.
+    `folder` is the config.json: heads, epsilon, changes of the preparation. `image_size` is a side or (height, width).
+    `sensors` are T3's. Raises WeightsError.
     """
     if (found := find_family(weights)) is None:
         return None
@@ -342,10 +331,7 @@ def read_family(
 def _completed(
     family: Family, weights: dict[str, np.ndarray], folder: Mapping[str, Any], heads: int | None
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of a file with those that its layout leaves out, because they are zero or computed.
-
-    They are biases of DINOv3, its periods, and the position of a class token.
-    """
+    """Return a file's arrays with those left out: biases and periods of DINOv3, the position of a class token."""
     own = dict(weights)
     if family.bare_class:
         own["pos_embed"] = np.concatenate([np.zeros_like(own["pos_embed"][:, :1]), own["pos_embed"]], axis=1)
@@ -393,9 +379,8 @@ def touch_of_photographs(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return a touch encoder that gives a still the tokens of a ViT of photographs, and sentences to log.
 
-    The patch kernel is repeated over the frames and divided by their number. Its bias goes into the positions, which
-    are resized, and layer scales into the layers before them. Sensor tokens and the projection are those of `fresh`.
-    Raises UserError for another family, and for a network of another form than the run's.
+    The patch kernel is divided among the frames. Its bias goes into the resized positions, and layer scales into the
+    layers before them. Raises UserError for another family, and for a network of another form.
     """
     form, ours = model.form, config.model
     has_tokens = {"position", "class_token"} <= model.params.keys() and not form.tanh
@@ -406,7 +391,7 @@ def touch_of_photographs(
         )
     kept = {name: getattr(ours, name) for name in ("embed", "frames", "sensor_tokens", "patch_encoder", "decoder")}
     theirs = replace(form.model, **kept, decoder_norm_eps=ours.decoder_norm_eps, pre_norm=form.pre_norm)
-    compatible.check_form(Path(source), theirs, config)
+    convert.check_form(Path(source), theirs, config)
     if ours.activation != "gelu":
         raise UserError(f"{source} was trained with gelu; leave out --model.activation {ours.activation}")
     own = {name: array for name, array in model.params.items() if name.startswith(("blocks/", "post_norm/", "pre_"))}
@@ -414,7 +399,7 @@ def touch_of_photographs(
         if (factor := own.pop(f"blocks/{scale}/scale", None)) is not None:
             own[f"blocks/{branch}/kernel"] = own[f"blocks/{branch}/kernel"] * factor[:, None]
             own[f"blocks/{branch}/bias"] = own[f"blocks/{branch}/bias"] * factor
-    position = compatible.resize_position(model.params["position"], ours.patches + 1)
+    position = convert.resize_position(model.params["position"], ours.patches + 1)
     position[1:] += model.params.get("patch/bias", np.float32(0))
     shape = fresh["patch"]["kernel"].shape
     own["patch/kernel"] = np.broadcast_to(model.params["patch/kernel"][0], shape) / np.float32(shape[-3])
@@ -466,46 +451,29 @@ def form_of(
     eps = folder.get("layer_norm_eps", family.eps)
     if not isinstance(eps, float | int) or not 0 < eps < 1:
         raise WeightsError(f"layer_norm_eps of the config.json is {str(eps)[:40]}; correct it")
-    if (activation := folder.get("hidden_act", family.activation)) != family.activation:
-        raise WeightsError(
-            f"hidden_act of the config.json is {str(activation)[:40]}; only {family.activation} is computed here"
-        )
+    if (stated := folder.get("hidden_act", family.activation)) != family.activation:
+        ours = family.activation
+        raise WeightsError(f"hidden_act of the config.json is {str(stated)[:40]}; only {ours} is computed here")
+    touch = Stack(width, find_depth(rows["blocks/norm1/scale"].key, weights), _heads(width, heads, folder), mlp)
+    model = ModelConfig(
+        max(size), patch, outputs or width, touch, keymaps.DECODER, frames=frames, sensors=sensors or (UNIVERSAL,),
+        sensor_tokens=own[1], norm_eps=float(eps),
+    )  # fmt: skip
     return VitConfig(
-        ModelConfig(
-            image_size=max(size),
-            patch=patch,
-            embed=outputs or width,
-            touch=Stack(width, find_depth(rows["blocks/norm1/scale"].key, weights), _heads(width, heads, folder), mlp),
-            decoder=_DECODER,
-            frames=frames,
-            sensors=sensors or (UNIVERSAL,),
-            sensor_tokens=own[1],
-            norm_eps=float(eps),
-        ),
-        tubelet,
-        grid,
-        axes=shape("frequency")[0] if has("frequency") else 2,
+        model, tubelet, grid, outputs=outputs, tanh=family.activation != "gelu",
         resample="antialias" if family.name == "dinov2" and has("registers") else family.resample,
-        class_token=has("class_token"),
+        axes=shape("frequency")[0] if has("frequency") else 2,
         registers=shape("registers")[0] if has("registers") else 0,
-        patch_bias=has("patch/bias"),
-        layer_scale=has("blocks/scale1/scale"),
-        pre_norm=has("pre_norm/scale"),
         trunk=find_depth(rows["trunk/norm1/scale"].key, weights) if has("trunk/norm1/scale") else 0,
         calibration=shape("calibration/kernel")[0] if has("calibration/kernel") else 0,
-        outputs=outputs,
-        output_bias=has("projection/bias"),
-        rotary=has("periods"),
-        tanh=family.activation != "gelu",
+        class_token=has("class_token"), patch_bias=has("patch/bias"), layer_scale=has("blocks/scale1/scale"),
+        pre_norm=has("pre_norm/scale"), output_bias=has("projection/bias"), rotary=has("periods"),
         pool=has("pool/probe"),
-    ), size
+    ), size  # fmt: skip
 
 
 def _grid(places: int, family: Family, time: int, size: Size | None, patch: int) -> tuple[int, int, int]:
-    """Return (time, rows, columns) of a number of stored positions.
-
-    `size` gives it where positions are not resized. Else it is in Sparsh's shape of 4:3, or square, or of `size`.
-    """
+    """Return (time, rows, columns) of stored positions: of `size` if not resized, 4:3 (Sparsh), or square."""
     rows, columns = (0, 0) if size is None else (size[0] // patch, size[1] // patch)
     given = (places // max(rows * columns, 1) if family.video else 1, rows, columns)
     grids = [given]
@@ -531,3 +499,94 @@ def _heads(width: int, heads: int | None, folder: Mapping[str, Any]) -> int:
     if type(count) is not int or not 0 < count <= 1024 or width % count:
         raise WeightsError(f"a width of {width} cannot have {str(count)[:40]} heads; correct the number of heads")
     return count
+
+
+# Preprocessing that timm (config.json) or Hugging Face (preprocessor_config.json) states in a file next to weights.
+_FILTERS = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
+_HF_STEPS = {"do_resize", "do_center_crop", "do_rescale", "do_normalize", "do_convert_rgb"}
+_HF_VALUES = {"size", "crop_size", "resample", "rescale_factor", "image_mean", "image_std", "image_processor_type",
+              "feature_extractor_type", "processor_class", "_valid_processor_keys", "data_format", "input_data_format",
+              "return_tensors", "device", "default_to_square", "disable_grouping"}  # fmt: skip
+_TIMM = ("mean", "std", "interpolation", "crop_pct", "crop_mode", "input_size")
+
+
+def stated_steps(config: Mapping[str, Any], theirs: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
+    """Return changes of a Preparation, the (height, width) of the input or None, and what of both files is ignored."""
+    if theirs:
+        return _hugging_face(theirs)
+    timm = config.get("pretrained_cfg", config if "architecture" in config else None)
+    return _timm(timm) if isinstance(timm, Mapping) and timm.keys() & {*_TIMM} else ({}, None, [])
+
+
+def _timm(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
+    changes: dict[str, Any] = {key: stated[key] for key in ("mean", "std") if key in stated}
+    size, ignored = _size(list(stated.get("input_size", ()))[1:]), list[str]()
+    _add_filter(changes, stated.get("interpolation"), ignored)
+    share, mode = stated.get("crop_pct", 1.0), stated.get("crop_mode", "center")
+    if size is not None and isinstance(share, int | float) and 0 < share <= 1:
+        if mode == "center":
+            changes |= {"crop": "centre", "shorter": int(max(size) / share)}
+        elif mode == "squash" and share == 1:
+            changes |= {"crop": "none", "shorter": None}
+        else:
+            ignored.append(f"crop_mode {mode} with crop_pct {share}")
+    elif "crop_pct" in stated:
+        ignored.append(f"crop_pct {share}")
+    return changes, size, ignored
+
+
+def _hugging_face(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
+    changes: dict[str, Any] = {}
+    known = {*_HF_STEPS, *_HF_VALUES}
+    ignored = [f"{name} {str(value)[:40]}" for name, value in stated.items()
+               if name not in known and value not in (None, False)]  # fmt: skip
+    does = {name: stated.get(name, name != "do_center_crop" or "crop_size" in stated) for name in _HF_STEPS}
+    _add_filter(changes, stated.get("resample"), ignored)
+    resized, cropped = stated.get("size"), _size(stated.get("crop_size"))
+    edge = resized.get("shortest_edge") if isinstance(resized, Mapping) else None
+    if edge is None and type(resized) is int and does["do_center_crop"]:
+        edge = resized
+    whole = None if edge is not None else _size(resized)
+    size = cropped if does["do_center_crop"] and cropped else whole
+    if not does["do_resize"]:
+        ignored.append("do_resize false")
+    elif does["do_center_crop"] and cropped and type(edge) is int:
+        changes |= {"crop": "centre", "shorter": edge}
+    elif whole is not None and (not does["do_center_crop"] or cropped in (None, whole)):
+        changes |= {"crop": "none", "shorter": None}
+    elif resized is not None:
+        ignored.append(f"size {resized} with crop_size {stated.get('crop_size')}")
+    scale = 1.0  # of the values 0 to 1 that are normalised here
+    if not does["do_rescale"]:
+        scale = 255.0
+    elif isinstance(factor := stated.get("rescale_factor", 1 / 255), int | float) and factor > 0:
+        scale = 255.0 * factor
+    else:
+        ignored.append(f"rescale_factor {str(factor)[:40]}")
+    given = {"mean": stated.get("image_mean"), "std": stated.get("image_std")}
+    if not does["do_normalize"]:
+        given = {"mean": [0.0] * 3, "std": [1.0] * 3}
+    if abs(scale - 1) > 1e-6 and all(_numbers(value) for value in given.values()):
+        given = {name: [number / scale for number in value] for name, value in given.items() if value is not None}
+    return changes | {name: value for name, value in given.items() if value is not None}, size, ignored
+
+
+def _add_filter(changes: dict[str, Any], stated: Any, ignored: list[str]) -> None:
+    name = _FILTERS[stated] if type(stated) is int and 0 <= stated < len(_FILTERS) else stated
+    if name in _FILTERS:
+        changes["filter"] = name
+    elif name not in (None, "random"):  # timm's training draws one
+        ignored.append(f"interpolation {str(name)[:40]}")
+
+
+def _numbers(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(one, int | float) for one in value)
+
+
+def _size(value: Any) -> tuple[int, int] | None:
+    """Return (height, width) of a side, a list or an object with them; None for anything else."""
+    if isinstance(value, Mapping):
+        value = [value.get("height"), value.get("width")]
+    sides = [value] * 2 if type(value) is int else value
+    fits = isinstance(sides, list) and len(sides) == 2 and all(type(side) is int and side > 0 for side in sides)
+    return (sides[0], sides[1]) if fits else None

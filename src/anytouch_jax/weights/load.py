@@ -14,20 +14,17 @@ import numpy as np
 from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
-from anytouch_jax.weights import checkpoint, compatible, registry
-from anytouch_jax.weights.compatible import map_sensors, match_sensors, resize_position, serve_unseen
-from anytouch_jax.weights.convert import check_arrays, detect_form, detect_layout, refuse_unknown, to_params
-from anytouch_jax.weights.keymaps import Weights, param_shapes
-from anytouch_jax.weights.safetensors import (
-    BACKGROUND_KEY,
-    MODEL_KEY,
-    SEEN_KEY,
-    Loaded,
-    WeightsError,
-    existing_file,
-    read_file_metadata,
-    read_safetensors,
+from anytouch_jax.weights import checkpoint, convert, registry, safetensors
+from anytouch_jax.weights.convert import (
+    check_arrays,
+    detect_form,
+    detect_layout,
+    map_sensors,
+    resize_position,
+    to_params,
 )
+from anytouch_jax.weights.keymaps import Weights, param_shapes
+from anytouch_jax.weights.safetensors import Loaded, WeightsError
 from anytouch_jax.weights.torch_file import read_torch
 from anytouch_jax.weights.tree import flatten
 
@@ -55,9 +52,8 @@ def load_model(
 ) -> Loaded:
     """Load an encoder by name, a run folder, a checkpoint folder, a weights file or a folder with a .pth file.
 
-    `step` chooses a checkpoint of a run, the latest by default. With `stored_rows` the rows of a file for sensors
-    outside its training are unchanged, as a conversion needs them. `weights` are those of the file, if they are read
-    already. Raises UserError.
+    `step` chooses a checkpoint, the latest by default. With `stored_rows` the rows for sensors outside the training are
+    unchanged, as a conversion needs them. `weights` are those of the file, if they are read. Raises UserError.
     """
     path = registry.locate(path)
     if not path.exists():
@@ -69,14 +65,16 @@ def load_model(
     if is_run_folder(path):
         params, text, metadata = checkpoint.load_params(path, step)
         config: Config = from_json(text)
-        _check_shapes(path, params, config.model)
+        wanted = {name: form for name, form in param_shapes(config.model).items() if name.split("/")[0] in params}
+        arrays = flatten(params)  # runs of version 0.1 have more
+        check_arrays(f"arrays of {path}", {name: x for name, x in arrays.items() if name in wanted}, wanted)
         trained = metadata.get("seen")
         drawn, from_run = config.objective.universal_start + config.objective.universal_end > 0, True
     else:
         path = find_weights_file(path)
         weights = read_weights(path) if weights is None else weights
-        model, file_metadata = model_of_file(path, weights), read_file_metadata(path)
-        background: Any = file_metadata.get(BACKGROUND_KEY, "keep")
+        model, file_metadata = model_of_file(path, weights), safetensors.read_file_metadata(path)
+        background: Any = file_metadata.get(safetensors.BACKGROUND_KEY, "keep")
         with _naming(path):
             params, config = to_params(weights, model), Config(model, data=DataConfig(background=background))
         # A run without universal tokens was exported with the mean of its sensors in their place.
@@ -85,7 +83,7 @@ def load_model(
     check_finite(path, flatten(params))
     check_finite(path, weights or {})  # an array that nobody reads shows a damaged file, too
     if trained is not None and "touch" in params and (from_run or not stored_rows):
-        params |= {"touch": serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
+        params |= {"touch": convert.serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
     return Loaded(path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run)
 
 
@@ -99,20 +97,11 @@ def _naming(path: str | Path) -> Iterator[None]:
         raise error if str(path) in text else WeightsError(f"{path}: {text}") from None
 
 
-def _check_shapes(path: Path, params: Params, model: ModelConfig) -> None:
-    """Raise WeightsError if the arrays of a run are not those of its configuration; runs of version 0.1 have more."""
-    arrays, wanted = flatten(params), param_shapes(model)
-    check_arrays(
-        f"arrays of {path}", {name: array for name, array in arrays.items() if name in wanted},
-        {name: shape for name, shape in wanted.items() if name.partition("/")[0] in params},
-    )  # fmt: skip
-
-
 def trained_sensors(metadata: Mapping[str, str], model: ModelConfig) -> tuple[str, ...] | None:
     """Return the sensors that a file was trained on: as its metadata says, or the authors' for a file of theirs."""
-    if SEEN_KEY in metadata:
-        return tuple(metadata[SEEN_KEY].split(","))
-    return _RELEASE_SENSORS if MODEL_KEY not in metadata and model.sensors == SENSORS else None
+    if safetensors.SEEN_KEY in metadata:
+        return tuple(metadata[safetensors.SEEN_KEY].split(","))
+    return _RELEASE_SENSORS if safetensors.MODEL_KEY not in metadata and model.sensors == SENSORS else None
 
 
 def load_init(
@@ -138,11 +127,11 @@ def load_init(
     if clip is not None:
         file = find_weights_file(clip)
         trained_by = clip_activation(file)
-        compatible.check_activation(file, trained_by, config)
+        convert.check_activation(file, trained_by, config)
         towers = read_weights(file)
         check_finite(file, towers)
         if detect_layout(towers) in ("clip", "openclip"):
-            compatible.check_clip(file, model_of_file(file, towers), config, touch=init is None)
+            convert.check_clip(file, model_of_file(file, towers), config, touch=init is None)
             if trained_by is None:
                 ours, other = sorted(("gelu", "quick_gelu"), key=config.model.activation.__ne__)
                 notes.append(
@@ -158,13 +147,13 @@ def load_init(
 def _check_init(loaded: Loaded, config: Config) -> None:
     """Raise UserError if a run or a file cannot start this run."""
     path, model = loaded.path, loaded.config.model
-    compatible.check_activation(path, model.activation if loaded.from_run else clip_activation(path), config)
+    convert.check_activation(path, model.activation if loaded.from_run else clip_activation(path), config)
     if "touch" not in loaded.params:
         raise UserError(f"{path} has no touch encoder; give a run, an encoder by name, or the authors' weights")
     if "decoder" not in loaded.params:  # an encoder of the package: the decoder starts untrained
         ours = config.model
         model = replace(model, decoder=ours.decoder, decoder_norm_eps=ours.decoder_norm_eps)
-    compatible.check_form(path, model, config, preset=loaded.config.preset if loaded.from_run else "custom")
+    convert.check_form(path, model, config, preset=loaded.config.preset if loaded.from_run else "custom")
 
 
 def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[str]:
@@ -184,9 +173,8 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     if config.reconstructs and not has_decoder:
         notes.append(f"{path} has no decoder, so the decoder starts untrained")
     if dropped := sorted((fresh_parts & set(loaded.params)) - {*_STARTS}):
-        notes.append(
-            f"{path} gives the touch encoder{' and the decoder' * has_decoder}; {', '.join(dropped)} start untrained"
-        )
+        decoder = " and the decoder" * has_decoder
+        notes.append(f"{path} gives the touch encoder{decoder}; {', '.join(dropped)} start untrained")
     if loaded.config.model.patches != config.model.patches:
         notes.append(f"the positions of {path} are resized for images of {config.model.image_size} pixels")
     return notes
@@ -218,7 +206,7 @@ def _fit(loaded: Loaded, config: Config) -> Params:
     if loaded.config.model.fields != config.model.fields:
         parts.pop("fields", None)
     stored, wanted = loaded.config.model.sensors, config.model.sensors
-    touch = map_sensors(parts["touch"], config.model, lambda table: match_sensors(table, stored, wanted))
+    touch = map_sensors(parts["touch"], config.model, lambda table: convert.match_sensors(table, stored, wanted))
     return parts | {"touch": touch}
 
 
@@ -227,10 +215,9 @@ def first_params(
 ) -> Params:
     """Return fresh `params` with touch and decoder from `stage1`, and the towers and the temperature from CLIP.
 
-    Without `stage1` the touch encoder starts from CLIP's vision tower. The 2-D patch kernel is repeated over the
-    frames, as the authors do, and not divided by their number (golden Q1): the response to a still is three times
-    CLIP's. A tower without a projection leaves that of `params`. LoRA and the matching head stay fresh. Raises
-    WeightsError.
+    Without `stage1` the touch encoder starts from CLIP's vision tower. The patch kernel is repeated over the frames and
+    not divided, as the authors do (golden Q1): the response to a still is three times CLIP's. A tower without a
+    projection leaves that of `params`. Raises WeightsError.
     """
     merged = dict(params)
     if clip is not None and stage1 is None:
@@ -246,10 +233,7 @@ def first_params(
 
 
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
-    """Return `params` with the touch encoder from the image tower `image`; sensor tokens are unchanged.
-
-    The patch kernel is repeated over the frames. With `divide` the response to a still equals the tower's.
-    """
+    """Return `params` with the touch encoder of an image tower; with `divide` a still's response equals the tower's."""
     shape = params["touch"]["patch"]["kernel"].shape  # (T, ...), or (R, T, ...) with one kernel a sensor
     kernel = np.broadcast_to(np.asarray(image["patch"]["kernel"]), shape) / np.float32(shape[-3] if divide else 1)
     touch = {**image, "patch": {"kernel": kernel}, "sensor_tokens": params["touch"]["sensor_tokens"]}
@@ -286,11 +270,10 @@ def _weights_files(folder: Path) -> list[Path]:
 def read_weights(path: str | Path) -> dict[str, np.ndarray]:
     """Return the arrays of a .safetensors, .npz, .pth, .pt, .ckpt or .bin file by name, floats as float32.
 
-    An index of several files (`model.safetensors.index.json`) stands for all of them. Prefixes that a training
-    framework added to the names are removed. No code in a pickle is run. Raises WeightsError for a missing, truncated,
-    foreign or unsafe file.
+    An index stands for all of its files. Prefixes of training frameworks are removed. No code in a pickle is run.
+    Raises WeightsError for a missing, truncated, foreign or unsafe file.
     """
-    path = existing_file(path)
+    path = safetensors.existing_file(path)
     if shard := _SHARD.fullmatch(path.name):
         index = path.with_name(f"{shard[1]}{shard[3]}{_INDEX}")
         if not index.is_file():
@@ -308,13 +291,13 @@ def read_weights(path: str | Path) -> dict[str, np.ndarray]:
 def _read_file(path: Path) -> dict[str, np.ndarray]:
     suffix = path.suffix.lower()
     if suffix == ".safetensors":
-        return read_safetensors(path)[0]
+        return safetensors.read_safetensors(path)[0]
     if suffix in _TORCH:
         return read_torch(path)
     if suffix != ".npz":
         raise WeightsError(f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt, .ckpt or .bin file")
     try:
-        return read_arrays(existing_file(path))
+        return read_arrays(safetensors.existing_file(path))
     except (OSError, ValueError) as error:
         raise WeightsError(f"{path} is not a whole npz file of plain arrays: {error}") from error
 
@@ -347,17 +330,13 @@ def model_of_file(path: str | Path, weights: Weights) -> ModelConfig:
     """Return the model of a weights file, see `form_of_file`. Raises WeightsError for unknown head counts."""
     model, unknown = form_of_file(path, weights)
     with _naming(path):
-        refuse_unknown(unknown)
+        convert.refuse_unknown(unknown)
     return model
 
 
 def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[str, int]]:
-    """Return the model of a weights file, and the widths of its stacks of unknown head counts.
-
-    It comes from the metadata if the file is ours, else from shapes and the configuration in the folder, which gives
-    head counts and the activation. Raises WeightsError.
-    """
-    if (text := read_file_metadata(path).get(MODEL_KEY)) is not None:
+    """Return the model of a file, and widths of stacks of unknown heads, by metadata or shapes. Raises WeightsError."""
+    if (text := safetensors.read_file_metadata(path).get(safetensors.MODEL_KEY)) is not None:
         return from_json(text, ModelConfig), {}
     config, openclip = _folder_config(path)
     with _naming(path):
@@ -402,12 +381,8 @@ def _object(value: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def clip_activation(path: str | Path) -> str | None:
-    """Return the activation of weights, which leaves no trace in the arrays; None if it is not stored.
-
-    It stands in the metadata of our files, in HF's config.json, or in OpenCLIP's open_clip_config.json. Raises
-    WeightsError for a file that is not JSON, and for an activation that this network does not have.
-    """
-    if (text := read_file_metadata(path).get(MODEL_KEY)) is not None:
+    """Return the activation that the files beside weights state, None if they do not. Raises WeightsError."""
+    if (text := safetensors.read_file_metadata(path).get(safetensors.MODEL_KEY)) is not None:
         return str(from_json(text, ModelConfig).activation)
     config, openclip = _folder_config(path)
     towers = [tower for name in ("text_config", "vision_config") if isinstance(tower := config.get(name), dict)]

@@ -50,9 +50,8 @@ def read_card(name: str) -> dict[str, Any]:
 def locate(model: str | Path) -> Path:
     """Return the path that a name, an address on the hub, or a path stands for.
 
-    A name of `list_encoders` comes before a folder of that name: write ./anytouch-tiny for the folder. An address is
-    hf://user/repo or hf://user/repo@revision; its files are kept in the cache of `huggingface_hub`. Raises UserError
-    for a damaged package, and for a repository that cannot be read.
+    A name comes before a folder of that name: write ./anytouch-tiny for the folder. An address is hf://user/repo or
+    hf://user/repo@revision. Raises UserError for a damaged package, and for a repository that cannot be read.
     """
     if str(model) == FORMER and not Path(model).exists():
         warnings.warn(f"{FORMER} has left the package: {DEFAULT} is used, which is better", stacklevel=2)
@@ -93,9 +92,8 @@ def write_encoder(
 ) -> Path:  # fmt: skip
     """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16, config.json, README.md.
 
-    The copy computes in float32, whatever its training did.
-    `parts` of the model are kept if it has them. `notes` is Markdown for the card: data with licences, results, limits.
-    Raises WeightsError for values that float16 cannot hold.
+    The copy computes in float32. `parts` of the model are kept. `notes` is Markdown for the card. Raises WeightsError
+    for values that float16 cannot hold.
     """
     from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors  # imports jax
     from anytouch_jax.weights.tree import flatten
@@ -119,18 +117,13 @@ def write_encoder(
     card = {
         "name": folder.name,
         "parameters": {
-            name: int(sum(np.size(leaf) for leaf in flatten(tree).values())) for name, tree in params.items()
+            part: int(sum(np.size(leaf) for leaf in flatten(tree).values())) for part, tree in params.items()
         },
-        "image_size": model.image_size,
-        "frames": model.frames,
-        "features": model.embed,
-        "background": loaded.config.data.background,
-        "trained_sensors": loaded.trained_sensors,
-        "stage": loaded.config.stage,
-        "steps": loaded.metadata.get("step", loaded.config.run.steps),
-        "recipe": loaded.config.recipe,
-        "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
-    }
+        "image_size": model.image_size, "frames": model.frames, "features": model.embed,
+        "background": loaded.config.data.background, "trained_sensors": loaded.trained_sensors,
+        "stage": loaded.config.stage, "steps": loaded.metadata.get("step", loaded.config.run.steps),
+        "recipe": loaded.config.recipe, "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
+    }  # fmt: skip
     atomic_write(folder / CARD, json.dumps(card, indent=2) + "\n")
     atomic_write(folder / "README.md", _page(card, notes))
     return folder

@@ -177,9 +177,6 @@ def _state(content: Any) -> dict[str, _Tensor]:
     return content
 
 
-# The pickle machine ---------------------------------------------------------------------------------------------------
-
-
 def _size(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ValueError(f"{type(value).__name__} where a size was expected")
@@ -244,10 +241,7 @@ def _refused(name: str) -> WeightsError:
 
 
 class _Unpickler(pickle._Unpickler):
-    """The standard library's reader in Python, without any operation that imports or calls.
-
-    The reader in C is not used: a deep tuple as a key ends the process in it, and one memo index takes 64 GiB.
-    """
+    """The library's reader in Python, without imports or calls. That in C ends the process at a deep tuple as a key."""
 
     stack: list[Any]
     readline: Callable[[], bytes]

@@ -12,10 +12,7 @@ from anytouch_jax.errors import UserError
 
 
 def flatten(tree: Any) -> dict[str, Any]:
-    """Return the leaves of a pytree by name: the keys, field names and indices of the path, joined with "/".
-
-    Raises UserError if two leaves get the same name.
-    """
+    """Return the leaves of a pytree by the path of names, joined with "/". Raises UserError for two of one name."""
     flat: dict[str, Any] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
@@ -26,10 +23,7 @@ def flatten(tree: Any) -> dict[str, Any]:
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the nested dict whose leaves have these names, the inverse of `flatten` for nested dicts.
-
-    Raises UserError if one name is the beginning of another.
-    """
+    """Return the nested dict of named leaves, as `flatten` reads it. Raises UserError if one name begins another."""
     tree: dict[str, Any] = {}
     for name, leaf in flat.items():
         *parents, last = name.split("/")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from anytouch_jax.data.loading.matching import Matches, MatchKeys
+from anytouch_jax.data.loading.sampling import Matches, MatchKeys
 
 
 def _keys(**columns):

@@ -29,7 +29,6 @@ def test_windows_are_what_the_words_say(monkeypatch, start, shuffle, block):
     for length in (1, 2, 3):
         want = _brute(sequence, frame, stride, length)
         assert w.clip_windows(sequence, frame, stride, length).tolist() == want and len(want) > 20
-        assert w.count_windows(sequence, frame, stride, length) == len(want)
         ends = rng.random(540) < 0.5
         assert w.clip_windows(sequence, frame, stride, length, ends=ends).tolist() == [
             one for one in want if ends[one[-1]]

@@ -10,6 +10,7 @@ from refused import refused
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import content, schema
 from anytouch_jax.data.manifest import manifest as m
+from anytouch_jax.data.prepare.prompts import attach_text
 from anytouch_jax.data.prepare.verify import verify
 
 HEAD = "path,sensor,sequence,frame_index,split"
@@ -277,21 +278,21 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     loose = make(plain_rows(text=None))
     csv = '\ufeffsequence,text\ns0,"soft, ""very""\nand round"\nq,unused\ns1,  \n'
     (tmp_path / "t.csv").write_text(csv, encoding="utf-8")
-    got, notes = m.attach_text(loose, tmp_path / "t.csv")
+    got, notes = attach_text(loose, tmp_path / "t.csv")
     assert got.column("text").to_pylist() == ['soft, "very" and round'] * 3 + [None] * 3
     assert notes == ["3 rows got a caption by 'sequence'", "1 of 2 keys of t.csv are not in the manifest"]
     (tmp_path / "u.csv").write_text("object,text\n cafe\u0301  noir,smooth\n", encoding="utf-8")
     drinks = m.replace_column(loose, "object", ["caf\u00e9 noir"] * 2 + ["tea"] * 4)
-    assert m.attach_text(drinks, tmp_path / "u.csv")[0].column("text").to_pylist() == ["smooth"] * 2 + [None] * 4
+    assert attach_text(drinks, tmp_path / "u.csv")[0].column("text").to_pylist() == ["smooth"] * 2 + [None] * 4
     table = pa.table({"frame_index": [0, 1], "words": ["new", "one"], "n": [1, 2]})
     pa.parquet.write_table(table, tmp_path / "t.parquet")
-    more, notes = m.attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")
+    more, notes = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")
     assert more.column("text").to_pylist() == ['soft, "very" and round'] * 3 + ["new", "one", None]
     assert notes == ["2 rows got a caption by 'frame_index'", "2 rows already had a caption"]
     nested = m.replace_column(got, "extra", pa.array([[0]] * len(got)))
     pa.parquet.write_table(pa.table({"extra": ["0"], "text": ["x"]}), tmp_path / "e.parquet")
-    refused("the key 'extra' must be a plain column, is list", m.attach_text, nested, tmp_path / "e.parquet")
-    over, _ = m.attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True)
+    refused("the key 'extra' must be a plain column, is list", attach_text, nested, tmp_path / "e.parquet")
+    over, _ = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True)
     assert over.column("text").to_pylist() == ["new", "one", 'soft, "very" and round', "new", "one", None]
 
 
@@ -310,8 +311,8 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
 )
 def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words):
     (tmp_path / "t.csv").write_text(text)
-    refused(words, m.attach_text, make(plain_rows()), tmp_path / "t.csv", **options)
-    refused("No such file", m.attach_text, make(plain_rows()), tmp_path / "none.csv")
+    refused(words, attach_text, make(plain_rows()), tmp_path / "t.csv", **options)
+    refused("No such file", attach_text, make(plain_rows()), tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(

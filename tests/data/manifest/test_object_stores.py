@@ -14,7 +14,7 @@ import pytest
 from refused import refused
 
 from anytouch_jax.data.loading.loader import Loader
-from anytouch_jax.data.manifest import remote
+from anytouch_jax.data.manifest import files
 from anytouch_jax.data.readers import IndexOptions, index
 from tests.data.loading.test_parts import config
 from tests.data.manifest.test_containers import write_tar
@@ -118,8 +118,8 @@ def check_store(url, corpus, tmp_path, monkeypatch):
     far = index("webdataset", tmp_path / "far", options=IndexOptions(sensor="digit", url=url)).manifest
     assert far.column("path").to_pylist() == [f"{url}/{path}" for path in near.column("path").to_pylist()]
     assert not (tmp_path / "cache").exists()
-    fetched, fetch = [], remote._fetch
-    monkeypatch.setattr(remote, "_fetch", lambda file, target: (fetched.append(file), fetch(file, target)))
+    fetched, fetch = [], files._fetch
+    monkeypatch.setattr(files, "_fetch", lambda file, target: (fetched.append(file), fetch(file, target)))
     loaders = [Loader(manifest, config()) for manifest in (near, far)]
     for step in range(4):
         batches = [loader.batch(step) for loader in loaders]
@@ -129,15 +129,15 @@ def check_store(url, corpus, tmp_path, monkeypatch):
     assert [file.read_bytes() for file in copies] == [
         (corpus / "train" / f"{shard}.tar").read_bytes() for shard in range(SHARDS)
     ]
-    refused(r"there is no .*/9\.tar", remote.local_copy, f"{url}/train/9.tar/0")
+    refused(r"there is no .*/9\.tar", files.local_copy, f"{url}/train/9.tar/0")
 
 
 def test_a_corpus_on_the_hub_gives_the_batches_of_the_folder(hub, corpus, tmp_path, monkeypatch):
     check_store(hub, corpus, tmp_path, monkeypatch)
-    refused(r"there is no hf://datasets/me/other/0\.tar", remote.local_copy, "hf://datasets/me/other/0.tar/0")
+    refused(r"there is no hf://datasets/me/other/0\.tar", files.local_copy, "hf://datasets/me/other/0.tar/0")
 
 
 @pytest.mark.slow
 def test_a_corpus_in_a_bucket_gives_the_batches_of_the_folder(bucket, corpus, tmp_path, monkeypatch):
     check_store(bucket, corpus, tmp_path, monkeypatch)
-    refused(r"there is no s3://other/0\.tar", remote.local_copy, "s3://other/0.tar/0")
+    refused(r"there is no s3://other/0\.tar", files.local_copy, "s3://other/0.tar/0")

@@ -15,7 +15,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import close_shards
 from anytouch_jax.data.prepare import captions
 from anytouch_jax.data.prepare.captions import AnnotateError, Endpoint, annotate, sample_sheet
-from anytouch_jax.data.prepare.prompts import find_caption_jobs, make_prompt
+from anytouch_jax.data.prepare.prompts import BadAnswer, find_caption_jobs, make_prompt
 from anytouch_jax.data.prepare.shards import pack
 from anytouch_jax.files import lock
 
@@ -43,7 +43,7 @@ def _ask(server, **options):
     return asyncio.run(_ask_at(server.url, **options))
 
 
-FAILED = (captions._QuestionError, captions.BadAnswer, AnnotateError)
+FAILED = (captions._QuestionError, BadAnswer, AnnotateError)
 
 
 def _failed(answer, words, **options):

@@ -14,10 +14,19 @@ from refused import refused
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import replace_column, select_rows
-from anytouch_jax.data.prepare.licences import NO, UNKNOWN, YES, allows, commercial_only, commercial_use, licences
-from anytouch_jax.data.prepare.repair import repair
 from anytouch_jax.data.prepare.shards import pack
-from anytouch_jax.data.prepare.verify import split_hash, verify
+from anytouch_jax.data.prepare.verify import (
+    NO,
+    UNKNOWN,
+    YES,
+    allows,
+    commercial_only,
+    commercial_use,
+    licences,
+    repair,
+    split_hash,
+    verify,
+)
 
 
 @pytest.fixture

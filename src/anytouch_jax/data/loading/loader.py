@@ -41,15 +41,9 @@ class Loader:
     """
 
     def __init__(
-        self,
-        manifest: Manifest,
-        config: Config,
-        *,
-        tokenizer: Tokenizer | None = None,
-        devices: int = 1,
-        shard: tuple[int, int] = (0, 1),
-        log: Callable[[str], None] = lambda _: None,
-    ) -> None:
+        self, manifest: Manifest, config: Config, *, tokenizer: Tokenizer | None = None, devices: int = 1,
+        shard: tuple[int, int] = (0, 1), log: Callable[[str], None] = lambda _: None,
+    ) -> None:  # fmt: skip
         if devices < 1:
             raise UserError(f"devices must be 1 or more, not {devices}")
         self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
@@ -58,11 +52,10 @@ class Loader:
         self._match_size = max(1, size // 2) if config.splits_steps else size
         self._in_batch_negatives = config.model.match_head == "cosine"  # instead of a third touch
         contrasted = [size, self._match_size] if self._in_batch_negatives else [size]
-        for rows in contrasted if config.stage == 2 else ():
-            if rows % groups:
-                raise UserError(
-                    f"a batch of {rows} touches does not divide by --objective.groups {groups}; change one of them"
-                )
+        if config.stage == 2 and (odd := [rows for rows in contrasted if rows % groups]):
+            raise UserError(
+                f"a batch of {odd[0]} touches does not divide by --objective.groups {groups}; change one of them"
+            )
         for name, number in (("devices", devices), ("batch_size", size)):
             self._shard.check(number, name)
         self._reader, self._log, self._replaced = SampleReader(manifest, config), log, set[str]()

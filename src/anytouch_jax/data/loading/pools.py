@@ -15,8 +15,14 @@ import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config
 from anytouch_jax.data.gels import ADVICE, UnitGels
-from anytouch_jax.data.loading.matching import Matches, MatchKeys, is_shared_touch
-from anytouch_jax.data.loading.sampling import EpochSampler, PartSampler, StratumQuota
+from anytouch_jax.data.loading.sampling import (
+    EpochSampler,
+    Matches,
+    MatchKeys,
+    PartSampler,
+    StratumQuota,
+    is_shared_touch,
+)
 from anytouch_jax.data.manifest.manifest import Manifest, ManifestError, sensor_rows
 from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
@@ -52,10 +58,7 @@ class MatchPool(NamedTuple):
 
 
 class Pools(NamedTuple):
-    """All pools of a run: `touch` (stills, then clips if there are any) and `match` (stills, clips, None if empty).
-
-    `sensor` i32 (rows of the manifest,) holds sensor-table rows, -1 for rows left out. `notes` are for the user.
-    """
+    """All pools of a run, None or absent if empty; `sensor` i32 (rows,) are sensor-table rows, -1 for rows left out."""
 
     touch: tuple[Pool, ...]
     match: tuple[MatchPool | None, MatchPool | None]
@@ -67,8 +70,8 @@ class Pools(NamedTuple):
 class _Usable(NamedTuple):
     """Rows that a run may use: `rows` i64 ids that may be drawn; the other arrays have a value per manifest row.
 
-    `sensor` is as in `Pools`, `weights` f64 draws per epoch (None: 1), and `ends` bool whether a clip may end there.
-    `has_image` and `has_text` bool is whether it has a modality that the model has a tower for.
+    `sensor` is as in `Pools`, `weights` f64 draws per epoch (None: 1), `ends` whether a clip may end there. `has_image`
+    and `has_text` are False without a tower.
     """
 
     sensor: np.ndarray
@@ -106,9 +109,8 @@ def find_pools(
     length = frames + config.reconstructs
     stills, clips = usable.rows[:, None], _clips(manifest, config, usable, length)
     shards = _shards(manifest) if data.parts else None
-    touch = tuple(
-        _pool(config, usable, kind, ids, devices, shards) for kind, ids in enumerate((stills, clips)) if len(ids)
-    )
+    kinds = [(kind, ids) for kind, ids in enumerate((stills, clips)) if len(ids)]
+    touch = tuple(_pool(config, usable, kind, ids, devices, shards) for kind, ids in kinds)
     if len(touch) == 1 and data.clip_share:
         notes.append(f"split {data.split!r} has no clip of {length} frames, so all batches are stills")
     match: tuple[MatchPool | None, MatchPool | None] = (None, None)
@@ -139,10 +141,7 @@ def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> 
 
 
 def _shards(manifest: Manifest) -> np.ndarray:
-    """Return a number for the shard of each row, i64 (rows,): its path without the entry. A loose file's is its folder.
-
-    Rows of several manifests have different shards.
-    """
+    """Return the shard of each row, i64 (rows,): its manifest with its path without the entry, or its folder."""
     folder = pc.replace_substring_regex(manifest.column("path").combine_chunks(), r"/[^/]*$", "")
     place = pc.replace_substring_regex(folder, r"\.parquet/[^/]*$", ".parquet")
     codes = np.asarray(place.dictionary_encode().indices).astype(np.int64)
@@ -255,9 +254,8 @@ def _required(
     count, words = int(allowed[rows].sum()), " and ".join(wanted)
     option = "data.contact_only" if wanted == ["contact"] else "data.require"
     if not count:
-        raise UserError(
-            f"{option}: no row of split {config.data.split!r} has {words}; add some, or leave the option out"
-        )
+        split = config.data.split
+        raise UserError(f"{option}: no row of split {split!r} has {words}; add some, or leave the option out")
     return allowed, [f"{count} of {len(rows)} rows have {words}; only they are drawn ({option})"]
 
 
@@ -293,9 +291,8 @@ def epoch_weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple
 def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
     """Return the rows whose text is not trained on, bool (rows,).
 
-    They are in a test split of a downstream task (column `downstream_test`), so that their text may name the label
-    (paper, appendix). Without `aligned_text` they include touches shared by sensors or units (Table 6, "w/o Text in
-    TacQuad").
+    These are in a test split of a downstream task (column `downstream_test`; paper, appendix), and without
+    `aligned_text` touches shared by sensors or units (Table 6, "w/o Text in TacQuad").
     """
     tested = _in_downstream_test(manifest)
     return tested if aligned_text else tested | _is_aligned(manifest)
@@ -333,8 +330,8 @@ def choose_tokenizer(
 ) -> tuple[Tokenizer | None, list[str]]:
     """Return the tokenizer of a run, and notes: from `file`, else `data.tokenizer`, else trained on the captions.
 
-    Captions are those of `rows` that may be trained on; without any the tokenizer is None. A trained tokenizer has at
-    most `vocabulary` tokens (default: as many as the text tower). Raises UserError for a file that cannot be used.
+    Captions are those of `rows` that may be trained on; without any it is None. A trained one has at most `vocabulary`
+    tokens, by default as many as the text tower. Raises UserError.
     """
     path = file or config.data.tokenizer
     if path is not None:

@@ -36,12 +36,7 @@ class SampleError(UserError):
 
 @dataclass(frozen=True)
 class SampleReader:
-    """Reads samples of `manifest` at the model's size, augmented by the settings of `config`.
-
-    The first resized frames that fit into `data.cache` MB stay in memory, so a small data set is read once. The
-    samples do not depend on it. `gels` are the pictures that are subtracted, by default those of the rule in
-    `data.gels`, None if none is.
-    """
+    """Reads samples of `manifest` at the model's size, augmented as `config` says; the first frames are cached."""
 
     manifest: Manifest
     config: Config
@@ -55,12 +50,11 @@ class SampleReader:
     def touch(
         self, rows: np.ndarray, epoch: int | None, out: np.ndarray | None = None, prepare: Prepare | None = None
     ) -> np.ndarray:
-        """Return the frames of a window of rows, u8 (T, size, size, 3); `epoch` None means no augmentation.
+        """Return the frames of a window of rows, u8 (T, size, size, 3), not augmented if `epoch` is None.
 
-        They are written into `out` once all frames could be read, else into a new array. The last row seeds the
-        augmentation of the whole clip. A background that is subtracted is augmented too: otherwise the change of
-        brightness would be stronger than the contact. `prepare` (without augmentation) replaces both resizing and
-        subtraction. Raises SampleError.
+        They are written into `out` once all could be read. The last row seeds the augmentation of the clip. A
+        background that is subtracted is augmented too: else the change of brightness would be stronger than the
+        contact. `prepare` replaces resizing and subtraction. Raises SampleError.
         """
         size, data = self.config.model.image_size, self.config.data
         plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
@@ -99,9 +93,8 @@ class SampleReader:
             return self.config.data.background == "subtract"
         if gel is None and self.manifest.value(row, "background_path") is None:
             return False
-        return epoch is None or bool(
-            np.random.default_rng([self.config.run.seed, epoch, row, _SUBTRACT]).random() < 0.5
-        )
+        seed = self.config.run.seed
+        return epoch is None or bool(np.random.default_rng([seed, epoch, row, _SUBTRACT]).random() < 0.5)
 
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
         """Return the photograph of a row, u8 (size, size, 3); `epoch` None means no augmentation."""
@@ -133,10 +126,7 @@ class SampleReader:
 def read_image(
     manifest: Manifest, row: int, column: str = "path", load: Callable[[Path], np.ndarray] | None = None
 ) -> np.ndarray:
-    """Return the image in a path column of a row, RGB u8 (h, w, 3), by `load` (default: `decode`).
-
-    Raises SampleError, which names the row and the column.
-    """
+    """Return the image in a path column, RGB u8 (h, w, 3), by `load` (`decode`). Raises SampleError with its place."""
     try:
         return (load or decode)(manifest.file(row, column))
     except UserError as error:
@@ -149,9 +139,8 @@ def fill_slot(
 ) -> int:  # fmt: skip
     """Write sample `index` of `size` into a slot by `write(index, epoch)`, and return how many were skipped.
 
-    With `data.on_bad_sample` "skip" a bad sample is replaced by another of the same `size`, drawn from (seed, step,
-    slot, attempt). Then `skipped` gets its error. Raises SampleError: at once with "error", else after TRIES bad
-    samples in a row.
+    With "skip" a bad sample is replaced by one drawn from (seed, step, slot, attempt), and `skipped` gets its error.
+    Raises SampleError at once with "error", else after TRIES bad samples in a row.
     """
     for attempt in range(TRIES):
         try:
@@ -171,54 +160,28 @@ def fill_slot(
 
 
 def evaluation(
-    manifest: Manifest,
-    rows: np.ndarray,
-    config: Config,
-    kind: Literal["still", "clip"] = "still",
-    *,
-    frames: int | None = None,
-    unknown: Literal["error", "universal"] = "error",
-    prepare: Prepare | None = None,
-    like: np.ndarray | None = None,
-    skipped: list[str] | None = None,
-    gels: UnitGels | None = None,
-) -> Iterator[tuple[np.ndarray, TouchBatch]]:
+    manifest: Manifest, rows: np.ndarray, config: Config, kind: Literal["still", "clip"] = "still", *,
+    frames: int | None = None, unknown: Literal["error", "universal"] = "error", prepare: Prepare | None = None,
+    like: np.ndarray | None = None, skipped: list[str] | None = None, gels: UnitGels | None = None,
+) -> Iterator[tuple[np.ndarray, TouchBatch]]:  # fmt: skip
     """Yield (row ids i64 (n,), TouchBatch of B rows) over `rows` in order, with the same bytes every time.
 
     Stills have T = 1; clips are the `frames` (default `model.frames`) frames that end at each row. B is
-    `data.batch_size`. The last batch is filled up with its last row, so only the first n rows of a batch are valid.
-    With `data.on_bad_sample` "skip" bad rows are left out, which the row ids show, and `skipped` gets a sentence for
-    each of the first NAMED. `unknown` "universal" gives unknown sensors the universal tokens. `prepare` makes an array
-    of the form of `like` from a frame u8 (h, w, 3) and its background or None, in place of the resizing and the
-    subtraction. `gels` are the pictures of the untouched gel, by default those of the rule in `data.gels`. Raises
-    UserError: ManifestError for an unknown sensor, SampleError for a bad sample, and for a row that
-    ends no clip.
+    `data.batch_size`, and only the first n rows of a batch are valid. With `data.on_bad_sample` "skip" bad rows are
+    left out, and `skipped` gets a sentence for the first NAMED. `unknown` "universal" gives unknown sensors the
+    universal tokens. `prepare` makes an array like `like` from a frame u8 (h, w, 3) and its background or None. `gels`
+    are the untouched gels, by default those of `data.gels`. Raises ManifestError for an unknown sensor, SampleError,
+    and UserError for a row that ends no clip.
     """
     rows = np.asarray(rows, np.int64)
     windows = rows[:, None] if kind == "still" else _clips_ending_at(manifest, rows, frames or config.model.frames)
     sensor, _ = sensor_rows(manifest, config.model, rows, unknown=unknown)
     if rows.size and (sensor[rows] < 0).any():
         row = int(rows[sensor[rows] < 0][0])
-        name = manifest.value(row, "sensor")
-        raise UserError(
-            f"{manifest.where(row)}: sensor {name!r} measures a force field and has no images; leave it out"
-        )
-    side = config.model.image_size
-    blank = np.zeros((side, side, 3), np.uint8) if like is None else like
-    reader = SampleReader(manifest, config, gels)
-    return _batches(reader, rows, windows, sensor, prepare, blank, [] if skipped is None else skipped)
-
-
-def _batches(
-    reader: SampleReader,
-    rows: np.ndarray,
-    windows: np.ndarray,
-    sensor: np.ndarray,
-    prepare: Prepare | None,
-    blank: np.ndarray,
-    skipped: list[str],
-) -> Iterator[tuple[np.ndarray, TouchBatch]]:
-    data = reader.config.data
+        place, name = manifest.where(row), manifest.value(row, "sensor")
+        raise UserError(f"{place}: sensor {name!r} measures a force field and has no images; leave it out")
+    side, data, reader = config.model.image_size, config.data, SampleReader(manifest, config, gels)
+    blank, named = np.zeros((side, side, 3), np.uint8) if like is None else like, [] if skipped is None else skipped
 
     def write(clip: np.ndarray, is_good: np.ndarray, start: int, slot: int) -> int:
         try:
@@ -226,8 +189,8 @@ def _batches(
         except SampleError as error:
             if data.on_bad_sample == "error":
                 raise
-            if len(skipped) < NAMED:
-                skipped.append(str(error))
+            if len(named) < NAMED:
+                named.append(str(error))
             is_good[slot] = False
         return 0
 
@@ -238,14 +201,17 @@ def _batches(
         batch.sensor[: len(chosen)] = sensor[chosen[:, -1]]
         return BatchJobs((batch, is_good), [partial(write, clip, is_good, start, slot) for slot in range(len(chosen))])
 
-    starts = range(0, len(rows), data.batch_size)
-    for start, (batch, is_good), _ in prefetch_batches(plan, starts, data.threads, data.prefetch):
-        good = np.flatnonzero(is_good)
-        if good.size and good.size < data.batch_size:  # move the good rows to the front and repeat the last one
-            order = np.concatenate([good, np.repeat(good[-1:], data.batch_size - good.size)])
-            batch = TouchBatch(batch.clip[order], batch.sensor[order])
-        if good.size:
-            yield rows[start + good], batch
+    def batches() -> Iterator[tuple[np.ndarray, TouchBatch]]:
+        starts = range(0, len(rows), data.batch_size)
+        for start, (batch, is_good), _ in prefetch_batches(plan, starts, data.threads, data.prefetch):
+            good = np.flatnonzero(is_good)
+            if good.size and good.size < data.batch_size:  # move the good rows to the front and repeat the last one
+                order = np.concatenate([good, np.repeat(good[-1:], data.batch_size - good.size)])
+                batch = TouchBatch(batch.clip[order], batch.sensor[order])
+            if good.size:
+                yield rows[start + good], batch
+
+    return batches()  # so that mistakes are raised by the call
 
 
 def _clips_ending_at(manifest: Manifest, rows: np.ndarray, length: int) -> np.ndarray:

@@ -38,8 +38,8 @@ def prefetch_batches(
 ) -> Iterator[tuple[int, Batch, dict[str, int]]]:
     """Yield (step, batch, info) of every step in order, at most `prefetch` batches ahead.
 
-    The content does not depend on `threads`; with 0 threads the caller's thread does the work. The first failing job
-    of a step raises in the caller. All threads have ended when the iterator ends, fails or is closed.
+    The content does not depend on `threads` (0: the caller's). The first failing job raises in the caller. All threads
+    have ended when the iterator ends.
     """
     if threads < 1:
         for step in steps:
@@ -62,10 +62,7 @@ def prefetch_batches(
 def bounded_map(
     function: Callable[[Item], Result], items: Iterable[Item], threads: int, ahead: int | None = None
 ) -> Generator[Result, None, None]:
-    """Yield `function(item)` for every item in order, at most `ahead` items ahead (4 per thread by default).
-
-    The first error raises in the caller. All threads have ended when the iterator ends, fails or is closed.
-    """
+    """Yield `function(item)` in order, `ahead` items ahead (4 per thread). The first error raises; all threads end."""
     if threads < 1:
         yield from map(function, items)
         return

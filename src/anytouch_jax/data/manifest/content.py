@@ -22,11 +22,7 @@ _SHOWN = 20
 
 
 class Summary(NamedTuple):
-    """Numbers of a manifest.
-
-    `clips` counts those of the asked length. `filled` are rows with a value, by column. `counts` has the first values
-    with their rows of split and sensor, in order, and the number of distinct ones.
-    """
+    """Numbers of a manifest: `filled` rows by column, `counts` of split and sensor (first values, number of all)."""
 
     rows: int
     recordings: int
@@ -89,10 +85,7 @@ def _text(block: pa.Array) -> tuple[np.ndarray, memoryview]:
 def summarise(
     names: Sequence[str], blocks: Blocks, length: int, repeat: Callable[[int, int, int, str], Exception]
 ) -> Summary:
-    """Return the numbers of a table of these columns, with its clips of `length` frames.
-
-    Raises `repeat(first row, second row, frame_index, sequence)` if a sequence repeats a frame.
-    """
+    """Return the numbers of a table. Raises `repeat(rows.., frame_index, sequence)` if a sequence repeats a frame."""
     parts: dict[str, list[Any]] = {name: [] for name in ("sequence", "frame_index", "stride", "split", "sensor")}
     filled: dict[str, int] = {}
 
@@ -123,7 +116,7 @@ def summarise(
         name = recordings[int(sequence[second]) // len(SPLITS)].as_py()
         return repeat(first, second, int(frame[second]), name)
 
-    clips = count_windows(sequence, frame, stride, length, error)
+    clips = sum(map(len, _blocks(sequence, frame, stride, length, error)[2]))  # they are not stored
     sensors = pa.concat_tables(parts["sensor"]).group_by("values").aggregate([("counts", "sum")]).sort_by("values")
     first = (column.slice(0, _SHOWN).to_pylist() for column in sensors.columns)
     splits = sorted((SPLITS[at], int(count)) for at, count in enumerate(np.bincount(split)) if count)
@@ -137,18 +130,14 @@ _BLOCK = 1 << 18  # rows at a time, so that the intermediate arrays of a block f
 
 
 def clip_windows(
-    sequence: np.ndarray,
-    frame: np.ndarray,
-    stride: np.ndarray,
-    length: int,
-    repeat_error: Callable[[int, int], Exception] | None = None,
-    ends: np.ndarray | None = None,
-) -> np.ndarray:
+    sequence: np.ndarray, frame: np.ndarray, stride: np.ndarray, length: int,
+    repeat_error: Callable[[int, int], Exception] | None = None, ends: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Return row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered by t's row id.
 
-    The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` are i64 (rows,); the stride of row t
-    counts. A row whose window has a gap, or that is not in `ends` bool (rows,), has no window. Raises
-    `repeat_error(first row, second row)` if a sequence repeats a frame, and OverflowError for a length above 10^12.
+    The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` (of row t) are i64 (rows,). A row
+    with a gap, or not in `ends` bool (rows,), has no window. Raises `repeat_error(first row, second row)` if a sequence
+    repeats a frame, and OverflowError for a length above 10^12.
     """
     order, key, blocks = _blocks(sequence, frame, stride, length, repeat_error, ends)
     dtype = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # there can be millions of windows
@@ -160,14 +149,6 @@ def clip_windows(
         count += len(positions)
     windows = windows[:count]
     return windows if order is None else windows[np.argsort(windows[:, -1], kind="stable")]
-
-
-def count_windows(
-    sequence: np.ndarray, frame: np.ndarray, stride: np.ndarray, length: int,
-    repeat_error: Callable[[int, int], Exception] | None = None,
-) -> int:  # fmt: skip
-    """Return the number of rows of `clip_windows`, which are not stored."""
-    return sum(map(len, _blocks(sequence, frame, stride, length, repeat_error)[2]))
 
 
 def _blocks(

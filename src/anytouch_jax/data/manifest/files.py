@@ -1,9 +1,12 @@
-"""Files of a manifest: their bytes, loose or in a shard, and the distinct files of all path columns.
+"""Files of a manifest: their bytes, loose, in a shard, or in an object store with a local cache.
 
 * `touch/00000.zip/17` is file 17 of a shard of `pack`: a ZIP file without compression, so a random file costs one read.
 * `data-000000.tar/17` is regular file 17 of a tar without compression, as WebDataset writes it.
 * `train-00000.parquet/image/17` is the cell of row 17 in a column of bytes, or of pictures of Hugging Face.
 * `touch/00000.parquet/17` is a shard of version 1 with its index next to it.
+* `s3://bucket/train-00000.parquet/image/17` is in an object store. A shard is copied whole on its first use, and the
+  copies that were not used for the longest leave first. `ANYTOUCH_CACHE` names the folder of the copies, and
+  `ANYTOUCH_CACHE_GB` their largest size (20).
 """
 
 from __future__ import annotations
@@ -12,23 +15,23 @@ import hashlib
 import io
 import math
 import os
+import shutil
 import stat
 import tarfile
 import threading
 import zipfile
 import zlib
-from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet
 
-from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.manifest.schema import PATHS
+from anytouch_jax.data.manifest.schema import ManifestError, shown
+from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_path
 
 MAX_BYTES = 1 << 29  # of one file: an image of images.MAX_PIXELS with four channels of 16 bits
 SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
@@ -45,11 +48,7 @@ class ShardError(ValueError):
 
 
 def read_file(path: Path) -> bytes:
-    """Return the bytes of a file, loose or packed.
-
-    Raises OSError, or ValueError (ShardError for a shard) if it is no regular file, is larger than MAX_BYTES, is in a
-    damaged shard, or is missing in its shard.
-    """
+    """Return the bytes of a file, loose or packed. Raises OSError, or ValueError (ShardError) if it is unfit."""
     place = split_shard_path(path)
     if place is None:
         return _read_loose(path)
@@ -125,10 +124,8 @@ class _Shard:
         else:
             valid = hashlib.sha256(data).digest() == entry["sha256"].tobytes()
         if not valid:
-            reason = "cut short" if length < size else "damaged (its checksum does not match)"
-            raise ShardError(
-                f"row {row} of the shard is {reason}; copy the shard again from where the data were packed"
-            )
+            fault = "cut short" if length < size else "damaged (its checksum does not match)"
+            raise ShardError(f"row {row} of the shard is {fault}; copy the shard again from where the data were packed")
         return data
 
 
@@ -153,10 +150,7 @@ def read_shard_index(path: Path) -> np.ndarray:
 
 
 def tar_members(path: Path, file: BinaryIO | None = None) -> list[tuple[str, int, int]]:
-    """Return (name, offset, size) of the regular files in a tar without compression, in its order. Raises ShardError.
-
-    Only headers are read. `file` is the opened tar, if it lies elsewhere.
-    """
+    """Return (name, offset, size) of the files in a plain tar, or in `file`, by its headers. Raises ShardError."""
     try:
         with tarfile.open(path, "r:", fileobj=file) as archive:
             members = [(member.name, member.offset_data, member.size) for member in archive if member.isreg()]
@@ -241,33 +235,82 @@ _column = lru_cache(16)(_Column)
 _shard = lru_cache(_OPEN)(_Shard)  # the least recently used one closes when its last reader is done
 
 
-class Files(NamedTuple):
-    """Distinct files i = 0 .. n - 1 of a manifest.
-
-    `code[column]` i64 (rows,) is the file of each cell, -1 for null. `row` i64 (n,) and `column` (n,) are the first
-    cell with the file, `path` before the other columns.
-    """
-
-    code: dict[str, np.ndarray]
-    row: np.ndarray
-    column: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.row)
+PROTOCOLS = ("s3", "gs", "az", "hf", "http", "https", "memory")
+CONTAINERS = (".parquet", ".tar", ".zip")
+_LOCKS = tuple(threading.Lock() for _ in range(64))
+_EVICTION = threading.Lock()
 
 
-def distinct_files(manifest: Manifest, columns: Sequence[str] = PATHS) -> Files:
-    """Return the files of the path columns `columns`, each once (by its written path and its manifest)."""
-    columns = [name for name in columns if name in manifest.table.column_names]
-    rows = len(manifest)
-    cells = pa.chunked_array([chunk for name in columns for chunk in manifest.table[name].chunks], pa.string())
-    encoded = cells.dictionary_encode().unify_dictionaries()
-    number = np.concatenate([np.asarray(pc.fill_null(chunk.indices, -1)) for chunk in encoded.chunks]).astype(np.int64)
-    key = number * len(manifest.files) + np.tile(manifest.source.astype(np.int64), len(columns))
-    known = np.flatnonzero(number >= 0)
-    _, first, code = np.unique(key[known], return_index=True, return_inverse=True)
-    full = np.full(len(number), -1, np.int64)
-    full[known] = code
-    first = known[first]
-    code_of = {name: full[i * rows : (i + 1) * rows] for i, name in enumerate(columns)}
-    return Files(code_of, first % rows, np.array(columns)[first // rows])
+def is_remote(path: str) -> bool:
+    """Return whether a path is an address of an object store."""
+    return "://" in path
+
+
+def local_copy(address: str) -> Path:
+    """Return the local path of an address or of an entry of a shard, copied if needed. Raises UserError."""
+    file, entry = _split(address)
+    name = file.rpartition("/")[2]
+    target = _folder() / hashlib.sha256(file.encode()).hexdigest()[:24] / name
+    try:
+        os.utime(target)  # the newest use
+    except OSError:
+        with _LOCKS[hash(target) % len(_LOCKS)]:
+            if not target.exists():
+                _fetch(file, target)
+    return target / entry if entry else target
+
+
+def _split(address: str) -> tuple[str, str]:
+    """Return the file of an address and the entry in it, "" for a file itself."""
+    protocol = address.partition("://")[0]
+    if protocol not in PROTOCOLS or "\\" in address or ".." in address.split("/"):
+        raise ManifestError(f"the address {shown(address)} is none of {', '.join(PROTOCOLS)}://...")
+    for suffix in CONTAINERS:
+        head, found, entry = address.rpartition(f"{suffix}/")
+        if found:
+            return head + suffix, entry
+    return address, ""
+
+
+def open_store(address: str) -> tuple[Any, str]:
+    """Return the file system of fsspec for an address, and the path in it. Raises UserError."""
+    try:
+        import fsspec
+
+        system, path = fsspec.core.url_to_fs(address)
+    except (ImportError, ValueError) as error:
+        raise UserError(f"{address} cannot be read: {error}; install the package for it (s3fs for s3)") from None
+    return system, path
+
+
+def _fetch(file: str, target: Path) -> None:
+    system, path = open_store(file)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        size = int(system.size(path) or 0)
+        _make_room(size, target)
+        with atomic_path(target) as part, system.open(path, "rb") as source, part.open("wb") as copy:
+            shutil.copyfileobj(source, copy, 1 << 20)
+    except FileNotFoundError:
+        raise UserError(f"there is no {file}; correct the manifest, or put the file there") from None
+    except Exception as error:  # each store has its own kinds, as of httpx and botocore
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"{file} cannot be copied to {target.parent}: {reason}; check access and free space") from None
+
+
+def _make_room(size: int, target: Path) -> None:
+    """Remove the copies that were not used for the longest until `size` more bytes fit."""
+    limit = int(float(os.environ.get("ANYTOUCH_CACHE_GB", "20")) * 1e9)
+    with _EVICTION:
+        copies = [(file.stat(), file) for file in _folder().glob("*/*") if file.is_file() and file != target]
+        total = sum(state.st_size for state, _ in copies) + size
+        for state, file in sorted(copies, key=lambda copy: copy[0].st_mtime_ns):
+            if total <= limit:
+                return
+            file.unlink(missing_ok=True)  # a reader that has it open still reads it
+            total -= state.st_size
+
+
+def _folder() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.environ.get("ANYTOUCH_CACHE") or f"{home}/anytouch_jax/shards").expanduser()

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,26 +20,11 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, ModelConfig, SpellingError, check_spelling
+from anytouch_jax.data.manifest import schema
 from anytouch_jax.data.manifest.content import Summary, clip_windows, content_digest, summarise, table_blocks
-from anytouch_jax.data.manifest.remote import is_remote, local_copy
-from anytouch_jax.data.manifest.schema import (
-    PATHS,
-    SCHEMA,
-    SPLITS,
-    ManifestError,
-    clean_text,
-    is_text,
-    listed,
-    load_table,
-    parquet_blocks,
-    place_of,
-    read_text_csv,
-    reading,
-    shown,
-    table_suffix,
-    typed,
-)
-from anytouch_jax.errors import ConfigError, UserError
+from anytouch_jax.data.manifest.files import is_remote, local_copy
+from anytouch_jax.data.manifest.schema import PATHS, SCHEMA, SPLITS, ManifestError, listed, shown
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.files import atomic_path
 from anytouch_jax.shown import described
 
@@ -76,7 +61,7 @@ class Manifest:
 
     def where(self, row: int) -> str:
         """Return "line 5 of /data/m.csv", or "row 3 of /data/m.parquet", for errors."""
-        return place_of(self.files[self.source[row]], int(self.number[row]))
+        return schema.place_of(self.files[self.source[row]], int(self.number[row]))
 
     def column(self, name: str) -> pa.ChunkedArray:
         """Return the column `name`, all null for an optional one that is absent. Raises ManifestError for others."""
@@ -110,10 +95,7 @@ class Manifest:
             raise ManifestError(f"Column {name!r} contains text. It must have numbers.") from None
 
     def codes(self, name: str, *, own: bool = False) -> np.ndarray:
-        """Return a text column as i64 (rows,): equal numbers for equal values, -1 for null.
-
-        With `own` the values of different files are different (see KEYS).
-        """
+        """Return a text column as codes i64 (rows,), -1 for null; with `own` files differ (see KEYS)."""
         indices = self.column(name).combine_chunks().dictionary_encode().indices
         codes = np.asarray(pc.fill_null(indices, -1)).astype(np.int64)
         if own and len(self.files) > 1:
@@ -144,12 +126,21 @@ class Manifest:
         A clip is rows of one sequence and one split whose frame_index values are exactly `stride` (of the last row)
         apart. `split` selects the clips of that split. Raises ManifestError if a sequence repeats a frame.
         """
-        ends = None
-        if split is not None:
-            ends = np.zeros(len(self), bool)
+        table, ends = self.table, None if split is None else np.zeros(len(self), bool)
+        if split is not None and ends is not None:
             ends[self.rows_of(split)] = True
+        sequence = self.codes("sequence", own=True)
+        sequence *= len(SPLITS)
+        sequence += self.codes("split")
+        has_stride = "stride" in table.column_names
+        stride = np.asarray(table["stride"]) if has_stride else np.broadcast_to(np.int64(1), len(self))
+
+        def repeats(first: int, second: int) -> ManifestError:
+            frame, name = self.value(second, "frame_index"), self.value(second, "sequence")
+            return _repeats(self.where(first), self.where(second), frame, name)
+
         try:
-            return clip_windows(self._sequence, self._frame, self._stride, length, self._repeat_error, ends)
+            return clip_windows(sequence, np.asarray(table["frame_index"]), stride, length, repeats, ends)
         except OverflowError as error:
             raise ManifestError(f"{self._name}: {error}") from None
 
@@ -172,27 +163,6 @@ class Manifest:
     def _name(self) -> str:
         return ", ".join(map(str, self.files))
 
-    @property
-    def _sequence(self) -> np.ndarray:  # not cached: 20 MB of a large manifest, for a fraction of a second
-        codes = self.codes("sequence", own=True)
-        codes *= len(SPLITS)
-        codes += self.codes("split")
-        return codes
-
-    @cached_property
-    def _frame(self) -> np.ndarray:
-        return np.asarray(self.table["frame_index"])
-
-    @cached_property
-    def _stride(self) -> np.ndarray:
-        if "stride" not in self.table.column_names:
-            return np.broadcast_to(np.int64(1), len(self))
-        return np.asarray(self.table["stride"])
-
-    def _repeat_error(self, first: int, second: int) -> ManifestError:
-        frame, sequence = self.value(second, "frame_index"), self.value(second, "sequence")
-        return _repeats(self.where(first), self.where(second), frame, sequence)
-
 
 def _repeats(first: str, second: str, frame: int, sequence: str) -> ManifestError:
     return ManifestError(
@@ -201,32 +171,26 @@ def _repeats(first: str, second: str, frame: int, sequence: str) -> ManifestErro
 
 
 def read(paths: str | Path | Sequence[str | Path]) -> Manifest:
-    """Read one manifest (.csv or .parquet), or several joined in order. Raises ManifestError.
-
-    Every row keeps its file, and its paths are relative to the folder of that file.
-    """
+    """Read one manifest (.csv or .parquet), or several joined in order; rows keep their files. Raises ManifestError."""
     several = [paths] if isinstance(paths, str | Path) else list(paths)
     if not several:
         raise ManifestError("no manifest is given; name a .csv or .parquet file")
     files = tuple(_real_file(Path(path).expanduser()) for path in several)
     if len(set(files)) != len(files):
         raise ManifestError(f"a manifest is given twice: {', '.join(map(str, files))}")
-    return _join([load_table(file) for file in files], files)
+    return _join([schema.load_table(file) for file in files], files)
 
 
 def summarise_file(path: str | Path, length: int = 3) -> Summary:
-    """Return numbers of one manifest, with its clips of `length` frames. Raises ManifestError as `read` and `clips`.
-
-    A Parquet file is read in blocks, so it may be larger than the memory.
-    """
+    """Return the numbers of a manifest, with its clips; Parquet is read in blocks. Raises ManifestError as `read`."""
     file = _real_file(Path(path).expanduser())
     if file.is_file() and file.suffix.lower() == ".parquet":
-        names, blocks = parquet_blocks(file)
+        names, blocks = schema.parquet_blocks(file)
     else:
         table = read(path).table
         names, blocks = table.column_names, table_blocks(table)
     try:
-        place = partial(place_of, file)
+        place = partial(schema.place_of, file)
         return summarise(names, blocks, length, lambda first, second, *it: _repeats(place(first), place(second), *it))
     except OverflowError as error:
         raise ManifestError(f"{file}: {error}") from None
@@ -244,22 +208,19 @@ def _real_file(path: Path) -> Path:
 
 
 def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
-    """Return a manifest from columns in memory, as if read from the file `path`, which need not exist yet.
-
-    `columns` maps names to sequences of equal length (None is null). Raises ManifestError as `read` does.
-    """
+    """Return a manifest from columns of equal length, as if read from `path`. Raises ManifestError as `read` does."""
     file = Path(path).expanduser().resolve()
     try:
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
     except (pa.ArrowException, ValueError, OverflowError) as error:
         raise ManifestError(f"{file}: the columns make no table: {error}") from None
-    return _join([typed(table, file)], (file,))
+    return _join([schema.typed(table, file)], (file,))
 
 
 def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
     kinds: dict[str, set[bool]] = {}
     for field in (field for table in tables for field in table.schema if not pa.types.is_null(field.type)):
-        kinds.setdefault(field.name, set()).add(is_text(field.type))
+        kinds.setdefault(field.name, set()).add(schema.is_text(field.type))
     try:
         # A label that is a number in one manifest and text in another becomes text in all of them.
         for name in (name for name, several in kinds.items() if len(several) > 1):
@@ -300,12 +261,9 @@ def write(manifest: Manifest, path: str | Path) -> None:
 
 
 def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
-    """Return the absolute path of a manifest to be written, and its table with paths relative to that folder.
-
-    Raises ManifestError for a wrong ending, and for files outside the new folder.
-    """
+    """Return the path of a manifest to be written, and its table for that folder. Raises ManifestError."""
     target, table = Path(path).expanduser().resolve(), manifest.table
-    table_suffix(target)
+    schema.table_suffix(target)
     folder = target.parent
 
     def relative(row: int, cell: str) -> str:
@@ -342,17 +300,13 @@ def with_distinct_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
 
 
 def sensor_rows(
-    manifest: Manifest,
-    model: ModelConfig,
-    rows: np.ndarray | None = None,
-    *,
+    manifest: Manifest, model: ModelConfig, rows: np.ndarray | None = None, *,
     unknown: Literal["error", "skip", "universal"] = "error",
-) -> tuple[np.ndarray, list[str]]:
+) -> tuple[np.ndarray, list[str]]:  # fmt: skip
     """Return the sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out, and notes.
 
-    Only `rows` (default: all) are considered, and the others are -1. Force-field sensors have no images: they are left
-    out. A sensor outside `model.sensors` is an error, is left out (`skip`), or uses the universal tokens (`universal`).
-    Raises ManifestError, which names the first row.
+    Only `rows` (default: all) are considered. Force fields are left out. A sensor outside `model.sensors` is an error,
+    is left out (`skip`), or uses the universal tokens (`universal`). Raises ManifestError, which names the first row.
     """
     ids = np.full(len(manifest), -1, np.int32)
     rows, notes = np.arange(len(manifest)) if rows is None else np.unique(rows), []
@@ -383,10 +337,7 @@ def misspelt_sensors(manifest: Manifest) -> Iterator[tuple[Literal["error", "war
 
 
 def resolve_path(root: str | Path, relative: str | None) -> Path:
-    """Return the file `relative` inside the folder `root` (absolute, resolved), or the local copy of an address.
-
-    Raises ManifestError if the path is empty, absolute, or leaves the folder by ".." or by a symbolic link.
-    """
+    """Return the file inside `root`, or the local copy of an address. Raises ManifestError if it leaves the folder."""
     if not relative:
         raise ManifestError("the path is empty")
     if is_remote(relative):
@@ -441,63 +392,29 @@ def replace_column(manifest: Manifest, name: str, values: Any) -> Manifest:
     return replace(manifest, table=_with_column(manifest.table, name, column))
 
 
-def attach_text(
-    manifest: Manifest, captions: str | Path, *, key: str | None = None, text: str = "text", overwrite: bool = False
-) -> tuple[Manifest, list[str]]:
-    """Add captions from a table (.csv or .parquet) with a key column and the column `text`; also return notes.
+class Files(NamedTuple):
+    """Distinct files i < n: `code[column]` i64 (rows,), -1 for null, and the first `row` i64 (n,) and `column` (n,)."""
 
-    `key` is a column of both (default: the one other column of the table), for instance `sequence`, `touch`, `object`
-    or `path`. Rows with a caption keep it unless `overwrite`. Raises UserError for a table that lacks a column, has
-    different captions for a key, or matches no row.
-    """
-    path = Path(captions).expanduser()
-    caption_of, key = _read_captions(path, key, text)
-    keys = _text_of(manifest.column(key), f"{manifest.files[0]}: the key {key!r}")
-    at = pc.index_in(keys, value_set=pa.array(list(caption_of), pa.string())).combine_chunks()
-    new = pa.chunked_array([pa.array(list(caption_of.values()), pa.string()).take(at)])
-    old, matched = manifest.column("text"), len(at) - at.null_count
-    if not matched:
-        raise UserError(
-            f"{path}: no key {key!r} of it is in the manifest; its first one is {shown(next(iter(caption_of), None))}; "
-            "name the right column with --key"
-        )
-    kept = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
-    unused = len(caption_of) - len(at.drop_null().unique())
-    notes = [f"{matched - kept} rows got a caption by {key!r}"]
-    notes += [f"{kept} rows already had a caption"] if kept else []
-    notes += [f"{unused} of {len(caption_of)} keys of {path.name} are not in the manifest"] if unused else []
-    return replace_column(manifest, "text", pc.coalesce(new, old) if overwrite else pc.coalesce(old, new)), notes
+    code: dict[str, np.ndarray]
+    row: np.ndarray
+    column: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.row)
 
 
-def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, str], str]:
-    """Return the captions of a table by key, and the name of its key column."""
-    suffix = table_suffix(path, "a table of captions")
-    with reading(path):
-        table = read_text_csv(path) if suffix == ".csv" else pa.parquet.read_table(path, partitioning=None)
-        table.validate(full=True)
-    names = table.column_names
-    others = [name for name in names if name != text]
-    if key is None and len(others) > 1 and text in names:
-        raise UserError(f"{path} has the columns {listed(names)}: name the key column")
-    key = key or next(iter(others), text)
-    for name in (text, key):
-        if names.count(name) != 1 or key == text:
-            fault = "twice the" if name in names else "no"
-            raise UserError(f"{path} has {fault} column {name!r}; it has {listed(names)}")
-    keys, texts = _text_of(table[key], f"{path}: {key!r}"), _text_of(table[text], f"{path}: {text!r}")
-    place = partial(place_of, path)
-    captions: dict[str, str] = {}
-    for row, (name, caption) in enumerate(zip(keys.to_pylist(), texts.to_pylist(), strict=True)):
-        caption = " ".join((caption or "").split())
-        if name is None and caption:
-            raise UserError(f"{place(row)}: a caption without {key}; fill it in")
-        if name is not None and caption and captions.setdefault(name, caption) != caption:
-            raise UserError(f"{place(row)}: {key} {shown(name)} has another caption in an earlier row; keep one")
-    return captions, key
-
-
-def _text_of(column: pa.ChunkedArray, name: str) -> pa.ChunkedArray:
-    try:
-        return clean_text(column.cast(pa.string()))
-    except pa.ArrowException:
-        raise UserError(f"{name} must be a plain column, is {column.type}") from None
+def distinct_files(manifest: Manifest, columns: Sequence[str] = PATHS) -> Files:
+    """Return the files of the path columns `columns`, each once (by its written path and its manifest)."""
+    columns = [name for name in columns if name in manifest.table.column_names]
+    rows = len(manifest)
+    cells = pa.chunked_array([chunk for name in columns for chunk in manifest.table[name].chunks], pa.string())
+    encoded = cells.dictionary_encode().unify_dictionaries()
+    number = np.concatenate([np.asarray(pc.fill_null(chunk.indices, -1)) for chunk in encoded.chunks]).astype(np.int64)
+    key = number * len(manifest.files) + np.tile(manifest.source.astype(np.int64), len(columns))
+    known = np.flatnonzero(number >= 0)
+    _, first, code = np.unique(key[known], return_index=True, return_inverse=True)
+    full = np.full(len(number), -1, np.int64)
+    full[known] = code
+    first = known[first]
+    code_of = {name: full[i * rows : (i + 1) * rows] for i, name in enumerate(columns)}
+    return Files(code_of, first % rows, np.array(columns)[first // rows])

@@ -38,12 +38,8 @@ BLOCK = 1 << 19  # rows that are read at once where a table is not needed whole
 _TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
 _TEXT_COLUMNS = (*REQUIRED, *PATHS, "dataset", "unit", "touch", "object", "text", "license")
 _NAMES = ("dataset", "unit", "object", "license")  # text columns with values that a hand-written table may misspell
-SCHEMA: dict[str, pa.DataType] = {
-    **dict.fromkeys(_TEXT_COLUMNS, _TEXT),
-    "frame_index": _WHOLE,
-    "stride": _WHOLE,
-    "commercial": _FLAG,
-}
+SCHEMA: dict[str, pa.DataType] = dict.fromkeys(_TEXT_COLUMNS, _TEXT)
+SCHEMA |= {"frame_index": _WHOLE, "stride": _WHOLE, "commercial": _FLAG}
 
 Cast = Callable[[pa.ChunkedArray], pa.ChunkedArray]
 
@@ -175,10 +171,7 @@ def _load_parquet(path: Path) -> pa.Table:
 
 
 def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.Array]]]:
-    """Return the columns' names of a Parquet file, and a function that yields a column in checked blocks.
-
-    Raises ManifestError as `load_table`, for a value when its block is read.
-    """
+    """Return the columns of a Parquet file, and a function that yields one in checked blocks. Raises ManifestError."""
     with reading(path):
         file = pa.parquet.ParquetFile(path, pre_buffer=False)
         names = file.schema_arrow.names
@@ -198,9 +191,9 @@ def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.A
 def typed(table: pa.Table, path: Path) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
-    Columns outside SCHEMA stay unchanged. `path` is the table's file, for errors. Raises ManifestError for a missing
-    column or value, a wrong type, an unknown split, and a stride below 1. So it does for text that is not UTF-8 or
-    longer than MAX_TEXT, and for a table without rows or with more than MAX_ROWS.
+    Other columns stay unchanged. Raises ManifestError, which names the place in `path`, for a missing column or value,
+    a wrong type, an unknown split, and a stride below 1. So it does for text that is not UTF-8 or too long, and for too
+    many rows or none.
     """
     _check_names(table.column_names, table.num_rows, path)
     return pa.table({name: _checked(name, table[name], path) for name in table.column_names}).combine_chunks()
@@ -209,8 +202,8 @@ def typed(table: pa.Table, path: Path) -> pa.Table:
 def typed_label(column: pa.ChunkedArray, name: str = "", where: Callable[[int], str] | None = None) -> pa.ChunkedArray:
     """Return a text column as numbers or truth values if all cells are; 007 stays text, because its zeros matter.
 
-    With `where`, which names a row, raises ManifestError if the column `name` has a class in two spellings, or a text
-    among nine times as many numbers.
+    With `where`, which names a row, raises ManifestError for a class in two spellings, or a text among nine times as
+    many numbers.
     """
     column = clean_text(column)
     kinds = (_WHOLE, pa.float64(), pa.bool_())
@@ -274,10 +267,7 @@ def is_text(kind: pa.DataType) -> bool:
 
 
 def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> pa.ChunkedArray:
-    """Return a column with its type in SCHEMA, every value checked. Raises ManifestError, which names the place.
-
-    `first` is the number of its first row in the file `path`.
-    """
+    """Return a column in its type, checked, from row `first` of the file. Raises ManifestError with a place."""
 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
         row = pc.index(bad, True).as_py()

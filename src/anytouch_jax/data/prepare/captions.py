@@ -28,16 +28,7 @@ from anytouch_jax.bars import bar
 from anytouch_jax.config.parsing import Count, Range, check, parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
-from anytouch_jax.data.prepare.prompts import (
-    PHRASE,
-    SECOND_IMAGE,
-    BadAnswer,
-    CaptionJob,
-    find_caption_jobs,
-    image_bytes,
-    parse_caption,
-    small_jpeg,
-)
+from anytouch_jax.data.prepare import prompts
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, lock
 
@@ -79,7 +70,7 @@ class CostEstimate(NamedTuple):
 class Caption(NamedTuple):
     """A caption, the object that the model named, and the job that it answers."""
 
-    job: CaptionJob
+    job: prompts.CaptionJob
     text: str
     object: str
 
@@ -115,13 +106,7 @@ class _QuestionError(Exception):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An OpenAI-compatible chat endpoint.
-
-    `url` is the base address, such as https://api.openai.com/v1. The key is read from the environment variable
-    `key_variable`. `timeout` is the seconds to wait for an answer, `tries` the attempts for each question. `json_mode`
-    asks for a JSON object. `token_field` names the limit field (newer models want max_completion_tokens). A
-    `temperature` of None is not sent. Raises AnnotateError for an address or a number that cannot be used.
-    """
+    """An OpenAI-compatible chat endpoint, see `anytouch data annotate --help`. Raises AnnotateError for a bad one."""
 
     url: str
     model: str
@@ -157,10 +142,7 @@ class Endpoint:
         return self.url.startswith("http:") and not self.is_local and bool(os.environ.get(self.key_variable))
 
     def read_key(self) -> str:
-        """Return the key, or "" if it is missing and the endpoint is local.
-
-        Raises AnnotateError for a key that is missing or malformed, and if the openai client is not installed.
-        """
+        """Return the key, "" if a local endpoint has none. Raises AnnotateError for a wrong key, and without openai."""
         key = os.environ.get(self.key_variable, "").strip()
         if not key and not self.is_local:
             raise AnnotateError(f"set the environment variable {self.key_variable} to the key of {self.url}")
@@ -178,7 +160,7 @@ class Endpoint:
 class _Client:
     """The openai client for one endpoint. The key is read once and removed from every message."""
 
-    def __init__(self, endpoint: Endpoint, log: Callable[[str], None] | None = None) -> None:
+    def __init__(self, endpoint: Endpoint, log: Callable[[str], None] = lambda _: None) -> None:
         self.endpoint, self._key, self._log = endpoint, endpoint.read_key(), log
 
     def connect(self) -> openai.AsyncOpenAI:
@@ -194,14 +176,11 @@ class _Client:
         )  # fmt: skip
 
     async def _report_wait(self, response: Any) -> None:
-        if self._log and response.status_code >= 400 and (wait := _asked_wait(response)):
+        if response.status_code >= 400 and (wait := _asked_wait(response)):
             self._log(f"the endpoint answers {response.status_code}{wait}")
 
     async def ask(self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]) -> tuple[str, str, int, int]:
-        """Return an answer's text without the key, its finish reason, and the tokens in and out (0 if unknown).
-
-        Raises _QuestionError, BadAnswer, or AnnotateError if no try can help.
-        """
+        """Return text, finish reason, tokens in and out. Raises _QuestionError, BadAnswer or AnnotateError."""
         import openai
 
         end = self.endpoint
@@ -221,7 +200,7 @@ class _Client:
         except openai.APIStatusError as error:
             reason = self._judge(error)
         except (ValueError, RecursionError):
-            raise BadAnswer("not JSON") from None
+            raise prompts.BadAnswer("not JSON") from None
         else:
             text, finish, tokens_in, tokens_out = _parse_reply(reply)
             return self.redact(text), finish, tokens_in, tokens_out
@@ -267,7 +246,7 @@ def _parse_reply(reply: Any) -> tuple[str, str, int, int]:
         text, finish = str(refusal or text or ""), "refusal" if refusal else str(choice.get("finish_reason") or "")
         text.encode()  # raises for half of a Unicode pair
     except (ValueError, KeyError, IndexError, TypeError, AttributeError):
-        raise BadAnswer("not a chat completion") from None
+        raise prompts.BadAnswer("not a chat completion") from None
     counts = [usage.get(name) if isinstance(usage, dict) else 0 for name in ("prompt_tokens", "completion_tokens")]
     # An answer with odd numbers is paid for too.
     tokens_in, tokens_out = (n if isinstance(n, int) and 0 <= n < 1 << 40 else 0 for n in counts)
@@ -278,27 +257,26 @@ def annotate(
     manifest: Manifest, endpoint: Endpoint, folder: str | Path, *, confirm: Callable[[CostEstimate], bool],
     price_in: float | None = None, price_out: float | None = None, threads: int = 4, side: int = 512,
     split: str | None = None, families: Mapping[str, str] | None = None, overwrite: bool = False,
-    second_image: str = SECOND_IMAGE, limit: int | None = None, log: Callable[[str], None] | None = None,
+    second_image: str = prompts.SECOND_IMAGE, limit: int | None = None, log: Callable[[str], None] = lambda _: None,
 ) -> CaptionResult:  # fmt: skip
     """Ask `endpoint` for every missing caption and return the manifest with all captions.
 
-    Each touch, or each sequence without a touch, is one question. `threads` questions are open at a time. Images are
-    sent with no side longer than `side` pixels. Answers and failures are stored in `folder`. `confirm` is always
-    called with the estimate, and prices are for a million tokens. `limit` asks only for the first captions. A phrase
-    that was expanded moves to the column `phrase`. Raises AnnotateError if `confirm` returns False or if the first
+    Each touch, or each sequence without a touch, is one question; `threads` are open at a time. Answers and failures
+    are stored in `folder`. `confirm` is always called with the estimate, and prices are for a million tokens. A phrase
+    that was expanded moves to the column `phrase`. Raises AnnotateError if `confirm` returns False, if the first
     questions all fail, or if the endpoint cannot be used, and UserError if no caption is missing.
     """
-    jobs, left_out = find_caption_jobs(
+    jobs, left_out = prompts.find_caption_jobs(
         manifest, split=split, families=families, overwrite=overwrite, second_image=second_image
     )
     jobs, store = jobs[:limit], _AnswerStore(Path(folder).expanduser().resolve())
     run = _Run(manifest, endpoint, store, side, log)
     keys = run.keys(jobs, threads)
-    missing: dict[str, CaptionJob] = {}  # equal questions about equal images are one
+    missing: dict[str, prompts.CaptionJob] = {}  # equal questions about equal images are one
     for job, key in zip(jobs, keys, strict=True):
         if key and key not in store.answers:
             missing.setdefault(key, job)
-    if log and endpoint.exposes_key:
+    if endpoint.exposes_key:
         log(f"the key travels unencrypted to {endpoint.url}; use https")
     cached = sum(key in store.answers for key in keys)
     image = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
@@ -326,17 +304,17 @@ class _Run:
     """One pass over the questions. `failures` and the counts grow during the pass."""
 
     def __init__(
-        self, manifest: Manifest, endpoint: Endpoint, store: _AnswerStore, side: int, log: Callable[[str], None] | None
+        self, manifest: Manifest, endpoint: Endpoint, store: _AnswerStore, side: int, log: Callable[[str], None]
     ) -> None:
         self.manifest, self.endpoint, self.store, self.side, self.log = manifest, endpoint, store, side, log
         self.failures: list[CaptionFailure] = []
         self.requests, self.tokens = 0, [0, 0]
         self.done = self.streak = 0
 
-    def keys(self, jobs: list[CaptionJob], threads: int) -> list[str]:
+    def keys(self, jobs: list[prompts.CaptionJob], threads: int) -> list[str]:
         """Return the key of each job's answer. An unreadable image is a failure with the key ""."""
 
-        def key_of(job: CaptionJob) -> tuple[str, str]:
+        def key_of(job: prompts.CaptionJob) -> tuple[str, str]:
             try:
                 return self._images(job)[0], ""
             except UserError as error:
@@ -350,22 +328,22 @@ class _Run:
                     self._fail(job, "", reason)
         return keys
 
-    def _images(self, job: CaptionJob) -> tuple[str, list[bytes]]:
+    def _images(self, job: prompts.CaptionJob) -> tuple[str, list[bytes]]:
         """Return the key of a job's answer, and its images as JPEG. Raises UserError for an unreadable image."""
         end, jpegs = self.endpoint, []
         parts = [end.model, job.prompt.fingerprint(), self.side, end.max_tokens]
         digest = hashlib.sha256(json.dumps(parts).encode())
         for row, column in job.images:
             try:
-                data = image_bytes(self.manifest, row, column)
-                jpegs.append(small_jpeg(data, column, self.side))
+                data = prompts.image_bytes(self.manifest, row, column)
+                jpegs.append(prompts.small_jpeg(data, column, self.side))
             except (OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or error
                 raise UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}") from None
             digest.update(hashlib.sha256(data).digest())
         return digest.hexdigest()[:32], jpegs
 
-    async def ask(self, client: _Client, questions: list[tuple[str, CaptionJob]], workers: int) -> None:
+    async def ask(self, client: _Client, questions: list[tuple[str, prompts.CaptionJob]], workers: int) -> None:
         """Ask all questions. The first error of a worker ends the others."""
         queue = iter(questions)
 
@@ -382,7 +360,7 @@ class _Run:
                     for later_key, later_job in queue:
                         self._fail(later_job, later_key, f"not asked: {_MAX_STREAK} before it failed")
                 advance(self.done)
-                if self.log and (self.done % 100 == 0 or self.done == len(questions)):
+                if self.done % 100 == 0 or self.done == len(questions):
                     self.log(f"{self.done} of {len(questions)} questions, {len(self.failures)} failed")
 
         try:
@@ -393,7 +371,7 @@ class _Run:
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
 
-    async def _ask_one(self, client: _Client, connection: openai.AsyncOpenAI, job: CaptionJob, key: str) -> str:
+    async def _ask_one(self, client: _Client, connection: openai.AsyncOpenAI, job: prompts.CaptionJob, key: str) -> str:
         """Get and store one answer. Returns the reason if there is none, else ""."""
         try:
             _, jpegs = await asyncio.to_thread(self._images, job)
@@ -406,10 +384,10 @@ class _Run:
                 text, finish, *tokens = await client.ask(connection, job.prompt.messages(jpegs))
                 self.requests += 1
                 self.tokens = [self.tokens[0] + tokens[0], self.tokens[1] + tokens[1]]
-                caption, named = parse_caption(text, finish)
+                caption, named = prompts.parse_caption(text, finish)
             except _QuestionError as error:
                 return str(error)
-            except BadAnswer as error:
+            except prompts.BadAnswer as error:
                 reason = f"bad answer ({error}): {text[:100]!r}"
                 continue
             self.store.add(key, {
@@ -419,7 +397,7 @@ class _Run:
             return ""
         return f"{reason} ({_BAD_ANSWER_TRIES} times)"
 
-    def _fail(self, job: CaptionJob, key: str, reason: str) -> None:
+    def _fail(self, job: prompts.CaptionJob, key: str, reason: str) -> None:
         self.failures.append(CaptionFailure(self.manifest.where(int(job.rows[0])), len(job.rows), reason, key))
 
 
@@ -479,25 +457,19 @@ def _entries(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:
-    columns: dict[str, list[str | None]] = {}
-    for caption in captions:
-        for name, cell in (("text", caption.text), (PHRASE, caption.job.phrase)):
-            if cell is not None:
-                if name not in columns:
-                    known = name in manifest.table.column_names
-                    columns[name] = manifest.column(name).to_pylist() if known else [None] * len(manifest)
-                for row in caption.job.rows:
-                    columns[name][row] = cell
-    for name, cells in columns.items():
-        manifest = replace_column(manifest, name, pa.array(cells, pa.string()))
+    texts, phrases = [one.text for one in captions], [one.job.phrase for one in captions]
+    for name, words in (("text", texts), (prompts.PHRASE, phrases)):
+        if any(word is not None for word in words):
+            known = name in manifest.table.column_names
+            cells = np.array(manifest.column(name).to_pylist() if known else [None] * len(manifest), object)
+            for caption, word in zip(captions, words, strict=True):
+                cells[caption.job.rows] = cells[caption.job.rows] if word is None else word
+            manifest = replace_column(manifest, name, pa.array(cells, pa.string()))
     return manifest
 
 
 def sample_sheet(manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40) -> Path:
-    """Write an HTML page with a random sample of `count` captions and their images, to be checked by hand.
-
-    The page holds its images. Raises UserError if there are no captions.
-    """
+    """Write an HTML page of `count` random captions with their images. Raises UserError without captions."""
     if not captions:
         raise UserError("there are no captions to look at; leave out --sheet, or ask for some")
     chosen = np.sort(np.random.default_rng(0).permutation(len(captions))[:count])
@@ -520,7 +492,7 @@ def _article(manifest: Manifest, caption: Caption, number: int) -> str:
     for image_row, column in images:
         word = "touch" if column == "path" else "photograph"
         try:
-            jpeg = small_jpeg(image_bytes(manifest, image_row, column), column, _SHEET_SIDE)
+            jpeg = prompts.small_jpeg(prompts.image_bytes(manifest, image_row, column), column, _SHEET_SIDE)
         except (OSError, ValueError) as error:
             parts.append(f"<p>{html.escape(str(error))}</p>")
             continue

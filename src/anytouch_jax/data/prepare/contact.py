@@ -1,14 +1,12 @@
 """Contact filter: which frames are touched, by difference from the background image (AnyTouch, appendix A.1).
 
-The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched gel. Other changes
-are removed first. Marker dots, which shear moves, are closed in both images if the untouched gel has them. A change of
-exposure, tint or light is subtracted as a plane for each colour. Noise is blurred. Lengths are in pixels of an image
-scaled to 160 on its long side, so thresholds do not depend on the camera's resolution.
+The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched gel, in an image of
+160 pixels on its long side. Marker dots, which shear moves, are closed in both images if the gel has them. A change of
+light is subtracted as a plane for each colour.
 
 The untouched gel of a row is its `background_path`, the rows of split `background` of its unit (or else sequence), or a
 picture that the user names. Otherwise it is estimated from the frames of its recording, and compared with the estimates
-of other recordings of the unit (see `untouched_gel`). Where these are undecided, it is the median of the unit's frames,
-unless that is clearly pressed: then the score stays empty.
+of other recordings of the unit. Where these are undecided, it is the median of the unit's frames, if that is free.
 """
 
 from __future__ import annotations
@@ -151,9 +149,6 @@ class ContactQuality:
         ]  # fmt: skip
 
 
-# Scores -----------------------------------------------------------------------------------------------------------
-
-
 def contact_scores(
     manifest: Manifest, rows: np.ndarray | None = None, *, backgrounds: Mapping[str, UntouchedGel] | None = None,
     gels: UnitGels | None = None, workers: int = 2,
@@ -205,10 +200,7 @@ def contact_scores(
 
 
 def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -> Manifest:
-    """Write the untouched gels of `scores.gels` to `folder`, and return the manifest with them as background_path.
-
-    The pictures are PNG of at most LONG_SIDE pixels. Rows of the split `background` stay without one. Raises OSError.
-    """
+    """Write the estimated gels as PNG, and return the manifest with them as background_path. Raises OSError."""
     cells = manifest.column("background_path").to_pylist()
     is_free = manifest.text_column("split") == "background"
     for rows, gel in scores.gels:
@@ -220,10 +212,7 @@ def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -
 
 
 def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, UntouchedGel]:
-    """Return the pictures of --background by unit: FILE, for all rows (unit ""), or UNIT=FILE words.
-
-    Raises UserError for a file that cannot be read, a unit without rows that need it, and a picture of another shape.
-    """
+    """Return the pictures of --background, FILE (unit "") or UNIT=FILE words, by unit. Raises UserError."""
     waiting = np.flatnonzero(~manifest.present("background_path"))
     units, sensors = manifest.text_column("unit"), manifest.codes("sensor")
     gels: dict[str, UntouchedGel] = {}
@@ -285,10 +274,7 @@ def _gel_of_group(
 def _estimates(
     manifest: Manifest, group: np.ndarray, pictures: _Pictures
 ) -> Iterator[tuple[np.ndarray, UntouchedGel | None, str]]:
-    """Yield the rows, untouched gel and reason of each recording of a group.
-
-    The estimates of other recordings of the unit decide where its own frames do not. Stills count as one recording.
-    """
+    """Yield rows, untouched gel and reason of each recording; stills are one, and others of the unit decide too."""
 
     def estimate(rows: np.ndarray) -> tuple[UntouchedGel | None, str, tuple[int, ...]]:
         frames = pictures(rows)
@@ -335,9 +321,6 @@ def _load_or_none(manifest: Manifest, faults: dict[int, str], row: int) -> np.nd
         if len(faults) < _MAX_FAULTS:
             faults[row] = str(error)
         return None
-
-
-# Labels -----------------------------------------------------------------------------------------------------------
 
 
 def mark_contact(
@@ -410,14 +393,8 @@ def known_contact(manifest: Manifest) -> np.ndarray:
     return contact
 
 
-# Quality ----------------------------------------------------------------------------------------------------------
-
-
 def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple[str, npt.NDArray[np.float64]]:
-    """Return the column that reports contact (default: the first existing one of REFERENCES) and its numbers.
-
-    Raises UserError if there is no such column, or if it holds no numbers.
-    """
+    """Return the column that reports contact (default: first of REFERENCES) and its numbers. Raises UserError."""
     columns = manifest.table.column_names
     name = reference or next((column for column in REFERENCES if column in columns), None)
     if name is None or name not in columns:

@@ -1,4 +1,4 @@
-"""Caption prompts: one for each family of datasets, and the rows of a manifest that need a caption.
+"""Captions of a manifest: prompts for each family of datasets, rows that need a caption, and tables of captions.
 
 The paper lets GPT-4o write the captions (AnyTouch, appendix). The wording of the prompts is ours, the inputs are the
 paper's. Touch and Go and TacQuad send one photograph. ObjectFolder Real sends two photographs and the tactile image,
@@ -14,16 +14,22 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet
 
 from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.images import decode_bytes, encode
+from anytouch_jax.data.manifest import schema
 from anytouch_jax.data.manifest.files import read_file
-from anytouch_jax.data.manifest.manifest import Manifest, group_rows, resolve_path
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_column, resolve_path
+from anytouch_jax.data.manifest.schema import listed, shown
 from anytouch_jax.data.prepare.untouched_gel import scale_picture
 from anytouch_jax.errors import UserError
 
@@ -34,13 +40,9 @@ _MIN_WORDS, _MAX_WORDS = 3, 60  # CLIP reads 77 tokens
 
 # Answers are stored under a hash of the prompt: another wording asks, and pays for, every question again.
 FAMILIES: dict[str, Family] = {
-    "touch_and_go": "photograph",
-    "tacquad": "photograph",
-    "objectfolder_real": "object",
-    "tvl": "phrase",
-    "ssvtp": "phrase",
-    "octopi": "phrase",
-}
+    "touch_and_go": "photograph", "tacquad": "photograph", "objectfolder_real": "object", "tvl": "phrase",
+    "ssvtp": "phrase", "octopi": "phrase",
+}  # fmt: skip
 
 _SYSTEM = (
     "You describe how surfaces feel to the touch. You look at what you are given, name the material, and say what a "
@@ -96,10 +98,7 @@ class Prompt(NamedTuple):
 
 
 def family_of(dataset: str | None, families: Mapping[str, str] | None = None) -> Family | None:
-    """Return the family of a dataset from `families` (dataset -> family), else from FAMILIES, else None.
-
-    Raises UserError for a family that does not exist.
-    """
+    """Return the family of a dataset, by `families` or else FAMILIES, or None. Raises UserError for an unknown one."""
     family = (families or {}).get(dataset or "") or FAMILIES.get(dataset or "")
     if family is not None and family not in _TEXTS:
         raise UserError(f"There is no prompt family {family!r}. Use one of {', '.join(_TEXTS)}.")
@@ -122,10 +121,7 @@ class BadAnswer(ValueError):
 
 
 def parse_caption(text: str, finish: str) -> tuple[str, str]:
-    """Return (caption, object) from a model's answer and its finish reason.
-
-    Raises BadAnswer if the answer is empty, cut off, refused, not JSON, too short or too long.
-    """
+    """Return (caption, object) of an answer. Raises BadAnswer if it is empty, cut off, refused, or unfit."""
     if finish in ("refusal", "content_filter") or _REFUSAL.search(text):
         raise BadAnswer("refused")
     if not text.strip():
@@ -160,13 +156,9 @@ class CaptionJob(NamedTuple):
 
 
 def find_caption_jobs(
-    manifest: Manifest,
-    *,
-    split: str | None = None,
-    families: Mapping[str, str] | None = None,
-    overwrite: bool = False,
-    second_image: str = SECOND_IMAGE,
-) -> tuple[list[CaptionJob], dict[str, int]]:
+    manifest: Manifest, *, split: str | None = None, families: Mapping[str, str] | None = None,
+    overwrite: bool = False, second_image: str = SECOND_IMAGE,
+) -> tuple[list[CaptionJob], dict[str, int]]:  # fmt: skip
     """Return the captions to get, and the number of rows left out for each reason.
 
     Rows of one touch share a caption. Rows without a touch share it by sequence. The photograph of a group is that of
@@ -255,3 +247,64 @@ def small_jpeg(data: bytes, name: str, side: int) -> bytes:
     pixels = decode_bytes(data, name)
     pixels = scale_picture(pixels, side) if max(pixels.shape[:2]) > side else pixels
     return encode(pixels, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
+
+
+def attach_text(
+    manifest: Manifest, captions: str | Path, *, key: str | None = None, text: str = "text", overwrite: bool = False
+) -> tuple[Manifest, list[str]]:
+    """Add captions from a table (.csv or .parquet) with a key column and the column `text`; also return notes.
+
+    `key` is a column of both (default: the one other column of the table). Rows with a caption keep it unless
+    `overwrite`. Raises UserError for a table that lacks a column, has different captions for a key, or matches no row.
+    """
+    path = Path(captions).expanduser()
+    caption_of, key = _read_captions(path, key, text)
+    keys = _text_of(manifest.column(key), f"{manifest.files[0]}: the key {key!r}")
+    at = pc.index_in(keys, value_set=pa.array(list(caption_of), pa.string())).combine_chunks()
+    new = pa.chunked_array([pa.array(list(caption_of.values()), pa.string()).take(at)])
+    old, matched = manifest.column("text"), len(at) - at.null_count
+    if not matched:
+        raise UserError(
+            f"{path}: no key {key!r} of it is in the manifest; its first one is {shown(next(iter(caption_of), None))}; "
+            "name the right column with --key"
+        )
+    kept = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
+    unused = len(caption_of) - len(at.drop_null().unique())
+    notes = [f"{matched - kept} rows got a caption by {key!r}"]
+    notes += [f"{kept} rows already had a caption"] if kept else []
+    notes += [f"{unused} of {len(caption_of)} keys of {path.name} are not in the manifest"] if unused else []
+    return replace_column(manifest, "text", pc.coalesce(new, old) if overwrite else pc.coalesce(old, new)), notes
+
+
+def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, str], str]:
+    """Return the captions of a table by key, and the name of its key column."""
+    suffix = schema.table_suffix(path, "a table of captions")
+    with schema.reading(path):
+        table = schema.read_text_csv(path) if suffix == ".csv" else pa.parquet.read_table(path, partitioning=None)
+        table.validate(full=True)
+    names = table.column_names
+    others = [name for name in names if name != text]
+    if key is None and len(others) > 1 and text in names:
+        raise UserError(f"{path} has the columns {listed(names)}: name the key column")
+    key = key or next(iter(others), text)
+    for name in (text, key):
+        if names.count(name) != 1 or key == text:
+            fault = "twice the" if name in names else "no"
+            raise UserError(f"{path} has {fault} column {name!r}; it has {listed(names)}")
+    keys, texts = _text_of(table[key], f"{path}: {key!r}"), _text_of(table[text], f"{path}: {text!r}")
+    place = partial(schema.place_of, path)
+    captions: dict[str, str] = {}
+    for row, (name, caption) in enumerate(zip(keys.to_pylist(), texts.to_pylist(), strict=True)):
+        caption = " ".join((caption or "").split())
+        if name is None and caption:
+            raise UserError(f"{place(row)}: a caption without {key}; fill it in")
+        if name is not None and caption and captions.setdefault(name, caption) != caption:
+            raise UserError(f"{place(row)}: {key} {shown(name)} has another caption in an earlier row; keep one")
+    return captions, key
+
+
+def _text_of(column: pa.ChunkedArray, name: str) -> pa.ChunkedArray:
+    try:
+        return schema.clean_text(column.cast(pa.string()))
+    except pa.ArrowException:
+        raise UserError(f"{name} must be a plain column, is {column.type}") from None

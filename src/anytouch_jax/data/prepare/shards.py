@@ -18,7 +18,6 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -27,18 +26,10 @@ from anytouch_jax.bars import tracked
 from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.files import (
-    Files,
-    ShardError,
-    close_shards,
-    distinct_files,
-    read_file,
-    read_shard_index,
-    split_shard_path,
-)
-from anytouch_jax.data.manifest.manifest import Manifest, replace_column, with_distinct_keys
+from anytouch_jax.data.manifest.files import ShardError, close_shards, read_file, read_shard_index, split_shard_path
+from anytouch_jax.data.manifest.manifest import Files, Manifest, distinct_files, replace_column, with_distinct_keys
 from anytouch_jax.data.manifest.schema import PATHS
-from anytouch_jax.data.prepare.licences import licences
+from anytouch_jax.data.prepare.verify import licences
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, atomic_write, lock
 
@@ -52,26 +43,15 @@ class PackError(UserError):
     """A manifest that cannot be packed as requested."""
 
 
-class _Piece(NamedTuple):
-    """A file on its way into a shard."""
-
-    suffix: str
-    data: bytes
-
-
 def pack(
-    manifest: Manifest,
-    out: str | Path,
-    *,
-    shard_bytes: int = SHARD_BYTES,
-    threads: int = 4,
-    log: Callable[[str], None] | None = None,
-) -> Path:
+    manifest: Manifest, out: str | Path, *, shard_bytes: int = SHARD_BYTES, threads: int = 4,
+    log: Callable[[str], None] = lambda _: None,
+) -> Path:  # fmt: skip
     """Store all files of a manifest in shards of about `shard_bytes` in the folder `out`, and return its manifest.
 
-    Files are stored unchanged and once each, so a loader reads the same batches. After an interruption the same call
-    continues behind the last whole shard. A finished pack is not changed. Memory holds a few files for each thread.
-    Raises PackError for a missing or empty file, and for a folder `out` with other contents.
+    Files are stored unchanged and once each, so a loader reads the same batches. The same call continues after an
+    interruption, and a finished pack is not changed. Raises PackError for a missing or empty file, and for a folder
+    `out` with other contents.
     """
     folder = Path(out).expanduser().resolve()
     if shard_bytes < 1:
@@ -88,8 +68,7 @@ def pack(
         fingerprint = None
     _is_same_pack(folder, plan, fingerprint, finished)  # before a lock is made in a foreign folder
     if finished:
-        if log:
-            log(f"{folder} is already packed; it was not changed")
+        log(f"{folder} is already packed; it was not changed")
         return target
     folder.mkdir(parents=True, exist_ok=True)
     with lock(folder / ".lock") as free:
@@ -103,7 +82,7 @@ def pack(
 
 
 def _pack(
-    manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, log: Callable[[str], None] | None
+    manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, log: Callable[[str], None]
 ) -> None:
     """Write the shards, the manifest and, last, the README."""
     cells = np.empty(len(files), object)  # where each file lies, as the manifest names it
@@ -116,8 +95,7 @@ def _pack(
             with (folder / name).open("rb") as file:
                 sums[name] = hashlib.file_digest(file, "sha256").hexdigest()
             done += rows
-            if log:
-                log(f"{name}: {done} of {len(ids)} files")
+            log(f"{name}: {done} of {len(ids)} files")
     close_shards()
     atomic_write(folder / "SHA256SUMS", "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
     target, packed = folder / "manifest.parquet", manifest
@@ -130,10 +108,7 @@ def _pack(
 
 
 def _fingerprint(manifest: Manifest, files: Files) -> str:
-    """Return a digest of the paths, sizes and times of all files. Raises PackError for the first missing one.
-
-    Equal manifests may name other images.
-    """
+    """Return a digest of the paths, sizes and times of all files. Raises PackError for the first missing one."""
     digest = hashlib.sha256()
     for row, column in zip(files.row, files.column, strict=True):
         try:
@@ -155,10 +130,7 @@ def _cannot_pack(manifest: Manifest, row: int, column: str, reason: str) -> Pack
 
 
 def _is_same_pack(folder: Path, plan: dict[str, object], fingerprint: str | None, finished: bool) -> bool:
-    """Return whether the folder holds this pack, finished or not. False means that the folder can be taken.
-
-    Raises PackError if it holds anything else. A pack that failed before its first shard is not protected.
-    """
+    """Return whether the folder holds this pack, finished or not. Raises PackError if it cannot be taken for it."""
     record = folder / "pack.json"
     if record.is_file():
         try:
@@ -201,7 +173,7 @@ def _write_shards(
         yield rows
         number, done = number + 1, done + rows
 
-    def fetch(file: int) -> _Piece:
+    def fetch(file: int) -> tuple[str, bytes]:  # the ending of its name, its content
         row, column = int(files.row[file]), str(files.column[file])
         try:
             data = read_file(manifest.file(row, column))
@@ -212,7 +184,7 @@ def _write_shards(
         if not data:
             raise _cannot_pack(manifest, row, column, "the file is empty")
         suffix = re.search(r"\.[a-zA-Z0-9]{1,8}$", manifest.value(row, column))
-        return _Piece(suffix.group() if suffix else "", data)
+        return suffix.group() if suffix else "", data
 
     with closing(bounded_map(fetch, ids[done:].tolist(), threads)) as every:
         pieces = tracked(every, "files packed", len(ids) - done)
@@ -220,10 +192,10 @@ def _write_shards(
         while piece is not None:
             path, rows, size = folder / f"{number:05d}.zip", 0, 0
             with atomic_path(path, part=path.with_suffix(".part")) as part, zipfile.ZipFile(part, "w") as archive:
-                while piece is not None and (not rows or size + len(piece.data) <= shard_bytes):
+                while piece is not None and (not rows or size + len(piece[1]) <= shard_bytes):
                     # A fixed date makes equal packs equal to the byte.
-                    archive.writestr(zipfile.ZipInfo(f"{rows:06d}{piece.suffix}"), piece.data)
-                    rows, size = rows + 1, size + len(piece.data)
+                    archive.writestr(zipfile.ZipInfo(f"{rows:06d}{piece[0]}"), piece[1])
+                    rows, size = rows + 1, size + len(piece[1])
                     piece = next(pieces, None)
             yield rows
             number += 1

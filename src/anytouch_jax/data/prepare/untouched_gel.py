@@ -1,9 +1,8 @@
 """Pictures of the untouched gel: background images, and estimates of them from the frames of a recording.
 
-Frames of the untouched gel have two properties. They are alike, since nothing moves. And they have less structure than
-every frame in which something presses: an object adds edges to the picture. The estimate is the group of alike frames
-that has less structure than all frames that differ from it. This holds however long the press lasts. Where no group
-stands out, or the group shows a light press itself, the background cannot be known from the frames.
+Frames of the untouched gel are alike, and have less structure than frames in which something presses. The estimate is
+the group of alike frames that has less structure than all frames that differ from it, however long the press lasts.
+Where no group stands out, or it shows a light press itself, the background cannot be known from the frames.
 """
 
 from __future__ import annotations
@@ -56,10 +55,7 @@ def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BL
 
 
 def change_of_light(change: np.ndarray) -> np.ndarray:
-    """Return the change of light f32 (h, w, 3): for each colour a plane that fits most of the picture.
-
-    Each lamp of a sensor drifts by itself, which brightens one side. A press covers the smaller part of a picture.
-    """
+    """Return the change of light f32 (h, w, 3), a plane a colour: lamps drift, and a press covers little."""
     small = cv2.resize(change, (FIT, FIT), interpolation=cv2.INTER_AREA).reshape(-1, 3)
     most, fits = int(0.6 * len(small)), np.arange(len(small))
     for _ in range(3):
@@ -72,10 +68,7 @@ def change_of_light(change: np.ndarray) -> np.ndarray:
 
 
 class UntouchedGel:
-    """A picture of the untouched gel u8 (h, w, 3), which scores frames.
-
-    Dots are closed only on a gel that has dots itself. A small dark dent looks like a dot.
-    """
+    """A picture of the untouched gel u8 (h, w, 3), which scores frames. Dots are closed only on a gel that has some."""
 
     def __init__(self, picture: np.ndarray) -> None:
         self.picture = scale_picture(picture)
@@ -99,10 +92,7 @@ class UntouchedGel:
 
 
 def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel | None, str]:
-    """Return the untouched gel of one recording, or None, and the reason.
-
-    `pictures` u8 (h, w, 3) are frames from `scale_picture`, all of one size.
-    """
+    """Return the untouched gel of scaled frames u8 (h, w, 3) of one recording, or None, and the reason."""
     group, reason = free_frames(pictures)
     return (None, reason) if group is None else (UntouchedGel(_median([pictures[i] for i in group])), "estimated")
 
@@ -121,10 +111,7 @@ def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]
 
 
 def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
-    """Return the per-pixel median of frames of one unit, pressed or not; None if it shows a press itself.
-
-    None, too, for frames that are all alike: they may always be pressed. `pictures` as for `estimate_untouched_gel`.
-    """
+    """Return the median of frames of one unit; None if it shows a press, or if all are alike and may be pressed."""
     free = _median(pictures) if len(pictures) else np.zeros(0)
     others = [picture for picture in pictures if _distance(free, picture) >= DIFFERENT]
     if not others or np.median([_press_of(free, other) for other in others]) >= ALIKE:
@@ -133,10 +120,7 @@ def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
 
 
 def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:
-    """Return the untouched gel that most estimates of one unit agree on, all of one size.
-
-    Return None if fewer than two agree, or if as many agree on another.
-    """
+    """Return the gel that most estimates of one unit agree on; None if fewer than two do, or as many on another."""
     if len(gels) < 2:
         return None
     groups = _alike([gel.score(other.picture) for gel, other in combinations(gels, 2)])
@@ -204,9 +188,8 @@ def contact_score(difference: np.ndarray, edge: int = EDGE) -> float:
 def _excess_structure(free: np.ndarray, pressed: np.ndarray) -> float:
     """Return how much more edges `pressed` has where the two differ, -1 to 1."""
     region = _changed(free, pressed)
-    less, more = (
-        float(np.sqrt((_gradient(_smooth(picture))[region] ** 2).sum(1)).sum()) for picture in (free, pressed)
-    )
+    edges = (_gradient(_smooth(picture))[region] for picture in (free, pressed))
+    less, more = (float(np.sqrt((one**2).sum(1)).sum()) for one in edges)
     return (more - less) / (more + less + 1e-6)
 
 

@@ -1,16 +1,14 @@
-"""Manifest checks: missing, damaged and duplicate files, split leaks, swapped folders, licences, in one report.
+"""Manifest checks and repairs: bad and duplicate files, split leaks, swapped folders, licences.
 
-Some copies of a dataset (TVL among them) hold touch images where the photographs should be. Touch images of one sensor
-look alike and photographs do not, so colours raise a suspicion. A background image of the sensor confirms it: images
-that resemble it are touch images.
+`verify` reports, and `repair` mends in a copy what needs no guess.
 """
 
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,35 +17,44 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from anytouch_jax.data.manifest.manifest import Manifest, group_rows, misspelt_sensors
+from anytouch_jax.data.manifest.manifest import Manifest, group_rows, misspelt_sensors, replace_column, select_rows
 from anytouch_jax.data.manifest.schema import NUMBER, SPLITS, listed, shown, spellings
-from anytouch_jax.data.prepare.licences import NO, YES, Licence, commercial_use, licences
-from anytouch_jax.data.prepare.scan import (
-    BORDER,
-    BOTTOM,
-    CHROMA,
-    EXAMPLES,
-    FIELDS,
-    NOISE,
-    OK,
-    SPREAD,
-    STATES,
-    Finding,
-    Level,
-    Scan,
-    finding,
-    scan,
-)
+from anytouch_jax.data.prepare import scan as scans
+from anytouch_jax.data.prepare.scan import EXAMPLES, OK, STATES, Finding, Level, Scan, finding
 from anytouch_jax.data.transforms import FORM
+from anytouch_jax.errors import UserError
 from anytouch_jax.shown import shown_short
 
 _SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
 _LISTED = 1000  # rows of a finding that are written to JSON
 _FRAME = ("dataset", "sensor", "unit", "sequence", "frame_index", "split")
 _LEARNING = SPLITS[:3]  # the splits that must not share anything: train, val, test
-_MIN_PAIRS = 8  # different pairs of images that are needed for an opinion on swapped folders
-_WIDER = 1.5  # touch images may spread this much more than photographs before they are suspect
-_CERTAIN = 0.95  # share of the rows that must resemble the background images to call a dataset swapped
+
+
+YES, NO, UNKNOWN = 1, 0, -1
+_NO = re.compile(r"\bnc\b|non-?\s?commercial|(research|academic|educational)[\s-]+(use[\s-]+)?only", re.IGNORECASE)
+_YES = re.compile(
+    r"(mit|apache([\s-]2(\.0)?)?|bsd([\s-][0-9]-clause)?|isc|cc0([\s-]1\.0)?|cc[\s-]by([\s-]sa)?([\s-][0-9]\.[0-9])?|"
+    r"public[\s-]domain|unlicense)(\s+licen[cs]e)?",
+    re.IGNORECASE,
+)
+
+
+class Licence(NamedTuple):
+    """Rows under one licence: its name or None, YES, NO or UNKNOWN, the datasets, the number of rows."""
+
+    name: str | None
+    commercial: int
+    datasets: tuple[str, ...]
+    rows: int
+
+
+class Commercial(NamedTuple):
+    """The rows that may be used commercially, and the numbers of rows left out."""
+
+    manifest: Manifest
+    non_commercial: int
+    unknown: int
 
 
 @shown_short
@@ -117,32 +124,30 @@ def _table(*names: str) -> list[str]:
 def verify(manifest: Manifest, *, decode: bool = True, objects: bool = False, threads: int = 4) -> VerifyReport:
     """Check a manifest and every file that it names.
 
-    `decode` reads every file and decodes every image completely. Without it, files must only exist and not be empty.
-    With `objects`, an object in two learning splits is an error. The manifest is not changed (see `repair`).
+    Without `decode`, files must only exist and not be empty. With `objects`, an object in two learning splits is an
+    error.
     """
-    scanned = scan(manifest, decode=decode, threads=threads)
+    scanned = scans.scan(manifest, decode=decode, threads=threads)
     findings = [
         *(fault for check in _FILE_CHECKS for fault in check(manifest, scanned)),
         *row_faults(manifest, objects=objects),
         *(Finding("unknown_sensor", *fault, (), "sensor") for fault in misspelt_sensors(manifest)),
     ]
     levels = ("error", "warning", "info")
+    findings = sorted(map(partial(_with_files, manifest), findings), key=lambda one: levels.index(one.level))
     counts = {entry["values"]: entry["counts"] for entry in pc.value_counts(manifest.table["split"]).to_pylist()}
+    splits = {name: counts[name] for name in SPLITS if name in counts}
+    present = {name: manifest.present(name) for name in _SHARES}
+    shares = {
+        str(manifest.value(rows[0], "dataset") or "-"): {name: float(has[rows].mean()) for name, has in present.items()}
+        for rows in manifest.groups("dataset")
+    }
+    names = (name for name in manifest.table.column_names if name.startswith("label."))
+    labels = {name: int(manifest.present(name).sum()) for name in names}
     return VerifyReport(
-        rows=len(manifest),
-        files=len(scanned.files),
-        decoded=decode,
-        findings=tuple(sorted(map(partial(_with_files, manifest), findings), key=lambda one: levels.index(one.level))),
-        licences=licences(manifest),
-        shares=_shares(manifest),
-        splits={name: counts[name] for name in SPLITS if name in counts},
-        labels={
-            name: int(manifest.present(name).sum()) for name in manifest.table.column_names if name.startswith("label.")
-        },
-        split_hash=split_hash(manifest),
-        content_hash=manifest.content_hash,
-        scan=scanned,
-    )
+        len(manifest), len(scanned.files), decode, tuple(findings), licences(manifest), shares, splits,
+        labels, split_hash(manifest), manifest.content_hash, scanned,
+    )  # fmt: skip
 
 
 def _with_files(manifest: Manifest, one: Finding) -> Finding:
@@ -154,7 +159,11 @@ def _with_files(manifest: Manifest, one: Finding) -> Finding:
 
 def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding]:
     """Yield the faults that need no file: leaks between splits, frame order, licence conflicts, spellings."""
-    yield from _split_leaks(manifest, objects)
+    for column in ("sequence", "touch", "grasp_group", "object"):
+        if column in manifest.table.column_names:
+            level: Level = "info" if column == "object" and not objects else "error"
+            codes = manifest.codes(column, own=column != "object")
+            yield from _leak(manifest, codes, f"leak_{column}", level, column, column)
     yield from _frame_order(manifest)
     marked = np.asarray(pc.fill_null(manifest.column("commercial"), False))
     rows, words = np.flatnonzero(marked & (commercial_use(manifest) == NO)), "rows are commercial, their licence is not"
@@ -162,19 +171,8 @@ def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding
     yield from _label_spellings(manifest)
 
 
-def _shares(manifest: Manifest) -> dict[str, dict[str, float]]:
-    present = {name: manifest.present(name) for name in _SHARES}
-    return {
-        str(manifest.value(rows[0], "dataset") or "-"): {name: float(has[rows].mean()) for name, has in present.items()}
-        for rows in manifest.groups("dataset")
-    }
-
-
 def split_hash(manifest: Manifest) -> str:
-    """Return the SHA-256 of which frame is in which split.
-
-    A frame is (dataset, sensor, unit, sequence, frame_index). The order of rows and the paths do not matter.
-    """
+    """Return the SHA-256 of which frame (_FRAME) is in which split, in any order of rows and with any paths."""
     table = manifest.table
     nulls = pa.nulls(table.num_rows, pa.string())
     columns = [table[name].cast(pa.string()) if name in table.column_names else nulls for name in _FRAME]
@@ -292,14 +290,6 @@ def _leak(manifest: Manifest, codes: np.ndarray, kind: str, level: Level, what: 
     yield Finding(kind, level, sentence, rows, tuple(examples))
 
 
-def _split_leaks(manifest: Manifest, objects: bool) -> Iterator[Finding]:
-    for column in ("sequence", "touch", "grasp_group", "object"):
-        if column in manifest.table.column_names:
-            level: Level = "info" if column == "object" and not objects else "error"
-            codes = manifest.codes(column, own=column != "object")
-            yield from _leak(manifest, codes, f"leak_{column}", level, column, column)
-
-
 def _frame_order(manifest: Manifest) -> Iterator[Finding]:
     """Yield sequences that repeat a frame, which allows no clips, or whose rows are not in frame order."""
     sequence = manifest.codes("sequence", own=True) * len(SPLITS) + manifest.codes("split")
@@ -316,10 +306,7 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
 
 
 def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
-    """Yield label values, objects and units that differ by spaces, letter case or Unicode form only.
-
-    Yield labels too of which most are numbers and some are words, and those that are lists.
-    """
+    """Yield labels, objects and units in several spellings, labels with words among numbers, and lists."""
     for name in manifest.table.column_names:
         column = manifest.table[name]
         if name.startswith("label.") and pa.types.is_nested(column.type):
@@ -341,200 +328,167 @@ def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
             yield from finding(manifest, "words_among_numbers", "warning", odd, words, name)
 
 
-class SwapVerdict(NamedTuple):
-    """A dataset with its rows that have both images, those that look swapped, whether all do, and whether a background
-    image confirms it."""
-
-    dataset: str | None
-    rows: np.ndarray
-    swapped: np.ndarray
-    whole: bool
-    confirmed: bool
+def allows(licence: str | None) -> int:
+    """Return whether a licence with this name allows commercial use: YES, NO or UNKNOWN."""
+    if licence is None or not licence.strip():
+        return UNKNOWN
+    if _NO.search(licence):
+        return NO
+    return YES if _YES.fullmatch(licence.strip()) else UNKNOWN
 
 
-def swap_verdicts(manifest: Manifest, scanned: Scan) -> list[SwapVerdict]:
-    """Return a verdict for every dataset and sensor with rows that look swapped."""
-    code = scanned.files.code
-    if "image_path" not in code or not scanned.colours.any():
-        return []
-    touch, vision = code["path"], code["image_path"]
-    background = np.asarray(pc.equal(manifest.table["split"], "background"))
-    usable = np.flatnonzero((vision >= 0) & scanned.decoded[touch] & scanned.decoded[vision] & ~background)
-    source = np.stack([manifest.codes("dataset"), manifest.codes("sensor")], 1)
-    result = []
-    for rows in group_rows(usable, source[usable]):
-        if len(np.unique(np.stack([touch[rows], vision[rows]], 1), axis=0)) < _MIN_PAIRS:
-            continue
-        others = np.flatnonzero(background & (vision < 0) & (source == source[rows[0]]).all(axis=1))
-        backgrounds = _background_colours(manifest, scanned, others, rows)
-        swapped, whole = _judge_swap(scanned.colours, rows, touch[rows], vision[rows], backgrounds)
-        if swapped.size:
-            dataset = manifest.value(rows[0], "dataset")
-            result.append(SwapVerdict(dataset, rows, swapped, whole, bool(len(backgrounds))))
-    return result
+def commercial_use(manifest: Manifest) -> np.ndarray:
+    """Return YES, NO or UNKNOWN, i8 (rows,): a NO by flag or licence decides, then the flag, then the licence."""
+    codes = manifest.codes("license")
+    names = pc.unique(manifest.column("license")).drop_null().to_pylist()
+    verdict = np.array([*(allows(name) for name in names), UNKNOWN], np.int8)[codes]  # code -1 is the last one
+    flag = np.asarray(pc.fill_null(manifest.column("commercial").cast("int8"), UNKNOWN)).astype(np.int8)
+    return np.where((flag == NO) | (verdict == NO), NO, np.where(flag == YES, YES, verdict)).astype(np.int8)
 
 
-def in_touch_folder(manifest: Manifest, column: str) -> np.ndarray:
-    """Return which rows name a file in `column` that lies in the folder of their touch image, bool (rows,)."""
-    folders = [pc.replace_substring_regex(manifest.column(name), r"[^/]*$", "") for name in (column, "path")]
-    return np.asarray(pc.fill_null(pc.equal(*folders), False))
-
-
-def _background_colours(manifest: Manifest, scanned: Scan, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the colours f32 (k, 48) of the sensor's background images, k = 0 if it has none.
-
-    They are those of `others`, background rows without a photograph, which could be swapped too, and of `rows`, but for
-    a `background_path` in the folder of the touch images.
-    """
-    code = scanned.files.code
-    files = [code["path"][others]]
-    if "background_path" in code:
-        files.append(code["background_path"][rows[~in_touch_folder(manifest, "background_path")[rows]]])
-    # A background that is also a photograph would confirm anything.
-    ids = np.setdiff1d(np.concatenate(files), [-1, *np.unique(code["image_path"])])
-    return scanned.colours[ids[scanned.decoded[ids]][:64]].astype(np.float32)
-
-
-def _judge_swap(
-    colours: np.ndarray, rows: np.ndarray, touch: np.ndarray, vision: np.ndarray, backgrounds: np.ndarray
-) -> tuple[np.ndarray, bool]:
-    """Return the rows that look swapped, and whether the whole dataset does; `touch` and `vision` are their files."""
-    if len(backgrounds):
-        bad = _distance(colours[vision], backgrounds) < _distance(colours[touch], backgrounds)
-        whole = bool(bad.mean() >= _CERTAIN)
-        return rows if whole else rows[bad], whole
-    each = [colours[np.unique(files)] for files in (touch, vision)]  # one photograph may serve many rows
-    centre, other = (np.median(part, axis=0)[None] for part in each)
-    spreads = [
-        float(np.median(_distance(part, middle))) if len(part) >= _MIN_PAIRS else 0.0
-        for part, middle in zip(each, (centre, other), strict=True)
-    ]
-    if spreads[1] and spreads[0] > _WIDER * spreads[1]:
-        return rows, True
-    far, near = _distance(colours[touch], centre), _distance(colours[vision], centre)
-    return rows[(far > 3 * max(spreads[0], 1.0)) & (near < far / 2)], False
-
-
-def _distance(colours: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the mean absolute difference f32 (n,) of colours u8 (n, 48) to the nearest of centres (k, 48)."""
-    return np.min([np.abs(colours.astype(np.float32) - centre).mean(axis=1) for centre in centres], axis=0)
-
-
-def _swapped(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
-    for verdict in swap_verdicts(manifest, scanned):
-        name = f"dataset {shown(verdict.dataset)}" if verdict.dataset else "the rows without a dataset"
-        reason = "the background frames show it" if verdict.confirmed else "suspected from the colours; look at some"
-        what = "all touch images and photographs are" if verdict.whole else f"{verdict.swapped.size} rows are"
-        kind = "swapped" if verdict.whole else "swapped_rows"
-        level: Level = "error" if verdict.confirmed else "warning"
-        for fault in finding(manifest, kind, level, verdict.swapped, "", "path", "image_path", column="image_path"):
-            yield fault._replace(sentence=f"{name}: {what} swapped ({reason})")
-
-
-# Pictures that decode but cannot be right: of one colour, cut, noise, repeated, turned, or unlike their recording.
-# Cameras, disks and scripts leave them behind. A picture is judged alone, or by the other frames of its sequence.
-_FEWEST = 5  # frames of a sequence that show what is usual in it
-_NARROW = 14  # bits of 16: more may be all that a dark picture uses
-_FROZEN = 3  # equal pictures in a row: cameras have noise
-_LAGS = (2, 3, 4)  # pictures of so many sensors may take turns in a sequence
-_ALONE = (
-    ("flat", "of one colour"),
-    ("cut", "of one colour from some row to the bottom, as a file is that was cut"),
-    ("border", "with a black border"),
-    ("noise", "of noise only"),
-)
-_IN_SEQUENCE = (
-    ("frozen", f"equal to the frames before ({_FROZEN} or more in a row)"),
-    ("alternating", "in sequences that jump between the pictures of several sensors"),
-    ("grey", "grey where their sequence is coloured"),
-    ("dark", "much darker than their sequence"),
-    ("inverted", "with inverted brightness for their sequence"),
-    ("channels", "with red and blue exchanged for their sequence"),
-    ("turned", "rotated or mirrored for their sequence"),
-)
-
-
-def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
-    """Yield the kinds of pictures that cannot be right."""
-    looks, narrow = scanned.looks, np.zeros(len(scanned.bits), bool)
-    source = np.stack([manifest.codes("dataset"), manifest.codes("sensor")], 1)
-    for column, code in scanned.files.code.items():
-        rows = np.flatnonzero((code >= 0) & (scanned.bits[code] > 0))
-        for group in group_rows(rows, source[rows]):
-            files = code[group]
-            if (bits := int(scanned.bits[files].max())) <= _NARROW:
-                narrow[files] = True
-                scaled = f"cv2.imread(file, cv2.IMREAD_UNCHANGED) * {2 ** (16 - bits)}"
-                words = f"rows whose {column} has values that use {bits} of 16 bits, and looks black. Scale it: "
-                words += f"cv2.imwrite(file, {scaled})"
-                yield from finding(manifest, "bits", "warning", group, words, column)
-    flat = (looks[:, SPREAD] < 1) & ~narrow
-    alone = {
-        "flat": flat, "cut": looks[:, BOTTOM] > 0.1, "border": looks[:, BORDER] > 0.03, "noise": looks[:, NOISE] > 0.6
-    }  # fmt: skip
-    alone = {kind: wrong & ~narrow & (~flat | (kind == "flat")) for kind, wrong in alone.items()}
-    for column, code in scanned.files.code.items():
-        for kind, words in _ALONE:
-            rows = np.flatnonzero((code >= 0) & (scanned.decoded & alone[kind])[code])
-            yield from finding(manifest, kind, "warning", rows, f"rows whose {column} is {words}", column)
-    files, frame = scanned.files.code["path"], np.asarray(manifest.table["frame_index"])
-    faults: dict[str, list[np.ndarray]] = {kind: [] for kind, _ in _IN_SEQUENCE}
-    rows = np.flatnonzero((scanned.decoded & ~np.any([*alone.values()], axis=0))[files])
-    for members in group_rows(rows, manifest.codes("sequence", own=True)[rows], frame[rows]):
-        for kind, wrong in _faults_of_sequence(scanned, files[members]).items():
-            faults[kind].append(members[wrong])
-    for kind, words in _IN_SEQUENCE:
-        rows = np.sort(np.concatenate([np.empty(0, np.int64), *faults[kind]]))
-        yield from finding(manifest, kind, "warning", rows, f"touch images {words}", "path")
-
-
-def _faults_of_sequence(scanned: Scan, files: np.ndarray) -> dict[str, np.ndarray]:
-    """Return which frames of a sequence have each fault, bool (frames,); `files` are in the order of the frames."""
-    pixels = scanned.pixels[files]
-    runs = np.split(np.arange(len(files)), np.flatnonzero(np.diff(pixels.astype(np.int64))) + 1)
-    frozen = np.zeros(len(files), bool)
-    for run in (run for run in runs if len(run) >= _FROZEN):
-        frozen[run[1:]] = True
-    faults = {"frozen": frozen}
-    if len(files) < _FEWEST:
-        return faults
-    colours = scanned.colours[files].astype(np.float32)
-    faults["alternating"] = np.full(len(files), _alternates(colours))
-    if faults["alternating"].any():
-        return faults
-    usual, chroma = np.median(colours, axis=0), scanned.looks[files, CHROMA]
-    faults["grey"] = (chroma < 1.5) & (np.median(chroma) > 6)
-    faults["dark"] = (colours.mean(axis=1) < usual.mean() / 4) & (usual.mean() > 20)
-    away = np.abs(colours - usual).mean(axis=1)
-    spread = float(np.median(away))
-    for at in np.flatnonzero((away > max(6.0, 3 * spread)) & ~faults["grey"] & ~faults["dark"]):
-        kind, near = min(
-            ((kind, float(np.abs(other - usual).mean())) for kind, other in _variants(colours[at])), key=lambda p: p[1]
+def commercial_only(manifest: Manifest) -> Commercial:
+    """Return the rows that may certainly be used commercially. Raises UserError if there is none."""
+    use = commercial_use(manifest)
+    non_commercial, unknown = int((use == NO).sum()), int((use == UNKNOWN).sum())
+    if not (use == YES).any():
+        files = ", ".join(map(str, manifest.files))
+        raise UserError(
+            f"{files}: no row may certainly be used commercially ({non_commercial} may not, {unknown} do not say). "
+            "Fill in the columns 'license' and 'commercial'."
         )
-        if near < min(away[at] / 3, max(3.0, 2 * spread)):
-            faults.setdefault(kind, np.zeros(len(files), bool))[at] = True
-    return faults
+    return Commercial(select_rows(manifest, np.flatnonzero(use == YES)), non_commercial, unknown)
 
 
-def _alternates(colours: np.ndarray) -> bool:
-    """Return whether neighbours differ much more than frames further apart, for colours f32 (frames, 48)."""
-    if len(colours) < 2 * _FEWEST - 2:
-        return False
-    step = np.median(np.abs(np.diff(colours, axis=0)).mean(axis=1))
-    return step > 2 and any(
-        len(colours) >= 3 * lag and 4 * np.median(np.abs(colours[lag:] - colours[:-lag]).mean(axis=1)) < step
-        for lag in _LAGS
-    )
+def licences(manifest: Manifest) -> tuple[Licence, ...]:
+    """Return the rows under each licence, most rows first."""
+    use = commercial_use(manifest).astype(np.int64)
+    result = []
+    for rows in group_rows(np.arange(len(manifest)), np.stack([manifest.codes("license"), use], 1)):
+        datasets = manifest.column("dataset").take(rows).unique().drop_null().to_pylist()
+        name, verdict = manifest.value(rows[0], "license"), int(use[rows[0]])
+        result.append(Licence(name, verdict, tuple(sorted(datasets)), len(rows)))
+    return tuple(sorted(result, key=lambda licence: -licence.rows))
 
 
-def _variants(colours: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the colours f32 (48,) of a picture as they were before each fault, with its kind."""
-    fields = colours.reshape(FIELDS, FIELDS, 3)
-    yield "inverted", 255 - colours
-    yield "channels", fields[..., ::-1].ravel()
-    for turns, mirror in itertools.product(range(4), (False, True)):
-        if turns or mirror:
-            yield "turned", np.rot90(fields[:, ::-1] if mirror else fields, turns).ravel()
+_FILE_CHECKS = (_bad_files, _wrong_sizes, _background_forms, _duplicates, scans.swapped_folders, scans.picture_faults)
 
 
-_FILE_CHECKS = (_bad_files, _wrong_sizes, _background_forms, _duplicates, _swapped, picture_faults)
+_OF_ROWS = {f"leak_{name}" for name in ("sequence", "touch", "grasp_group", "object")}
+_OF_ROWS |= {"repeated_frame", "frame_order", "licence_conflict", "spelling"}  # faults that dropping rows can repair
+
+
+class Repaired(NamedTuple):
+    """The repaired manifest, a sentence for each repair, and a sentence for each fault that is left to the user."""
+
+    manifest: Manifest
+    done: tuple[str, ...]
+    left: tuple[str, ...]
+
+
+def repair(manifest: Manifest, report: VerifyReport, *, swap: Collection[str] = ()) -> Repaired:
+    """Make the repairs that need no guess, based on the `report` of this manifest.
+
+    Rows with an unusable touch image and repeated rows are dropped. An unusable photograph, background or field file
+    becomes null. Touch images and photographs are exchanged in datasets that a background image confirms to be
+    swapped as a whole, and in those named in `swap`. Raises UserError if no touch image is usable, and for an unknown
+    name in `swap`.
+    """
+    scanned = report.scan
+    done: list[str] = []
+    if report.content_hash != manifest.content_hash:
+        raise UserError("the report is of another manifest; verify this one first")
+    result, exchanged = _exchange(manifest, report, swap, done)
+    usable = np.ones(len(manifest), bool)
+    for column in scanned.files.code:
+        states = scanned.states(column)
+        if column in ("path", "image_path") and exchanged.any():
+            other = scanned.states("image_path" if column == "path" else "path")
+            states = np.where(exchanged, other, states)
+        bad = states != OK
+        if not bad.any():
+            continue
+        counts = ", ".join(f"{int((states == n).sum())} {STATES[n]}" for n in np.unique(states[bad]))
+        if column == "path":
+            usable &= ~bad
+            done.append(f"dropped {int(bad.sum())} rows whose touch image cannot be used ({counts})")
+        else:
+            result = _empty_cells(result, column, bad)
+            done.append(f"emptied {column} in {int(bad.sum())} rows ({counts})")
+    if not usable.any():
+        folder = manifest.files[0].parent
+        raise UserError(f"no touch image of {manifest.files[0]} can be used; are the files really in {folder}?")
+    repeats = repeated_rows(manifest, content_ids(scanned))
+    repeats = repeats[usable[repeats]]
+    if repeats.size:
+        usable[repeats] = False
+        done.append(f"dropped {repeats.size} rows that repeat another, touch image and all")
+    result = select_rows(result, np.flatnonzero(usable))
+    return Repaired(result, tuple(done), _left(report, result, exchanged))
+
+
+def check_swap(manifest: Manifest, swap: Collection[str]) -> None:
+    """Raise UserError for a dataset to swap that the manifest does not have."""
+    names = set(manifest.column("dataset").unique().to_pylist())
+    unknown = sorted(set(swap) - names)
+    if unknown:
+        known = ", ".join(sorted(str(name) for name in names if name)) or "no dataset names"
+        raise UserError(f"there is no dataset {unknown[0]!r} to swap; the manifest has {known}")
+
+
+def _empty_cells(manifest: Manifest, column: str, rows: np.ndarray) -> Manifest:
+    cells = manifest.column(column).combine_chunks().to_numpy(False)
+    return replace_column(manifest, column, pa.array(np.where(rows, None, cells), pa.string()))
+
+
+def _exchange(
+    manifest: Manifest, report: VerifyReport, swap: Collection[str], done: list[str]
+) -> tuple[Manifest, np.ndarray]:
+    """Return the manifest with touch image and photograph exchanged where needed, and which rows those are."""
+    exchanged = np.zeros(len(manifest), bool)
+    check_swap(manifest, swap)
+    for verdict in scans.swap_verdicts(manifest, report.scan):
+        if verdict.whole and verdict.confirmed and verdict.dataset not in swap:
+            exchanged[verdict.rows] = True
+            exchanged |= _background_rows(manifest, verdict.rows)
+            done.append(
+                f"exchanged touch image and photograph in {verdict.rows.size} rows of dataset {verdict.dataset!r}: "
+                "its photographs resemble the background frames, its touch images do not"
+            )
+    if swap:
+        dataset = manifest.column("dataset").to_pylist()
+        chosen = np.array([name in swap for name in dataset]) & manifest.present("image_path")
+        exchanged |= chosen
+        rows = int(chosen.sum())
+        done.append(f"exchanged touch image and photograph in {rows} rows of {', '.join(sorted(swap))}, as requested")
+    if not exchanged.any():
+        return manifest, exchanged
+    touch, image = (manifest.table[name].combine_chunks().to_numpy(False) for name in ("path", "image_path"))
+    result = replace_column(manifest, "path", pa.array(np.where(exchanged, image, touch), pa.string()))
+    result = replace_column(result, "image_path", pa.array(np.where(exchanged, touch, image), pa.string()))
+    photographs = exchanged & scans.in_touch_folder(manifest, "background_path")  # its folder now holds photographs
+    if photographs.any():
+        result = _empty_cells(result, "background_path", photographs)
+        done.append(f"emptied background_path in {int(photographs.sum())} of them: it lay among the photographs")
+    return result, exchanged
+
+
+def _background_rows(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
+    """Return the background rows with a photograph of the dataset and sensor of `rows`. They are swapped too."""
+    selected = np.asarray(pc.equal(manifest.table["split"], "background")) & manifest.present("image_path")
+    for name in ("dataset", "sensor"):
+        code = manifest.codes(name)
+        selected &= code == code[rows[0]]
+    return selected
+
+
+def _left(report: VerifyReport, result: Manifest, exchanged: np.ndarray) -> tuple[str, ...]:
+    """Return the faults that remain after the repair."""
+    remaining = {one.kind for one in row_faults(result)}
+    left = []
+    for one in report.findings:
+        repaired = one.kind in {*STATES, "repeated_row"}
+        repaired |= one.kind in _OF_ROWS and one.kind not in remaining
+        repaired |= one.kind == "swapped" and bool(exchanged[one.rows].any())
+        if one.level != "info" and not repaired:
+            left.append(one.sentence)
+    return tuple(left)

@@ -15,29 +15,16 @@ import pyarrow.compute as pc
 import pyarrow.parquet
 
 from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.files import is_remote
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
-from anytouch_jax.data.manifest.remote import is_remote
 from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest, table_suffix
-from anytouch_jax.data.readers import (
-    bags,
-    corpora,
-    feel,
-    forces,
-    lerobot,
-    objectfolder,
-    packs,
-    recordings,
-    robots,
-    tacquad,
-    touch_and_go,
-    tvl,
-)
+from anytouch_jax.data.readers import bags, corpora, forces, hands, lerobot, recordings, robots
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader, IndexOptions
 from anytouch_jax.errors import UserError
 
 __all__ = ["READERS", "DatasetError", "DatasetIndex", "DatasetReader", "IndexOptions", "IndexReport", "index"]
 
-_MODULES = (touch_and_go, robots, tvl, tacquad, feel, objectfolder, packs, corpora, forces, lerobot, bags, recordings)
+_MODULES = (hands, robots, corpora, forces, lerobot, bags, recordings)
 READERS = {name: reader for module in _MODULES for name, reader in module.READERS.items()}
 _INDEX_KEY = b"anytouch.index"  # in the schema of a Parquet file: the content hash with which `index` wrote it
 _OTHER_OUT = "name another file with --out, in a folder that contains the data"
@@ -99,13 +86,9 @@ class IndexReport:
 
 
 def index(
-    name: str,
-    root: str | Path,
-    out: str | Path | None = None,
-    *,
-    options: IndexOptions | None = None,
+    name: str, root: str | Path, out: str | Path | None = None, *, options: IndexOptions | None = None,
     keep: bool = False,
-) -> IndexReport:
+) -> IndexReport:  # fmt: skip
     """Read the dataset `name` in the folder `root` and write its manifest to `out` (default: ROOT/<name>.parquet).
 
     `out` must be in `root` or above it, because a manifest's paths may not leave its folder. With `keep` an edited
@@ -143,9 +126,7 @@ def index(
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
     above = base.relative_to(target.parent)
     for column in set(PATHS) & columns.keys() if above != Path() else ():
-        columns[column] = [
-            path and (path if is_remote(path) else f"{above.as_posix()}/{path}") for path in columns[column]
-        ]
+        columns[column] = [p and (p if is_remote(p) else f"{above.as_posix()}/{p}") for p in columns[column]]
     manifest = manifests.from_columns(columns, target)
     manifest.clips(2)  # raises for a repeated frame
     _check_links(manifest, base)
@@ -156,9 +137,8 @@ def index(
     except OSError as error:
         raise UserError(f"the manifest {target} cannot be written: {error.strerror}; {_OTHER_OUT}") from None
     rows.notes += [sentence for _, sentence, _ in manifests.misspelt_sensors(manifest)]
-    return IndexReport(
-        reader, target, manifest, dict(sorted(rows.skipped.items())), rows.notes, rows.left_out, rows.written
-    )
+    skipped = dict(sorted(rows.skipped.items()))
+    return IndexReport(reader, target, manifest, skipped, rows.notes, rows.left_out, rows.written)
 
 
 def _target(base: Path, name: str, out: str | Path | None) -> Path:

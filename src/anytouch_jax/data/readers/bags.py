@@ -41,10 +41,7 @@ class BagError(DatasetError):
 
 
 class Message(NamedTuple):
-    """A message of a recording: its topic, the time when it was logged in nanoseconds, its type, its content.
-
-    The content is None if its encoding is not read.
-    """
+    """A message: topic, time of its log in nanoseconds, type, and content, None for an encoding that is not read."""
 
     topic: str
     time: int
@@ -136,9 +133,8 @@ def nearest_values(times: np.ndarray, series: list[tuple[int, Any]]) -> list[Any
         return [None] * len(times)
     order = sorted(series, key=lambda one: one[0])
     stamps = np.array([time for time, _ in order])
-    after = (
-        np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1) if len(stamps) > 1 else np.zeros(len(times), int)
-    )
+    last = len(stamps) - 1
+    after = np.clip(np.searchsorted(stamps, times), min(1, last), last)
     before = np.maximum(after - 1, 0)
     chosen = np.where(np.abs(stamps[before] - times) <= np.abs(stamps[after] - times), before, after)
     return [order[at][1] if abs(stamps[at] - time) <= FAR else None for at, time in zip(chosen, times, strict=True)]

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Literal
 
 from anytouch_jax.bars import Item, tracked
 from anytouch_jax.config import FIELD_SENSORS, SENSORS, UNIVERSAL, check_spelling, parse_json
-from anytouch_jax.data.manifest.remote import open_store
+from anytouch_jax.data.manifest.files import open_store
 from anytouch_jax.data.manifest.schema import REQUIRED
 from anytouch_jax.data.names import natural
 from anytouch_jax.errors import UserError
@@ -53,16 +53,7 @@ class DatasetError(UserError):
 
 @dataclass(frozen=True)
 class IndexOptions:
-    """Options of the readers; each reader names those that it uses.
-
-    `val`, `test`: shares of the groups (objects, else recordings) for these splits, in datasets without splits.
-    `lists`: a folder with list files, searched before ROOT. `task`: the lists of Touch and Go that decide the split.
-    `fold`: the `split_<k>.npy` of Feel. `export`: write pictures into ROOT for datasets of arrays or videos. `sensor`,
-    `split_by`, `labels`: for recordings, their sensor, what is held out, and a table of labels by object or sequence.
-    `singles`, `films`: whether pictures are single touches or films (default: by their names). `order`: of frames.
-    `url`: the address of shards that are not in ROOT. `keys`: tactile cameras, or topics of images. `values`: what else
-    becomes a label, as NAME=PLACE.
-    """
+    """Options of the readers, as `anytouch data index --help` explains them. Each reader names those that it uses."""
 
     val: float = 0.05
     test: float = 0.05
@@ -87,12 +78,7 @@ class IndexOptions:
 
 @dataclass(frozen=True)
 class DatasetReader:
-    """A dataset: how to read it, and facts about it.
-
-    `read` adds the rows of a `DatasetIndex`. `layout` is the path of one frame, whose first folder is in ROOT, for the
-    error of a folder without frames. `paper` is the number of contact frames in the paper's dataset table, None if it
-    is not there.
-    """
+    """How to read a dataset, and facts: `layout` of a frame for an error, `paper` its contact frames in the paper."""
 
     read: Callable[[DatasetIndex], None]
     layout: str
@@ -139,6 +125,10 @@ class DatasetIndex:
             before, first = self.skipped.get(reason, (0, example))
             self.skipped[reason] = before + count, first
 
+    def skip_all(self, reason: str, examples: Sequence[str]) -> None:
+        """Count all of `examples` as left out for `reason`."""
+        self.skip(reason, "".join(examples[:1]), len(examples))
+
     def leave_out(self, reason: str, example: str, count: int = 1) -> None:
         """Count frames that get no row, see `skip`."""
         self.left_out += count
@@ -159,11 +149,13 @@ class DatasetIndex:
         return next((file for file in files if file.is_file()), None)
 
     def listing(self, folder: str, *, count: bool = True) -> tuple[list[str], list[str]]:
-        """Return the names of the folders (2 before 10) and files in `folder`; links and system files are skipped."""
+        """Return the names of folders (2 before 10) and files in a folder, if any, without links and system files."""
         folders: list[str] = []
         files: list[str] = []
         try:
             entries = list(os.scandir(self.root / folder))
+        except FileNotFoundError:
+            return [], []
         except OSError as error:
             raise DatasetError(f"{self.root / folder} cannot be listed: {error.strerror}") from None
         for entry in entries:
@@ -192,8 +184,7 @@ class DatasetIndex:
 
     def paths(self, suffix: str, base: str = "") -> list[str]:
         """Return the paths of the files below a folder whose names end in `suffix`."""
-        folders = self.walk(base) if (self.root / base).is_dir() else ()
-        found = (f"{folder}/{name}".lstrip("/") for folder, _, files in folders for name in files)
+        found = (f"{folder}/{name}".lstrip("/") for folder, _, files in self.walk(base) for name in files)
         return [f"{base}{path}" for path in found if path.endswith(suffix)]
 
     def shards(self, suffix: str) -> Iterator[tuple[str, Callable[[], BinaryIO]]]:
@@ -228,12 +219,8 @@ class DatasetIndex:
     def frames(
         self, folder: str, pattern: str = NUMBERED, files: Sequence[str] | None = None, *, count: bool = True
     ) -> Frames:
-        """Return the files of a folder (none if it is missing) whose whole name matches `pattern`.
-
-        They are sorted by the number in its first group. Other files, and a second file of one number, are skipped.
-        """
-        if files is None:
-            files = self.listing(folder)[1] if (self.root / folder).is_dir() else []
+        """Return the files whose whole name matches, by the number in its first group. Others are skipped."""
+        files = self.listing(folder)[1] if files is None else files
         match = re.compile(pattern, re.IGNORECASE).fullmatch
         frames: Frames = {}
         for name in files:
@@ -275,10 +262,7 @@ class DatasetIndex:
         return tests, captions
 
     def read_contact_list(self, names: Collection[str], marker: str) -> None:
-        """Read the authors' list of contact frames, if one of the CSV files `names` is there.
-
-        The keys of `contact` are the paths behind the last folder called `marker`.
-        """
+        """Read the authors' list of contact frames, if any: `contact` is by the path behind the last `marker`/."""
         path = self.find_file(names)
         if path is not None:
             rows = ((row[0].replace("\\", "/"), row) for _, row in read_lines(path))
@@ -301,10 +285,7 @@ class DatasetIndex:
             column.extend([None] * (before + size - len(column)))
 
     def add_recording(self, frames: Frames, folder: str, *, split: str, key: str = "", **cells: Any) -> None:
-        """Add the frames of a recording; `key`/name is the key of a frame in the contact list.
-
-        With a contact list the frames in it have contact, and all other frames get the split `unused`.
-        """
+        """Add the frames of a recording; those that a contact list lacks, by `key`/name, get the split `unused`."""
         cells["split"] = split
         if self.contact is not None:
             is_contact = [f"{key}/{name}" in self.contact for name in frames.values()]
@@ -314,10 +295,7 @@ class DatasetIndex:
         self.add([f"{folder}/{name}".lstrip("/") for name in frames.values()], frame_index=list(frames), **cells)
 
     def columns(self) -> Columns:
-        """Return all columns, without optional ones that are null on every row; report unmatched contact frames.
-
-        A note says which of the columns that were asked for have no value.
-        """
+        """Return the columns, without optional ones that are all null; report what was not matched."""
         if self.contact is not None:
             missing = len(self.contact) - self._contact_rows
             self.skip("listed contact frame that is not on disk", "see the contact list", missing)
@@ -334,10 +312,7 @@ def split_word(name: str) -> str | None:
 
 
 def label_cells(name: str, values: list[Any]) -> dict[str, list[Any]]:
-    """Return values by label: NAME of numbers or text, NAME_0, ... of vectors, NAME_0_0 of tables, NAME_key of objects.
-
-    A row without a value, or with a shorter vector, has None. Raises DatasetError for more than MOST_LABELS.
-    """
+    """Return values by label: NAME, NAME_0.. of vectors, NAME_key of objects. Raises DatasetError above MOST_LABELS."""
     rows = [dict(_flat(value)) for value in values]
     places = dict.fromkeys(place for row in rows for place in row)
     if len(places) > MOST_LABELS:
@@ -355,21 +330,14 @@ def _flat(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
 
 
 def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
-    """Return the split of a group: the first 8 bytes of SHA-256(dataset/group) as a share of their range.
-
-    Below `val` it is val, below `val + test` test, else train. A group is never in two splits, and adding or removing
-    other groups moves none.
-    """
+    """Return val, test or train by the share of SHA-256(dataset/group) in its range. Other groups move none."""
     digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
     share = int.from_bytes(digest[:8], "big") / 2**64
     return "val" if share < options.val else "test" if share < options.val + options.test else "train"
 
 
 def published_splits(path: Path, lists: Mapping[str, Iterable[Any]], key: Callable[[Any], Any] = str) -> dict[Any, str]:
-    """Return `key` of member -> split from the lists of train, val and test in the file `path`, as far as it has them.
-
-    Raises DatasetError for a member in two lists, and for one that `key` cannot read.
-    """
+    """Return `key` of member -> split from the lists train, val, test of a file. Raises DatasetError for overlaps."""
     splits: dict[Any, str] = {}
     for part in PARTS:
         try:
@@ -383,10 +351,7 @@ def published_splits(path: Path, lists: Mapping[str, Iterable[Any]], key: Callab
 
 
 def read_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Return (number of its first line, from 1, cells) of the rows of a CSV file (UTF-8) that are not blank.
-
-    Raises DatasetError.
-    """
+    """Return (number of its first line, from 1, cells) of each row of a CSV file. Raises DatasetError."""
     try:
         lines = [(line, [cell.strip() for cell in cells]) for line, cells in csv_lines(path)]
         return [(line, row) for line, row in lines if any(row)]
@@ -423,10 +388,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def read_pickle(path: Path) -> Any:
-    """Return the content of a pickle, also behind the header of a .npy: plain values and arrays of NumPy.
-
-    No other code is run. Raises DatasetError for anything else.
-    """
+    """Return plain values and arrays of a pickle, or behind a .npy header. No code is run. Raises DatasetError."""
     try:
         data = path.read_bytes()
         return _Unpickler(io.BytesIO(data.partition(b"\n")[2] if path.suffix == ".npy" else data)).load()

@@ -1,4 +1,4 @@
-"""Corpora in shards that stay unchanged: Parquet with pictures in a column, and WebDataset tars.
+"""Corpora in shards that stay unchanged, Parquet and WebDataset tars, and small packs that need no layout.
 
 Layouts are those of public code: the schema and the read-me of gelsight-mini-pretrain (github.com/Yuxiang-Ma), and
 `WdsWriter` and the loader of T3 (github.com/alanzjl/t3) with the data set card of FoTa. With `url` the shards stay in
@@ -7,19 +7,25 @@ an object store, and only their metadata are read.
 
 from __future__ import annotations
 
+import importlib.metadata
 import re
+import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet
 
 from anytouch_jax.config import parse_json
+from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import ShardError, tar_members
-from anytouch_jax.data.manifest.schema import typed_label
+from anytouch_jax.data.manifest.schema import PATHS, typed_label
 from anytouch_jax.data.readers.common import TACTILE, DatasetError, DatasetIndex, DatasetReader, label_cells, split_word
+from anytouch_jax.data.readers.exports import exported
 from anytouch_jax.errors import UserError
 
 _CC_BY, _TACTILE_MNIST = "CC-BY-4.0", "CC-BY-2.0"
@@ -52,8 +58,8 @@ _SENSORS = {
 def _gelsight_mini(index: DatasetIndex) -> None:
     """GelSight Mini touches of 13 public sources, one schema of 30 columns: <source>/<split>-<n>.parquet.
 
-    The licence is that of the source. A frame of a film (`frame_idx`) belongs to the sequence of its capture. Any
-    other frame is a sequence. Splits called test* are test, and those of no usual name are by hash of the capture.
+    The licence is that of the source. A frame of a film (`frame_idx`) belongs to its capture, any other is a sequence.
+    Splits called test* are test, and those of no usual name are by hash of the capture.
     """
     for path, opened in index.shards(".parquet"):
         with opened() as file:
@@ -84,26 +90,24 @@ def _gelsight_mini(index: DatasetIndex) -> None:
                 split=split if split in ("train", "val") else "test" if split.startswith("test")
                 else index.split_of(capture),
                 license=licence, commercial=licence != "not stated" and "NC" not in licence,
-                **{f"label.{ours}": _plain(row.get(name)) for name, ours in _LABELS.items()},
+                **{f"label.{ours}": int(value) if isinstance(value := row.get(name), bool) else value
+                   for name, ours in _LABELS.items()},
             )  # fmt: skip
 
 
 def _webdataset(index: DatasetIndex) -> None:
     """Tars of WebDataset: a sample is the files of one key, which ends at the first point of their names.
 
-    Pictures are touches, photographs or backgrounds by their field (`kind_of_picture`). Values of .json and .cls become
-    labels, `object` the object, .txt the caption. Every touch is a sequence, because shards are in a random order. A
-    folder or a shard called train or val gives the split, or else `split` of the JSON, or the hash of object or key.
+    Pictures are touches, photographs or backgrounds by their field. Values of .json and .cls become labels, `object`
+    the object, .txt the caption. Every touch is a sequence. The split is that of a folder or shard called train or val,
+    or `split` of the JSON, or the hash of object or key.
     """
     sensor = index.need_sensor()
     _tars(index, lambda path: sensor)
 
 
 def _fota(index: DatasetIndex) -> None:
-    """FoTa, 13 sensors: <data set>/{train,val}/data-000000.tar, with `key.jpg` and `key.json`.
-
-    The sensor comes from the name of the data set. The option `sensor` serves names that say nothing.
-    """
+    """FoTa, 13 sensors, by the name of the data set or else --sensor: <data set>/{train,val}/data-000000.tar."""
 
     def sensor_of(path: str) -> str:
         name = "/".join(path.lower().split("/")[:-2]) or path.lower()
@@ -193,10 +197,7 @@ def _add_sample(
 
 
 def kind_of_picture(field: str, keys: Sequence[str] = ()) -> str:
-    """Return what the picture of a field of a sample is: touch, photo, background or other. `keys` are tactile fields.
-
-    A field such as jpg, without a name, and one of a side, such as left.jpg, are tactile.
-    """
+    """Return touch, photo, background or other for a field. No name, as jpg, and a side, as left.jpg, are touch."""
     name = field.rpartition(".")[0]
     if keys:
         return "touch" if field in keys or name in keys else "photo" if _PHOTO.search(name) else "other"
@@ -229,10 +230,6 @@ def _parsed(data: bytes, where: str) -> dict[str, Any]:
     return {str(name): value for name, value in values.items()} if isinstance(values, dict) else {"value": values}
 
 
-def _plain(value: Any) -> Any:
-    return int(value) if isinstance(value, bool) else value
-
-
 def _one_type(index: DatasetIndex) -> None:
     """Make labels that are a number in one data set and text in another text in all, and whole numbers floats."""
     for name, column in index.table.items():
@@ -240,6 +237,64 @@ def _one_type(index: DatasetIndex) -> None:
         if name.startswith("label.") and len(kinds) > 1:
             kind = str if str in kinds else float
             index.table[name] = [None if value is None else kind(value) for value in column]
+
+
+def _real_touch(index: DatasetIndex) -> None:
+    """Real frames from public repositories, with their own manifest.csv; label.contact_score is computed."""
+    if not (index.root / "manifest.csv").is_file():
+        return
+    table = manifests.read(index.root / "manifest.csv").table
+    on_disk = {f"{folder}/{name}".lstrip("/") for folder, _, files in index.walk(count=False) for name in files}
+    exists = [path in on_disk for path in table["path"].to_pylist()]
+    gone = [path for path in table["path"].to_pylist() if path not in on_disk]
+    index.skip_all("file of the manifest that is not on disk", gone)
+    columns = {name: pc.filter(table[name], exists).to_pylist() for name in table.column_names}
+    for name in set(PATHS[1:]) & columns.keys():
+        missing = [path is not None and path not in on_disk for path in columns[name]]
+        index.skip(f"{name} that is not on disk (kept without)", name, sum(missing))
+        columns[name] = [None if gone else path for gone, path in zip(missing, columns[name], strict=True)]
+    index.add(columns.pop("path"), **columns)
+
+
+def _taxim_presses(index: DatasetIndex) -> None:
+    """Presses of a steel ball on a GelSight and a GelSight Mini, in the package `taxim` (1.4.1), which is not imported.
+
+    `calib/<sensor>/dataPack.npz` has `f0`, the untouched gel, `imgs`, BGR u8 480 x 640, `touch_center` and
+    `touch_radius` in pixels. Pictures are written into ROOT/taxim_presses. `lists` may name another `calib` folder.
+    Every press is a sequence, split by hash. Raises DatasetError without the package.
+    """
+    calib = index.options.lists
+    if calib is None:
+        try:
+            calib = Path(str(importlib.metadata.distribution("taxim").locate_file("taxim/calib")))
+        except importlib.metadata.PackageNotFoundError:
+            raise DatasetError("the package taxim is not installed; run pip install taxim") from None
+    for sensor in ("gelsight", "gelsight_mini"):
+        path, place = calib / sensor / "dataPack.npz", f"taxim_presses/{sensor}"
+        if not path.is_file():
+            index.skip("sensor without dataPack.npz", str(path))
+            continue
+        try:
+            with np.load(path, allow_pickle=False) as pack:
+                gel, images, centres, radii = (pack[key] for key in ("f0", "imgs", "touch_center", "touch_radius"))
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise DatasetError(f"{path} is not a calibration pack of taxim: {error}") from None
+        names = [f"press_{i:02d}" for i in range(len(images))]
+        with exported(index, place, sensor, [path]) as pictures:
+            for name, image in zip(("background", *names), (gel, *images), strict=True):
+                pictures.save(f"{name}.png", image[..., ::-1])
+        place = pictures.folder
+        cells = {"sensor": sensor, "unit": f"taxim/{sensor}", "frame_index": 0}
+        index.add(
+            [f"{place}/{name}.png" for name in names], **cells, object="ball",
+            sequence=[f"{sensor}/{name}" for name in names],
+            split=[index.split_of(f"{sensor}/{name}") for name in names],
+            background_path=f"{place}/background.png",
+            **{"label.contact": 1, "label.radius_px": [float(r) for r in radii],
+               "label.x_px": [float(x) for x, _ in centres], "label.y_px": [float(y) for _, y in centres]},
+        )  # fmt: skip
+        index.add([f"{place}/background.png"], **cells, sequence=f"{sensor}/background", split="background",
+                  **{"label.contact": 0})  # fmt: skip
 
 
 READERS = {
@@ -257,5 +312,13 @@ READERS = {
     "webdataset": DatasetReader(
         _webdataset, "<folder>/000000.tar", "nothing, unless their owner asks for it", "as their owner says",
         uses=("val", "test", "url", "sensor", "keys"),
+    ),
+    "real_touch": DatasetReader(
+        _real_touch, "manifest.csv", "the sources named in the pack's read-me", "by row", uses=()
+    ),
+    "taxim_presses": DatasetReader(
+        _taxim_presses, "dataPack.npz in the folder calib of the package taxim",
+        "Si and Yuan, Taxim: An Example-Based Simulation Model for GelSight Tactile Sensors, RA-L 2022", "MIT",
+        "https://pypi.org/project/taxim", uses=("val", "test", "lists"),
     ),
 }  # fmt: skip

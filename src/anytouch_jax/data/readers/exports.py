@@ -28,10 +28,7 @@ _TRIES = 1000  # folders of one name
 
 
 class Export:
-    """The pictures of one stream. `folder` is relative to ROOT, and final when the block of `exported` has ended.
-
-    `is_new` says whether they have to be written.
-    """
+    """The pictures of a stream in `folder`, which is final when `exported` ends; `is_new` if they must be written."""
 
     def __init__(self, folder: str, is_new: bool, place: Path) -> None:
         self.folder, self.is_new, self.names = folder, is_new, list[str]()
@@ -52,8 +49,8 @@ def exported(
 ) -> Iterator[Export]:
     """Give the pictures of `stream` in `folder`, or in a folder of a name like it if that holds something else.
 
-    `sources` are the files that they come from, and `which` what else decides them. New pictures come to be as a whole
-    when the block ends. After an error nothing has changed. Raises DatasetError if nothing can be written.
+    `sources` and `which` decide the pictures, which come to be as a whole when the block ends. Raises DatasetError if
+    nothing can be written.
     """
     place, record = find_export(index.root, folder, stream)
     is_new = record is None or not _is_same(record, sources, which)
@@ -62,7 +59,9 @@ def exported(
     try:
         yield export
         if is_new and export.names:
-            state = {"stream": stream, "part": which, "sources": _state(sources), "pictures": export.names}
+            states = [(one, one.stat()) for one in sources]
+            files = [(one.name, status.st_size, status.st_mtime_ns, _digest(one)) for one, status in states]
+            state = {"stream": stream, "part": which, "sources": files, "pictures": export.names}
             part.joinpath(EXPORT_RECORD).write_text(json.dumps(state), encoding="utf-8")
             export.folder = _move(index, part, folder, place, record, export.names)
             index.written += len(export.names)
@@ -115,10 +114,6 @@ def _is_same(record: dict[str, Any], sources: Sequence[Path], part: object) -> b
     return True
 
 
-def _state(sources: Sequence[Path]) -> list[tuple[str, int, int, str]]:
-    return [(one.name, one.stat().st_size, one.stat().st_mtime_ns, _digest(one)) for one in sources]
-
-
 def _digest(file: Path) -> str:
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
@@ -156,16 +151,12 @@ def _move(
 
 
 def _has_same(folder: Path, part: Path, names: list[str]) -> bool:
-    return all(
-        (folder / name).is_file() and (folder / name).read_bytes() == (part / name).read_bytes() for name in names
-    )
+    pairs = [(folder / name, part / name) for name in names]
+    return all(old.is_file() and old.read_bytes() == new.read_bytes() for old, new in pairs)
 
 
 def export_video(index: DatasetIndex, video: str) -> str:
-    """Write the frames of a video as 000000.png, ... into a folder of its name, and return that folder.
-
-    Raises ImageError for a video that cannot be read, DatasetError if nothing can be written.
-    """
+    """Write a video's frames as 000000.png.. into a folder of its name. Raises ImageError or DatasetError."""
     file = index.root / video
     with exported(index, video.removesuffix(file.suffix), file.name, [file]) as pictures:
         if pictures.is_new:

@@ -15,13 +15,8 @@ import numpy as np
 
 from anytouch_jax.data.images import ImageError
 from anytouch_jax.data.manifest.schema import is_text, read_text_csv, typed_label
-from anytouch_jax.data.readers.common import (
-    DatasetError,
-    DatasetIndex,
-    DatasetReader,
-    read_json,
-    read_pickle,
-)
+from anytouch_jax.data.readers import common
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 from anytouch_jax.data.readers.exports import Export, export_video, exported
 
 _SPARSH = "Higuera et al., Sparsh: Self-supervised touch representations for vision-based tactile sensing, CoRL 2024"
@@ -42,7 +37,7 @@ def _force(index: DatasetIndex) -> None:
     for folder in index.tracked(folders):
         files = [name for name in index.listing(folder)[1] if re.match(r"dataset_(digit|gelsight)_\d+\.pkl", name)]
         frames = [frame for name in files for frame in _list(index.root / folder / name)]
-        content = read_pickle(index.root / folder / "dataset_slip_forces.pkl")
+        content = common.read_pickle(index.root / folder / "dataset_slip_forces.pkl")
         slides = content.get("trajectories", content) if isinstance(content, dict) else None
         if not isinstance(slides, dict) or not files:
             raise DatasetError(f"{index.root / folder} has no slides or no frames; download it again")
@@ -84,7 +79,7 @@ def _pose(index: DatasetIndex) -> None:
     its code names them. Backgrounds are bgs/digit_<finger>.png.
     """
     for part in ("train", "test"):
-        for folder, _, files in index.walk(f"{part}/") if (index.root / part).is_dir() else ():
+        for folder, _, files in index.walk(f"{part}/"):
             bags = [name for name in files if name.endswith(".pkl")]
             if bags:
                 index.need_export(f"{len(bags)} bags of TacBench in pickles")
@@ -94,7 +89,7 @@ def _pose(index: DatasetIndex) -> None:
 
 def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
     path = index.root / part / folder / bag
-    content = read_pickle(path)
+    content = common.read_pickle(path)
     for finger in ("index", "middle", "ring"):
         try:
             frames, poses = content[f"digit_{finger}"], np.asarray(content[f"object_{finger}_rel_pose_n5"], float)
@@ -118,7 +113,7 @@ def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
 
 
 def _list(path: Path) -> list[Any]:
-    frames = read_pickle(path)
+    frames = common.read_pickle(path)
     if not isinstance(frames, list):
         raise DatasetError(f"{path} is no list of pictures; download it again")
     return frames
@@ -146,7 +141,7 @@ def _touchd(index: DatasetIndex) -> None:
     table = index.find_file(["all_data_direction.json"])
     if table is None:
         return
-    for folder, sensors in index.tracked(read_json(table, dict).items()):
+    for folder, sensors in index.tracked(common.read_json(table, dict).items()):
         number = re.search(r"obj(\d+)", folder.split("_speed")[0])
         known = int(number[1]) if number else -1
         split = "test" if known in TEST_OBJECTS else "train" if known in TRAIN_OBJECTS else None
@@ -154,7 +149,7 @@ def _touchd(index: DatasetIndex) -> None:
             names = {"digit": "digit", "gelsight": "gelsight_mini", "duragel": "duragel"}
             sensor = next((name for word, name in names.items() if word in unit), unit)
             place = f"{folder}/{unit}"
-            on_disk = set(index.listing(place)[1]) if (index.root / place).is_dir() else set()
+            on_disk = set(index.listing(place)[1])
             try:
                 rows = [(int(row[0]), *(float(value) for value in row[1:4])) for row in rows]
                 kept = [row for row in rows if f"image_{row[0]}.png" in on_disk and len(row) == 4]
@@ -207,9 +202,8 @@ def _poses(index: DatasetIndex, path: Path, count: int) -> dict[str, list[Any]]:
         index.skip("recording without a trajectory (no labels)", str(path))
         return {}
     if (table := read_text_csv(path)).num_rows != count:
-        index.skip(
-            f"trajectory that has not a line for each frame (no labels): {table.num_rows}, not {count}", str(path)
-        )
+        counts = f"{table.num_rows}, not {count}"
+        index.skip(f"trajectory that has not a line for each frame (no labels): {counts}", str(path))
         return {}
     columns = {name: typed_label(table[name]) for name in table.column_names}
     texts = [name for name, column in columns.items() if is_text(column.type)]
@@ -224,11 +218,11 @@ def _times(index: DatasetIndex, path: Path, count: int) -> list[float] | None:
     except (OSError, ValueError, IndexError):
         index.skip("film without readable time stamps (no column time)", str(path))
         return None
-    if len(times) != count:
-        index.skip(
-            f"time stamps that have not a line for each frame (no column time): {len(times)}, not {count}", str(path)
-        )
-    return times if len(times) == count else None
+    if len(times) == count:
+        return times
+    counts = f"{len(times)}, not {count}"
+    index.skip(f"time stamps that have not a line for each frame (no column time): {counts}", str(path))
+    return None
 
 
 READERS = {

@@ -17,29 +17,18 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from anytouch_jax.data.images import ImageError, frames_from_video
-from anytouch_jax.data.readers.common import (
-    TACTILE,
-    DatasetError,
-    DatasetIndex,
-    DatasetReader,
-    label_cells,
-    read_json,
-    split_word,
-)
+from anytouch_jax.data.readers import common
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 from anytouch_jax.data.readers.exports import Export, exported
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path
 
 
 def _lerobot(index: DatasetIndex) -> None:
-    """A LeRobotDataset v3: meta/info.json, meta/episodes/, data/*.parquet, videos/KEY/*.mp4.
-
-    Each tactile camera of an episode is a sequence, with the data set's own frame_index, timestamp and index. Pictures
-    in Parquet are read where they are. Films are written as PNG, under LeRobot's names for pictures.
-    """
+    """A LeRobotDataset v3, a sequence for each tactile camera of an episode; films become PNG by LeRobot's names."""
     if not (index.root / "meta" / "info.json").is_file():
         return
-    info, sensor = read_json(index.root / "meta" / "info.json"), index.need_sensor()
+    info, sensor = common.read_json(index.root / "meta" / "info.json"), index.need_sensor()
     if not str(info.get("codebase_version", "")).startswith("v3"):
         raise DatasetError(
             f"{index.root} has version {info.get('codebase_version')} of LeRobot's format; convert it to v3.0 with "
@@ -47,7 +36,7 @@ def _lerobot(index: DatasetIndex) -> None:
         )
     features = {str(name): one for name, one in dict(info.get("features", {})).items() if isinstance(one, dict)}
     cameras = [name for name, one in features.items() if one.get("dtype") in ("image", "video")]
-    keys = index.options.keys or tuple(name for name in cameras if TACTILE.search(name))
+    keys = index.options.keys or tuple(name for name in cameras if common.TACTILE.search(name))
     if unknown := [key for key in keys if key not in cameras] or ([] if keys else [""]):
         wrong = f"there is no camera {unknown[0]}" if unknown[0] else "no camera is called tactile"
         raise DatasetError(f"{index.root}: {wrong}; choose with --keys from {', '.join(cameras)}")
@@ -61,13 +50,13 @@ def _lerobot(index: DatasetIndex) -> None:
             raise DatasetError(f"{index.root} has no feature {name}; it has {', '.join(features)}")
     files = [(path, set(pa.parquet.read_schema(index.root / path).names)) for path in index.paths(".parquet", "data/")]
     for name in index.options.values:
-        index.skip(f"file without the column {name}", *_without(name, files))
+        index.skip_all(f"file without the column {name}", [path for path, columns in files if name not in columns])
     rows_of = {
         path: pa.parquet.read_table(index.root / path, columns=[one for one in wanted if one in columns]).to_pylist()
         for path, columns in files
     }
     cells = {
-        name: label_cells(name, [row.get(name) for rows in rows_of.values() for row in rows])
+        name: common.label_cells(name, [row.get(name) for rows in rows_of.values() for row in rows])
         for name in index.options.values
     }
     index.wanted += [f"label.{label}" for names in cells.values() for label in names]
@@ -94,16 +83,8 @@ def _lerobot(index: DatasetIndex) -> None:
             )  # fmt: skip
 
 
-def _without(name: str, files: list[tuple[str, set[str]]]) -> tuple[str, int]:
-    missing = [path for path, columns in files if name not in columns]
-    return "".join(missing[:1]), len(missing)
-
-
 def _stated_splits(index: DatasetIndex, info: dict[str, Any], episodes: Iterable[int]) -> dict[int, str]:
-    """Return the split of each episode: those of meta/info.json, as "0:2", if it states several; else by hash.
-
-    Raises DatasetError for splits that cannot be read or that share an episode.
-    """
+    """Return the split of each episode, as meta/info.json states several ("0:2"), else by hash. Raises DatasetError."""
     stated: dict[int, str] = {}
     splits = dict(info.get("splits") or {})
     if len(splits) < 2:
@@ -114,7 +95,7 @@ def _stated_splits(index: DatasetIndex, info: dict[str, Any], episodes: Iterable
             )
         return {number: index.split_of(f"episode-{number:06d}") for number in episodes}
     for name, ranges in splits.items():
-        split = split_word(str(name))
+        split = common.split_word(str(name))
         if split is None:
             index.notes.append(f"split {name} of meta/info.json has no name that is known: its episodes are unused")
         try:
@@ -152,10 +133,7 @@ def _tasks(index: DatasetIndex) -> dict[int, str]:
 def _export_films(
     index: DatasetIndex, info: dict[str, Any], key: str, episodes: dict[int, dict[str, Any]]
 ) -> dict[int, str]:
-    """Write the frames of a camera's films, which hold several episodes each, as PNG; return the episodes' folders.
-
-    Raises DatasetError.
-    """
+    """Write the episodes of a camera's films as PNG, and return their folders. Raises DatasetError."""
     index.need_export(f"films of {key}")
     fps, films = float(info["fps"]), dict[str, list[tuple[int, int, int]]]()
     folders: dict[int, str] = {}
@@ -218,12 +196,11 @@ def _common(lists: Sequence[Sequence[str]]) -> int:
 def write_features(root: Path, columns: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Write columns by name: features f32 (n, E), and the numbers (n,) of their frames in the column `index`.
 
-    Frames without features get NaN. meta/stats.json has the statistics of the others, for LeRobot's normaliser. All
-    files are written before the first one is replaced, and meta/info.json is replaced last. Raises UserError for a
-    column that is there, and for frames that are not.
+    Other frames get NaN. meta/stats.json gets their statistics. All files are written before the first is replaced,
+    meta/info.json last. Raises UserError for a column that is there, and for frames that are not.
     """
     file, statistics = root / "meta" / "info.json", root / "meta" / "stats.json"
-    info, stats = read_json(file), read_json(statistics) if statistics.is_file() else {}
+    info, stats = common.read_json(file), common.read_json(statistics) if statistics.is_file() else {}
     files = sorted((root / "data").glob("*/*.parquet"))
     known = [np.asarray(pa.parquet.read_table(path, columns=["index"])["index"]) for path in files]
     for name, (features, index) in columns.items():

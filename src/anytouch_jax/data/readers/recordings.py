@@ -6,10 +6,9 @@
     mine/mug/photo.jpg                  a photograph of the touched object, for the same recordings
     mine/mug/caption.txt                a caption, for the same recordings
 
-Frames are in natural order (2 before 10). Their numbers are the last ones that differ between their names if these
-count frames, so that a missing frame is a gap. Otherwise they are counted. If numbers repeat with other words or serial
-numbers (left_0.png and right_0.png, or 0_D1.png and 0_D2.png: two fingers), each finger is a sequence and a unit. Whole
-objects, or recordings without objects, are held out. With `--split-by recording` some recordings of each object are.
+Names decide the order and the numbers of frames (`data.names`). If numbers repeat with other words (left_0.png and
+right_0.png: two fingers), each finger is a sequence and a unit. Whole objects, or recordings without objects, are held
+out. With `--split-by recording` some recordings of each object are.
 """
 
 from __future__ import annotations
@@ -32,14 +31,8 @@ from anytouch_jax.data import images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
 from anytouch_jax.data.manifest.schema import EMPTY, REQUIRED, typed_label
 from anytouch_jax.data.names import frame_numbers, frame_order, looks_like_film, natural, split_series
-from anytouch_jax.data.readers.common import (
-    DatasetError,
-    DatasetIndex,
-    DatasetReader,
-    IndexOptions,
-    read_lines,
-    split_word,
-)
+from anytouch_jax.data.readers import common
+from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 from anytouch_jax.data.readers.exports import export_video, find_export, is_current
 from anytouch_jax.errors import UserError
 
@@ -102,13 +95,14 @@ def read(index: DatasetIndex) -> None:
     ]
     films = _films(index, recordings)
     sequences = _sequences([(one.place, one.unit, one.names) for one in recordings], films)
+    numbers = frame_numbers if options.order == "names" else lambda names: list(range(len(names)))
     parts: list[str] = []  # of every row: the recording that is never split, a folder or a single picture
     given: list[str | None] = []  # of every row: the split that a folder decides
     for one, is_film, sequence in zip(recordings, films, sequences, strict=True):
         paths = [f"{one.folder}/{name}".lstrip("/") for name in one.names]
         index.add(
             paths, sensor=sensor, unit=one.unit or None, object=one.place.object, dataset=root.name, sequence=sequence,
-            frame_index=_frame_numbers(index, one.names) if is_film else 0, **shared[one.folder],
+            frame_index=numbers(one.names) if is_film else 0, **shared[one.folder],
         )  # fmt: skip
         parts += [one.folder] * len(paths) if is_film else paths
         given += [one.place.split] * len(paths)
@@ -120,11 +114,7 @@ def read(index: DatasetIndex) -> None:
 
 
 def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
-    """Return whether the pictures of each recording are a film, and put them in order; else each is a touch alone.
-
-    A film counts its frames or gives steady times in their names. Where each object has one folder, a few pictures of
-    it must look so too: they may be numbered single touches.
-    """
+    """Return which recordings are films, by names, or by a few pictures if objects have one folder; order them."""
     options, unclear = index.options, list[str]()
     films = [options.films or options.order == "times"] * len(recordings)
     for at, one in enumerate(recordings):
@@ -160,11 +150,11 @@ def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
     return films
 
 
-def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]:
+def ranked_split(groups: Iterable[str], options: common.IndexOptions) -> dict[str, str]:
     """Return the split of every group, by rank: sorted by SHA-256, the first are val, the last test, the others train.
 
-    The counts are the rounded shares. A share above 0 gets at least one group, and train too if it has a share; with
-    too few groups train comes first, then test. Adding or removing a group moves at most one other at each cut.
+    The counts are the rounded shares. A share above 0 gets at least one group, if there are enough. Another group moves
+    at most one at each cut.
     """
     order = sorted(set(groups), key=lambda group: hashlib.sha256(group.encode()).digest())
     most = max(0, len(order) - (options.val + options.test < 1))
@@ -176,15 +166,8 @@ def ranked_split(groups: Iterable[str], options: IndexOptions) -> dict[str, str]
     return dict(zip(order, parts, strict=True))
 
 
-def _frame_numbers(index: DatasetIndex, names: list[str]) -> list[int]:
-    return frame_numbers(names) if index.options.order == "names" else list(range(len(names)))
-
-
 def _assign_splits(index: DatasetIndex, parts: list[str], given: list[str | None], default: str) -> None:
-    """Fill column split: what a folder decides, else by rank of the groups that `--split-by` names.
-
-    Groups are ranked inside each object, unless they are the objects or span several. `parts` (rows,) are never split.
-    """
+    """Fill column split: as folders say, else by rank of groups inside each object, unless groups span several."""
     options, table = index.options, index.table
     by = options.split_by or default
     index.keep_together = ["sequence", "object"] if by == "object" else ["sequence"]
@@ -245,14 +228,11 @@ def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
 
 
 def _understand(folders: Iterable[str]) -> dict[str, _Place]:
-    """Return how each folder of pictures is understood. Raises DatasetError for one in two splits.
-
-    Split words decide the split at any level. The object is the first other folder, without those above all splits.
-    """
+    """Return how folders are understood: split words, then the object. Raises DatasetError for one in two splits."""
     parts = {folder: tuple(part for part in folder.split("/") if part) for folder in folders}
     above, rest = list[tuple[str, ...]](), list[int]()
     for folder, names in parts.items():
-        words = [split_word(name) for name in names]
+        words = [common.split_word(name) for name in names]
         if len(set(words) - {None}) > 1:
             named = " and ".join(name for name, word in zip(names, words, strict=True) if word)
             raise DatasetError(f"{folder} names two splits, {named}; rename one of these folders")
@@ -265,7 +245,7 @@ def _understand(folders: Iterable[str]) -> dict[str, _Place]:
 
 
 def _place(names: tuple[str, ...], shared: int) -> _Place:
-    words = [split_word(name) for name in names]
+    words = [common.split_word(name) for name in names]
     split = next((word for word in words if word), None)
     kinds, obj, shared = list[str](), None, shared if split else 0
     for at, (name, word) in enumerate(zip(names, words, strict=True)):
@@ -277,10 +257,7 @@ def _place(names: tuple[str, ...], shared: int) -> _Place:
 
 
 def _sequences(recordings: Sequence[tuple[_Place, str, list[str]]], films: Sequence[bool]) -> list[list[str]]:
-    """Return the sequence of every picture of each recording (place, finger, pictures): its own if it is no film.
-
-    No two recordings have one: the split is added where names repeat between splits, and else a number.
-    """
+    """Return the distinct sequence of every picture, its own if it is no film, with a split or number."""
     names = [
         [f"{place.name}/{unit}"] * len(pictures) if is_film else [f"{place.name}/{picture}" for picture in pictures]
         for (place, unit, pictures), is_film in zip(recordings, films, strict=True)
@@ -306,8 +283,8 @@ def _sentence(places: Sequence[_Place], films: Sequence[bool]) -> str:
         last = "frames" if is_film else "<touch>"
         form = [kind for at, kind in enumerate(place.kinds) if kind != "<recording>" or place.kinds[at - 1] != kind]
         forms["/".join([*form, last])] += 1
-        words |= {part: str(split_word(part)) for part, kind in zip(place.parts, place.kinds, strict=True)
-                  if kind == "<split>" and split_word(part) != part}  # fmt: skip
+        words |= {part: str(common.split_word(part)) for part, kind in zip(place.parts, place.kinds, strict=True)
+                  if kind == "<split>" and common.split_word(part) != part}  # fmt: skip
     first, *others = [form for form, _ in forms.most_common(3)]
     more = f" (also {', '.join(others)})" if others else ""
     named = ", ".join(f"{word} is split {split}" for word, split in words.items())
@@ -315,27 +292,22 @@ def _sentence(places: Sequence[_Place], films: Sequence[bool]) -> str:
 
 
 def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
-    """Return whether neighbouring pictures are more alike than others, and were not stored seconds apart.
-
-    A few pictures of each folder are read. Pictures that cannot be read, or show nothing, do not count.
-    """
+    """Return whether neighbouring pictures are more alike than others, by a few, and not stored seconds apart."""
     near, far, gaps = list[float](), list[float](), list[float]()
     for paths in folders:
         starts = np.unique(np.linspace(0, len(paths) - 2, 4).astype(int))
         try:
-            tiny = {at: _tiny(paths[at]) for at in sorted({*starts.tolist(), *(starts + 1).tolist()})}
+            pictures = {at: images.decode(paths[at]) for at in sorted({*starts.tolist(), *(starts + 1).tolist()})}
             gaps += [abs(os.stat(paths[at + 1]).st_mtime - os.stat(paths[at]).st_mtime) for at in starts]
         except (images.ImageError, OSError):
             continue
+        tiny = {at: cv2.resize(one, _TINY, interpolation=cv2.INTER_AREA) for at, one in pictures.items()}
+        tiny = {at: one.mean(axis=2).astype(np.float32) for at, one in tiny.items()}
         near += [float(np.abs(tiny[at] - tiny[at + 1]).mean()) for at in starts]
         far += [float(np.abs(tiny[a] - tiny[b]).mean()) for a, b in combinations(tiny, 2) if b - a > 1]
     is_slow = bool(gaps) and float(np.median(gaps)) > _SLOW
     is_alike = not far or float(np.mean(far)) < _STILL or float(np.mean(near)) < _FILM * float(np.mean(far))
     return is_alike and not is_slow
-
-
-def _tiny(path: Path) -> np.ndarray:
-    return cv2.resize(images.decode(path), _TINY, interpolation=cv2.INTER_AREA).mean(axis=2).astype(np.float32)
 
 
 def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, list[str]]:
@@ -382,9 +354,8 @@ def _skip_videos(index: DatasetIndex, folder: str, folders: list[str], files: li
 def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
     """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes first.
 
-    A sequence may be named by its folder or picture in `parts` too. Names match in any Unicode form. Lines without a
-    recording, and recordings without a line, are skipped. Raises DatasetError for a table that is missing, has no key,
-    or has a column or a key twice.
+    A sequence may be named by its folder or picture too, in any Unicode form. Lines and recordings without the other
+    are skipped. Raises DatasetError for a table that is missing, has no key, or has a column or a key twice.
     """
     names, lines = _read_labels(path)
     table, size = index.table, len(index.table["path"])
@@ -416,7 +387,7 @@ def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
 
 def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | None], dict[str, str]]]:
     """Return the columns of the table, and (object, sequence) -> the other cells; an empty key cell is None."""
-    rows = read_lines(path)
+    rows = common.read_lines(path)
     names = rows[0][1] if rows else []
     if not set(LABEL_KEYS) & set(names):
         raise DatasetError(f"{path} has no column object or sequence, by which labels are joined; it has "
@@ -432,9 +403,8 @@ def _read_labels(path: Path) -> tuple[list[str], dict[tuple[str | None, str | No
         if not any(key):
             raise DatasetError(f"{path}, line {line}: there is neither an object nor a sequence; fill in one")
         if key in lines:
-            raise DatasetError(
-                f"{path}, line {line}: {', '.join(part for part in key if part)} is there twice; keep one"
-            )
+            named = ", ".join(part for part in key if part)
+            raise DatasetError(f"{path}, line {line}: {named} is there twice; keep one")
         lines[key] = {name: cell for name, cell in cells.items() if name}
     for name in (name for name in names if name not in (*LABEL_KEYS, *PLAIN_COLUMNS, "")):
         column = pa.chunked_array([pa.array([cells.get(name) for cells in lines.values()], pa.string())])
@@ -449,10 +419,7 @@ def _plain(name: str | None) -> str | None:
 
 READERS = {
     "recordings": DatasetReader(
-        read,
-        "<object>/<recording>/0.png",
-        "nothing, unless their owner asks for it",
-        "as their owner says",
+        read, "<object>/<recording>/0.png", "nothing, unless their owner asks for it", "as their owner says",
         uses=("val", "test", "split_by", "sensor", "labels", "export", "singles", "films", "order"),
     )
-}
+}  # fmt: skip

@@ -64,7 +64,7 @@ def test_every_form_of_data_gives_maps_and_a_line_a_frame(frames, weights, capsy
     [
         (("--out", "out.csv"), ".npz"), (("--out", "frames.npz", "--film", "x.gif"), ".mp4"),
         (("--out", "manifest.npz", "--data", "manifest.csv"), "is a file that is read"),
-        (("--out", "out.npz", "--width-mm", "0"), "above 0"), (("--out", "out.npz", "--data", "nothing"), "there is no"),
+        (("--out", "out.npz", "--width-mm", "0"), "above 0"), (("--out", "out.npz", "--data", "nothing"), "is no"),
         (("--out", "out.npz", "--model", "plain.safetensors"), "--model.fields 32"),
         (("--out", "out.npz", "--data", "manifest.csv", "--sensor", "digit"), "--sensor has no effect"),
     ],

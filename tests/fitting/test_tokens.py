@@ -58,7 +58,7 @@ def stopping(monkeypatch, steps):
     """Let the training be interrupted after some steps."""
     real = tokens._train
 
-    def train(state, moments, step, *rest):
+    def train(kept, step, *rest):
         number = count(1)
 
         def counted(*words):
@@ -66,24 +66,29 @@ def stopping(monkeypatch, steps):
                 raise KeyboardInterrupt
             return step(*words)
 
-        return real(state, moments, counted, *rest)
+        return real(kept, counted, *rest)
 
     monkeypatch.setattr(tokens, "_train", train)
 
 
 @pytest.mark.parametrize("deep", [False, True])
-def test_an_interrupted_training_goes_on_and_moves_only_what_it_may(run, mine, tmp_path, monkeypatch, capsys, deep):
+def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_it_may(
+    run, mine, tmp_path, monkeypatch, capsys, deep
+):
     words = ["adapt", "--model", str(run), "--sensor", str(mine), "--minutes", "0.05", "--out", str(tmp_path / "out")]
     words += ["--deep"] * deep
     with monkeypatch.context() as stopped:
-        stopping(stopped, 3)
+        stopping(stopped, 18)
         assert app.main(words) == 130
     state = tmp_path / "out.part.npz"
     assert state.is_file() and not (tmp_path / "out").exists()
-    scores = iter((0.2, 0.4))
+    scores = iter((0.2, 0.4) * 2)
     monkeypatch.setattr(tokens, "_found", lambda *_: next(scores))
     assert app.main(words) == 0 and not state.exists()
-    assert "continued after" in capsys.readouterr().err
+    assert "continued after 18 steps of 30" in capsys.readouterr().err
+    assert app.main([*words[: -1 - deep], str(tmp_path / "undisturbed"), *["--deep"] * deep]) == 0
+    resumed, undisturbed = (flatten(checkpoint.load_params(tmp_path / name)[0]) for name in ("out", "undisturbed"))
+    assert all(np.array_equal(values, undisturbed[name]) for name, values in resumed.items())
     before, after = (flatten(checkpoint.load_params(path)[0]) for path in (run, tmp_path / "out"))
     moved = {name for name, values in before.items() if not np.array_equal(values, after[name])}
     assert all(name.startswith("touch/") for name in moved) and "touch/sensor_tokens" in moved

@@ -107,6 +107,7 @@ def colours_of_dents(look: Any, halo_mm: Any, gain: Any = 1.0, angle: float = 0.
         c, s = np.cos(angle), np.sin(angle)
         nx, ny = (a.ravel() for a in tilt(jnp.asarray(c * sx - s * sy), jnp.asarray(s * sx + c * sy), look.steepest))
         glow = np.stack([c * hx - s * hy, s * hx + c * hy, soft], -1).reshape(-1, 3)
+        glow = np.clip(glow, -np.asarray(look.widest), np.asarray(look.widest))
         powers = np.stack([np.asarray(nx) ** i * np.asarray(ny) ** j for i, j in POWERS], 1)
         changes.append((powers @ np.asarray(look.normal)[:, 0] + glow @ np.asarray(look.halo)[:, 0]) * gain)
         rows.append(np.stack([sx.ravel(), sy.ravel(), dent.ravel()], 1))

@@ -21,37 +21,35 @@ from anytouch_jax.sim.sensing.sensors import POWERS, Photometry
 
 Array = np.ndarray
 PLACES = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of (u, v) that a coefficient drifts by
-STEEPEST = 0.95
-WIDEST = (9.0, 9.0, 1.5)  # of the halo's features
+# Largest tilt, and largest features of the halo, that change a colour: of open light, and of paint that is soon dark.
+LIMITS = (0.95, (9.0, 9.0, 1.5)), (0.3, (0.03, 0.03, 0.06))
 DEPTHS = np.linspace(0.05, 1.6, 24)  # mm
 _GRID, _SIDE = 96, 14.0  # points and mm of the solved gel
 SKIN = 0.13  # mm: detail that the coating and the lens pass
-HALOS, THICKNESSES = (0.35, 1.0, 1.6), (2.0, 3.0, 4.5)  # mm, of the soft shadow and of the gel: the best is chosen
+# mm, of the soft shadow and of the gel: the best is chosen. The gel's decides the depth, and so the change by depth.
+HALOS, THICKNESSES = (0.35, 1.0, 1.6), (1.7, 2.1, 2.6, 3.2, 3.9, 4.7)
+TURNS = 4  # of colours and slopes, without a ball
 THIN = 5  # the search looks at every so many pixels
 PLAIN = 9  # powers of the normal with which the presses are placed
-ROUNDS = (
-    (0.8, 0.2),
-    (0.4, 0.1),
-    (0.2, 0.1),
-    (0.1, 0.05),
-    (0.1, 0.05),
-    (0.05, 0.03),
-)  # steps of the search, mm of place and depth
+ROUNDS = (0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03)  # mm of place and depth
 FEATURES = len(POWERS) * len(PLACES)
 # Root mean square of the slope of the gel, where its change is above a quarter of the strongest, and of its depth there
-# in mm, in simulated touches of 0.15 to 1.0 mm. They set the scale where no ball does.
-USUAL_TILT, USUAL_DEPTH = 0.22, 0.3
-UNSURE = "Without a ball of known size the strength is a usual one, perhaps half or double the true one: edit contrast."
+# in mm, which give the right strength on average over simulated units. They set the scale where no ball does.
+USUAL_TILT, USUAL_DEPTH = 0.19, 0.27
+UNSURE = (
+    "Without a ball the strength is a usual one, which differs by {} (deviation over known sensors): edit contrast."
+)
 
 
 class Colour(NamedTuple):
-    """A fitted look with the width mm of its halo, the share of the change that it explains, and how it was found."""
+    """A fitted look with mm of its halo and gel, the share of the change that it explains, and how it was found."""
 
     look: Photometry
     halo: float
     explained: float
     source: str
     doubt: str = ""
+    thickness: float = 3.0
 
 
 class Grid(NamedTuple):
@@ -72,16 +70,21 @@ def grid_of(shape: tuple[int, int], width_mm: float) -> Grid:
 
 
 class _Profiles(NamedTuple):
-    """Dents of a ball by depth (K,) and distance (R,) mm: slope, and depth and slope of the blurred dent (K, R)."""
+    """Dents of a ball by depth (K,) and distance (R,) mm: slope, and depth and slope of the blurred dent (K, R).
+
+    `steepest` and `widest` are those of `Photometry`.
+    """
 
     away: Array
     slope: Array
     soft: Array
     soft_slope: Array
+    steepest: float
+    widest: Array
 
 
-def _profiles(ball_mm: float) -> dict[tuple[float, float], _Profiles]:
-    """Return the dents of a ball in gels of THICKNESSES, with HALOS."""
+def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
+    """Return the dents of a ball by thickness of the gel, halo, and number of the LIMITS."""
     line = (np.arange(_GRID) - (_GRID - 1) / 2) * _SIDE / _GRID
     away, radius = np.hypot(*np.meshgrid(line, line)), ball_mm / 2
     surface = np.where(away < radius, np.sqrt(np.maximum(radius**2 - away**2, 0)) - radius, -radius - 5)
@@ -92,7 +95,7 @@ def _profiles(ball_mm: float) -> dict[tuple[float, float], _Profiles]:
     def solve(depths: Any, gel: Gel) -> Any:
         return jax.vmap(lambda depth: press(height, depth, gel, pitch, fidelity="fast").displacement)(depths)
 
-    found = dict[tuple[float, float], _Profiles]()
+    found = dict[tuple[float, float, int], _Profiles]()
     for thickness in THICKNESSES:
         dents = np.asarray(solve(DEPTHS.astype(np.float32), Gel(150.0, thickness=np.float32(thickness))))
 
@@ -102,23 +105,25 @@ def _profiles(ball_mm: float) -> dict[tuple[float, float], _Profiles]:
             return lines, np.gradient(lines, pitch, axis=1)
 
         sharp = rows(SKIN)[1]
-        found |= {(thickness, halo): _Profiles(line[middle:], sharp, *rows(halo)) for halo in HALOS}
+        for halo, (number, (steepest, widest)) in product(HALOS, enumerate(LIMITS)):
+            found[thickness, halo, number] = _Profiles(line[middle:], sharp, *rows(halo), steepest, np.array(widest))
     return found
 
 
-def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, Array, Array]:
-    """Return tilts (N,) along x and y and halo features (N, 3) of a ball at `pose` x, y, depth mm."""
-    dx, dy = grid.x.ravel() - pose[0], grid.y.ravel() - pose[1]
+def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]:
+    """Return the arguments of `design` for a ball at `pose` x, y, depth mm and the places (N,) of a grid."""
+    dx, dy = grid.x - pose[0], grid.y - pose[1]
     away = np.hypot(dx, dy)
     k = float(np.clip(np.interp(pose[2], DEPTHS, np.arange(len(DEPTHS))), 0, len(DEPTHS) - 1.001))
     low, share = int(k), k - int(k)
     slope, soft, wide = (
         np.interp(away, profiles.away, (1 - share) * table[low] + share * table[low + 1], right=0.0)
-        for table in profiles[1:]
+        for table in profiles[1:4]
     )
-    cos, sin = dx / np.maximum(away, 1e-6), dy / np.maximum(away, 1e-6)
-    scale = 1 / np.sqrt(1 + slope**2)
-    return slope * cos * scale, slope * sin * scale, np.stack([wide * cos, wide * sin, soft], 1)
+    cos, sin = (along / np.maximum(away, 1e-6) for along in (dx, dy))
+    tilt = slope * np.minimum(1 / np.sqrt(1 + slope**2), profiles.steepest / np.maximum(np.abs(slope), 1e-6))
+    glow = np.clip(np.stack([wide * cos, wide * sin, soft], 1), -profiles.widest, profiles.widest)
+    return tilt * cos, tilt * sin, grid.u, grid.v, glow
 
 
 def design(nx: Array, ny: Array, u: Array, v: Array, halo: Array, *, plain: bool = False) -> Array:
@@ -145,73 +150,65 @@ _PENALTY = np.concatenate([
 ])  # fmt: skip
 
 
-def assemble(coefficients: Array) -> Photometry:
+def assemble(coefficients: Array, steepest: float = LIMITS[0][0], widest: Any = LIMITS[0][1]) -> Photometry:
     """Return the `Photometry` of the coefficients (129, 3) of `design`."""
     normal = coefficients[:FEATURES].reshape(len(POWERS), len(PLACES), 3).astype(np.float32)
     halo = coefficients[FEATURES:].reshape(3, 3, 3).astype(np.float32)
-    return Photometry(normal, halo, STEEPEST, np.array(WIDEST, np.float32))
+    return Photometry(normal, halo, steepest, np.array(widest, np.float32))
 
 
 def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> Colour:
     """Fit colour changes f32 (N, H, W, 3) of presses of a ball. Raises UserError if no ball of that size fits."""
-    grid, known = grid_of(change.shape[1:3], width_mm), _profiles(ball_mm)
-    part = Grid(*(values.ravel() for values in grid))
+    part, known = Grid(*(values.ravel() for values in grid_of(change.shape[1:3], width_mm))), _profiles(ball_mm)
     # A pixel that is not clear has change 0 and features 0.
     flat, seen = change.reshape(len(change), -1, 3).astype(np.float64), clear.reshape(len(clear), -1, 1)
     flat = flat * seen
     few, thin, some = flat[:, ::THIN], Grid(*(values[::THIN] for values in part)), seen[:, ::THIN]
-    usual = known[THICKNESSES[1], HALOS[1]]
+    usual = known[THICKNESSES[2], HALOS[1], 0]
     poses = np.stack([_first_pose(one, part, usual) for one in flat])
-    if float(np.median(poses[:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
+    tries = {
+        key: _placed(few, some, thin, known[key], poses, ROUNDS[:4])
+        for key in product((THICKNESSES[2],), HALOS, range(len(LIMITS)))
+    }
+    nearest = min(tries, key=lambda key: tries[key][0])
+    poses = tries[nearest][1]
+    tries = {key: _placed(few, some, thin, known[key], poses, ROUNDS[3:]) for key in known if key[1] == nearest[1]}
+    best = min(tries, key=lambda key: tries[key][0])
+    if float(np.median(tries[best][1][:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
         raise UserError(
             f"the dents are wider than a ball of {ball_mm:g} mm makes them, if the picture is {width_mm:g} mm wide; "
             "check --width-mm and --ball-mm"
         )
-    tries = dict[tuple[float, float], tuple[float, Array]]()
-
-    def attempt(key: tuple[float, float], poses: Array, rounds: Any) -> None:
-        placed = _placed(few, some, thin, known[key], poses, rounds)
-        tries[key] = _plain(few, some, thin, known[key], placed)[0], placed
-
-    for halo in HALOS:
-        attempt((THICKNESSES[1], halo), poses, ROUNDS)
-    nearest = min(tries, key=lambda key: tries[key][0])
-    for thickness in (THICKNESSES[0], THICKNESSES[2]):
-        attempt((thickness, nearest[1]), tries[nearest][1], ROUNDS[-3:])
-    best = min(tries, key=lambda key: tries[key][0])
-    rows = [w * design(*_at(part, known[best], pose)) for pose, w in zip(tries[best][1], seen, strict=True)]
-    gram, target = sum(r.T @ r for r in rows), sum(r.T @ d for r, d in zip(rows, flat, strict=True))
-    coefficients = _ridge(gram, target, _PENALTY)
-    left = sum(float(((one - r @ coefficients) ** 2).sum()) for one, r in zip(flat, rows, strict=True))
-    explained = 1 - left / float((flat**2).sum())
-    return Colour(assemble(coefficients), best[1], explained, f"{len(change)} presses of a ball of {ball_mm:g} mm")
+    loss, coefficients = _colours(flat, seen, part, known[best], tries[best][1], plain=False)
+    look = assemble(coefficients, *LIMITS[best[2]])
+    source, explained = f"{len(change)} presses of a ball of {ball_mm:g} mm", -loss / float((flat**2).sum())
+    return Colour(look, best[1], explained, source, thickness=best[0])
 
 
-def _placed(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any) -> Array:
-    """Return better poses (N, 3): the colours and the poses are found in turn."""
+def _placed(
+    flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any
+) -> tuple[float, Array]:
+    """Return the loss of `_colours`, and better poses (N, 3): the colours and the poses are found in turn."""
     for step, deep in rounds:
         # Deeper dents with fainter colours look nearly alike, so all depths are also tried together.
         tries = [poses * (1, 1, factor) for factor in (0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.25)]
-        losses, solutions = zip(*(_plain(flat, seen, part, profiles, one) for one in tries), strict=True)
+        losses, solutions = zip(*(_colours(flat, seen, part, profiles, one) for one in tries), strict=True)
         best = int(np.argmin(losses))
         poses = np.stack([
-            _search(one, weight, part, profiles, pose, solutions[best], (step, step, deep))
+            _search(one, weight, part, profiles, pose, solutions[best], np.array([step, step, deep]))
             for one, weight, pose in zip(flat, seen, tries[best], strict=True)
         ])  # fmt: skip
-    return poses
+    return _colours(flat, seen, part, profiles, poses, plain=False)[0], poses
 
 
-def _plain(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array) -> tuple[float, Array]:
-    """Return what is left of the change with the best plain colours (22, 3), and these."""
-    rows = [w * design(*_at(part, profiles, pose), plain=True) for pose, w in zip(poses, seen, strict=True)]
+def _colours(
+    flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, *, plain: bool = True
+) -> tuple[float, Array]:
+    """Return minus the squares of the change that the best colours explain, and these colours (22 or 129, 3)."""
+    rows = [w * design(*_features(part, profiles, pose), plain=plain) for pose, w in zip(poses, seen, strict=True)]
     gram, target = sum(r.T @ r for r in rows), sum(r.T @ d for r, d in zip(rows, flat, strict=True))
-    found = _ridge(gram, target, np.full(len(gram), 1e-5))
+    found = _ridge(gram, target, np.full(len(gram), 1e-5) if plain else _PENALTY)
     return -float(2 * (target * found).sum() - (found * (gram @ found)).sum()), found
-
-
-def _at(part: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]:
-    nx, ny, halo = _features(part, profiles, pose)
-    return nx, ny, part.u, part.v, halo
 
 
 def _first_pose(change: Array, grid: Grid, profiles: _Profiles) -> Array:
@@ -227,22 +224,18 @@ def _first_pose(change: Array, grid: Grid, profiles: _Profiles) -> Array:
 
 
 def _search(
-    change: Array,
-    seen: Array,
-    grid: Grid,
-    profiles: _Profiles,
-    pose: Array,
-    coefficients: Array,
-    steps: tuple[float, ...],
+    change: Array, seen: Array, grid: Grid, profiles: _Profiles, pose: Array, coefficients: Array, steps: Array
 ) -> Array:
     """Return a pose that no step along x, y or depth makes better, after four steps at most."""
 
     def loss(one: Array) -> float:
-        return float(((change - seen * (design(*_at(grid, profiles, one), plain=True) @ coefficients)) ** 2).sum())
+        return float(
+            ((change - seen * (design(*_features(grid, profiles, one), plain=True) @ coefficients)) ** 2).sum()
+        )
 
     least = loss(pose)
     for _ in range(4):
-        moves = [pose + sign * np.eye(3)[axis] * steps[axis] for axis in range(3) for sign in (-1, 1)]
+        moves = [pose + sign * move for move in np.diag(steps) for sign in (-1, 1)]
         moves = [np.array([x, y, np.clip(depth, DEPTHS[0], DEPTHS[-1])]) for x, y, depth in moves]
         losses = [loss(one) for one in moves]
         if min(losses) >= least:
@@ -253,7 +246,7 @@ def _search(
 
 def fit_presses(change: Array, clear: Array) -> Colour:
     """Fit colour changes f32 (N, H, W, 3) of presses of unknown objects: their slopes without a curl, see above."""
-    smooth = np.stack([cv2.GaussianBlur(one, (0, 0), 1.0) for one in change])
+    smooth, grid = np.stack([cv2.GaussianBlur(one, (0, 0), 1.0) for one in change]), grid_of(change.shape[1:3], 2.0)
     strength = np.abs(smooth).max(-1)
     touched = strength > 0.25 * np.percentile(strength, 99.5, axis=(1, 2))[:, None, None]
     values, axes = np.linalg.eigh(np.cov(smooth.reshape(-1, 3).T, ddof=0))
@@ -264,25 +257,34 @@ def fit_presses(change: Array, clear: Array) -> Colour:
         coefficients = np.zeros((FEATURES + 9, 3))
         coefficients[FEATURES + 6] = axes[:, -1] * np.sign(mean @ axes[:, -1]) * strength
         source = f"{len(change)} presses of unknown objects, of a gel that changes by depth"
-        return Colour(assemble(coefficients), 0.35, float(values[2] / values.sum()), source, UNSURE)
+        return Colour(assemble(coefficients), 0.35, float(values[2] / values.sum()), source, UNSURE.format("30 %"))
+    values, axes = np.linalg.eigh(np.cov(smooth[clear].T, ddof=0))
     white = (smooth @ axes[:, 1:]) / np.sqrt(values[1:])  # (N, H, W, 2), uncorrelated: slopes up to a turn
-    down, across = (np.gradient(white, axis=axis)[:, 2:-2, 2:-2] for axis in (1, 2))
+    down, across = (np.gradient(white, axis=axis)[clear] for axis in (1, 2))
     best = (np.inf, np.eye(2))
     for mirror, angle in product((1, -1), np.linspace(0, np.pi, 180, endpoint=False)):
         turn = np.array([[np.cos(angle), np.sin(angle)], [-mirror * np.sin(angle), mirror * np.cos(angle)]])
         curl = down @ turn[0] - across @ turn[1]
-        loss = float((curl**2).sum())
-        best = min(best, (loss, turn), key=lambda one: one[0])
+        best = min(best, (float((curl**2).sum()), turn), key=lambda one: one[0])
     slopes = white @ best[1].T
     if _depth_of(slopes)[touched].mean() < 0:
         slopes = -slopes
-    slopes = slopes * USUAL_TILT / np.sqrt((slopes[touched] ** 2).sum(-1).mean())
-    flat, seen = slopes[clear], smooth[clear]
-    linear = np.linalg.solve(flat.T @ flat, flat.T @ seen)
+    # The colours drift over the picture: those of the nearest surface, and the slopes by these colours, in turn.
+    place = np.stack([np.ones_like(grid.u), grid.u, grid.v], -1)
+    for _ in range(TURNS):
+        fitting = np.stack(np.gradient(_depth_of(slopes), axis=(2, 1)), -1)
+        fitting *= USUAL_TILT / np.sqrt((fitting[touched] ** 2).sum(-1).mean())
+        rows = (fitting[..., None] * place[:, :, None]).reshape(*smooth.shape[:3], 6)[clear]
+        linear = _ridge(rows.T @ rows, rows.T @ smooth[clear], np.array([0, 0.05, 0.05] * 2)).reshape(2, 3, 3)
+        colours = np.einsum("hwp,dpc->hwdc", place, linear)
+        square = colours @ colours.swapaxes(2, 3)
+        square += 0.01 * np.trace(square.mean((0, 1))) * np.eye(2)
+        slopes = np.einsum("hwde,hwec,nhwc->nhwd", np.linalg.inv(square), colours, smooth)
     coefficients = np.zeros((FEATURES + 9, 3))
-    coefficients[0], coefficients[len(PLACES)] = linear
-    left = ((seen - flat @ linear) ** 2).sum() / (seen**2).sum()
-    return Colour(assemble(coefficients), 1.0, 1 - float(left), f"{len(change)} presses of unknown objects", UNSURE)
+    coefficients[:3], coefficients[len(PLACES) : len(PLACES) + 3] = linear
+    left = ((smooth[clear] - rows @ linear.reshape(6, 3)) ** 2).sum() / (smooth[clear] ** 2).sum()
+    source = f"{len(change)} presses of unknown objects"
+    return Colour(assemble(coefficients), 1.0, 1 - float(left), source, UNSURE.format("20 %"))
 
 
 def _depth_of(slopes: Array) -> Array:

@@ -72,18 +72,21 @@ def fit_sensor(
     markers = None
     if dots is not None:
         ink: Any = tuple(round(float(value), 3) for value in dots.ink)
-        markers = Markers(round(dots.pitch * pixel, 4), round(dots.radius * pixel, 4), round(dots.aspect, 3), 1.0, ink)
+        step, radius = round(dots.pitch * pixel, 4), round(dots.radius * pixel, 4)
+        markers = Markers(step, radius, round(dots.aspect, 3), 1.0, ink, round(dots.bend, 4))
     presses = int(seen.pressed.sum())
     sure = {
         "pictures": f"{len(pictures)}, of which {presses} show a press",
         "untouched gel": f"{seen.source}; its lights and vignette are in it",
-        "dots": "none seen" if dots is None else f"distance from dot to dot {dots.spread:.1%} around the median",
+        "dots": "none seen" if dots is None else f"steps from dot to dot {dots.spread:.1%} around the lattice",
         "noise": f"{seen.noise_spread:.0%} from picture to picture",
         "colour": f"from {found.source}; explains {found.explained:.0%} of the change. {found.doubt}",
         "size": "as given",
-        "thickness_mm, modulus_kpa, skin_mm, halo_mm": "not seen in pictures: usual values, edit what you know",
+        "thickness_mm, halo_mm": "not seen" if found.doubt else "the best of a few",
+        "modulus_kpa, skin_mm": "not seen in pictures: usual values, edit what you know",
     }
     numbers = OwnSensor(
-        name, float(width_mm), round(height_mm, 4), (height, width), round(seen.noise, 3), markers, sure=sure
-    )
+        name, float(width_mm), round(height_mm, 4), (height, width), round(seen.noise, 3), markers,
+        thickness_mm=found.thickness, halo_mm=found.halo, sure=sure,
+    )  # fmt: skip
     return Fitted(own.write_sensor(out, numbers, look.without_dots(seen)[None], found.look), numbers, seen, found)

@@ -17,16 +17,17 @@ LONG = 320  # pixels of the long side of a picture that is looked at
 WORK = 96  # pixels of the long side on which the colour change is fitted
 BASE = 40  # pixels of the long side of a stored untouched gel
 FEWEST_DOTS = 12
-IRREGULAR = 0.15  # spread of the distances of neighbours, over their median, that is no lattice
+IRREGULAR = 0.08  # spread of the steps from dot to dot that is no lattice
 ANOTHER = 0.15  # share of the pictures that shows another unit
 DARK = 14  # grey levels: the corners of a round picture
 _CURVED = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6  # keeps the deviation of white noise
 
 
 class Dots(NamedTuple):
-    """Dots of the gel: the step of their lattice, radius of a height and width over height, ink (3,) in 0..1, mask."""
+    """Dots of the gel: the step and the bend of their lattice as in `Markers`, radius of a height, ink (3,) in 0..1."""
 
     pitch: float
+    bend: float
     radius: float
     aspect: float
     ink: Array
@@ -130,7 +131,7 @@ def _dots_of(gel: Array, sign: int) -> Dots | None:
         depth = cv2.subtract(gel, cv2.morphologyEx(gel, cv2.MORPH_OPEN, kernel))
     deep = cv2.GaussianBlur(depth.max(2).astype(np.float32), (0, 0), long / 320)
     strongest = float(np.percentile(deep, 99))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats((deep > max(8.0, 0.4 * strongest)).astype(np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((deep > max(8.0, 0.5 * strongest)).astype(np.uint8))
     places, moments, areas, centres = [], [], [], []
     for number, (x, y, w, h, area) in enumerate(stats[1:], 1):
         edge = min(x, y, gel.shape[1] - x - w, gel.shape[0] - y - h)
@@ -151,18 +152,38 @@ def _dots_of(gel: Array, sign: int) -> Dots | None:
     apart = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
     rough = float(np.median(np.sort(apart, 1)[:, :2]))
-    steps = apart[(apart > 0.75 * rough) & (apart < 1.25 * rough)]
-    if len(steps) < FEWEST_DOTS or np.std(steps) / np.mean(steps) > IRREGULAR:
+    pitch, bend, spread = _lattice(at, apart, rough, gel.shape)
+    if spread > IRREGULAR:
         return None
     blur = (long / 320) ** 2
     wide, tall = np.maximum(np.median(moments, 0) - blur, 0.05)
     aspect = float(np.clip(np.sqrt(wide / tall), 0.4, 3.5))
-    pitch, area = float(np.median(steps)), float(np.median(areas))
-    if len(places) * pitch**2 < 0.35 * gel.shape[0] * gel.shape[1]:  # some specks, but no lattice
+    area = float(np.median(areas))
+    if len(places) * rough**2 < 0.35 * gel.shape[0] * gel.shape[1]:  # some specks, but no lattice
         return None
     grown = cv2.dilate((deep > max(6.0, 0.25 * strongest)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     ink = np.median(np.array(centres), 0) / 255
-    return Dots(pitch, float(np.sqrt(area / (np.pi * aspect))), aspect, ink, grown, float(np.std(steps) / pitch))
+    return Dots(pitch, bend, float(np.sqrt(area / (np.pi * aspect))), aspect, ink, grown, spread)
+
+
+def _lattice(at: Array, apart: Array, rough: float, shape: tuple[int, ...]) -> tuple[float, float, float]:
+    """Return step and bend of the lattice of dots at places (N, 2), and the spread of its steps, infinite for few.
+
+    Along x and y the lattice counts `plain` x + `more` x r^2 (see `Markers`), which is one more at the next dot.
+    """
+    place, half = at - np.array([shape[1], shape[0]]) / 2, float(np.hypot(shape[0], shape[1])) / 2
+    counted = np.stack([place, place * (place**2).sum(1)[:, None] / half**2], 2) / rough
+    first, second = np.nonzero((apart > 0.75 * rough) & (apart < 1.25 * rough))
+    steps = counted[second] - counted[first]
+    rows = np.concatenate([steps[:, i][steps[:, i, 0] > 2 * np.abs(steps[:, 1 - i, 0])] for i in range(2)])
+    spread = np.inf
+    for _ in range(3):
+        if len(rows) < FEWEST_DOTS:
+            return rough, 0.0, np.inf
+        plain, more = np.linalg.lstsq(rows, np.ones(len(rows)), rcond=None)[0]
+        left = np.abs(rows @ [plain, more] - 1)
+        spread, rows = float(np.sqrt((left**2).mean())), rows[left <= 3 * np.median(left)]
+    return rough / (plain + more), float(more / (plain + more)), spread
 
 
 def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:

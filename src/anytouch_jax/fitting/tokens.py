@@ -40,8 +40,10 @@ KEPT = 480  # features of touches before, that a touch must not be taken for
 HEAT = 0.07  # temperature of the contrast
 REUSE = 4  # steps with the same touches in other light
 BATCHES = 10  # of held-out touches, before and after
+TIMED = 4 * REUSE  # steps whose speed decides how many there are
 SAVED = 60.0  # seconds between saved states
 State = dict[str, Any]
+Kept = tuple[State, Any, Any]  # what is trained, its moments, and features of touches before
 
 
 def adapt_by_simulation(
@@ -96,16 +98,17 @@ def adapt_by_simulation(
     tx = optax.scale_by_adam()
 
     @jax.jit
-    def step(
-        train: State, moments: Any, frozen: Params, key: Any, touches: Any, queue: Any, seen: Any, rate: Any
-    ) -> Any:
+    def step(kept: Kept, frozen: Params, key: Any, touches: Any, number: Any, rate: Any) -> tuple[Kept, Any]:
+        (train, moments, queue), at = kept, number // REUSE * COUNT
+        seen = jnp.arange(KEPT) < jnp.where(number % REUSE == 0, at, at + COUNT)
         (value, target), grad = jax.value_and_grad(loss, has_aux=True)(train, frozen, key, touches, queue, seen)
         updates, moments = tx.update(grad, moments)
         rates = {name: RATE if name == "tokens" else DEEP_RATE for name in train}
         moved = {name: jax.tree.map(lambda x, r=rates[name]: -rate * r * x, part) for name, part in updates.items()}
         if deep:
             moved["blocks"] = jax.tree.map(lambda x: x.at[FIRST:].set(0), moved["blocks"])
-        return optax.apply_updates(train, moved), moments, value, target
+        new = jax.lax.dynamic_update_slice(queue, target.astype(queue.dtype), (at % KEPT, 0))
+        return (optax.apply_updates(train, moved), moments, jnp.where(number % REUSE == 0, new, queue)), value
 
     @jax.jit
     def features(train: State, frozen: Params, touches: Any) -> tuple[Any, Any]:
@@ -123,9 +126,9 @@ def adapt_by_simulation(
         held = [own_touches(jax.random.fold_in(root, (1 << 29) + n), test, size=size) for n in range(BATCHES)]
         score = partial(_found, held, lambda train, touches: features(train, frozen, touches))
         before = score(train)
-        train, history, finished = _train(
-            train, tx.init(train), step, frozen, lambda n: own_touches(jax.random.fold_in(root, n), world, size=size),
-            config.model.embed, 60 * minutes, root, state, identity, log,
+        (train, *_), history, finished = _train(
+            (train, tx.init(train), jnp.zeros((KEPT, config.model.embed))), step, frozen, 60 * minutes, root, state,
+            lambda n: own_touches(jax.random.fold_in(root, n), world, size=size), identity, log,
         )  # fmt: skip
         if not finished:
             return None
@@ -135,12 +138,11 @@ def adapt_by_simulation(
             f"the new tokens find {after:.1%} of held-out simulated touches by a known sensor, and the universal ones "
             f"{before:.1%}: nothing is saved. Look at look.png of {sensor}, or give more --minutes."
         )
-    params = params | {"touch": params["touch"] | {name: part for name, part in train.items() if name != "tokens"}}
     source = {"run": str(run), "sensor": numbers.name, "frames": 0, "minutes": minutes, "deep": deep}
     metadata: dict[str, Any] = {name: stored[name] for name in ("preprocessing", "data") if name in stored}
     metadata |= {"sensors": list(config.model.sensors), "source": source}
     metadata |= {} if loaded.trained_sensors is None else {"seen": [*loaded.trained_sensors, numbers.name]}
-    return Adapted(config, put_tokens(params, row, train["tokens"]), history, before, after, "simulated", metadata)
+    return Adapted(config, params | merged(train, params), history, before, after, "simulated", metadata)
 
 
 def _found(held: list[SimulatedTouches], features: Callable[..., Any], train: State) -> float:
@@ -153,52 +155,48 @@ def _found(held: list[SimulatedTouches], features: Callable[..., Any], train: St
 
 
 def _train(
-    train: State, moments: Any, step: Callable[..., Any], frozen: Params, touches_of: Callable[[int], Any], width: int,
-    seconds: float, root: Any, file: Path | None, identity: str, log: Log,
-) -> tuple[State, tuple[float, ...], bool]:  # fmt: skip
-    """Train for `seconds` in all, from the state in `file` if there is one. False is an interruption, with a state."""
-    leaves, tree = jax.tree.flatten((train, moments))
-    spent, history = 0.0, list[float]()
+    kept: Kept, step: Callable[..., Any], frozen: Params, seconds: float, root: Any, file: Path | None,
+    touches_of: Callable[[int], Any], identity: str, log: Log,
+) -> tuple[Kept, tuple[float, ...], bool]:  # fmt: skip
+    """Train for about `seconds`, from the state in `file` if there is one. False is an interruption, with a state.
+
+    The speed of the first steps decides the number of steps, so a continued training equals an undisturbed one.
+    """
+    total, history = 0, list[float]()
     if file is not None and file.is_file():
-        arrays = read_arrays(file)
+        arrays, (leaves, tree) = read_arrays(file), jax.tree.flatten(kept)
         if str(arrays.get("identity")) != identity:
             raise UserError(f"{file} belongs to another adaptation; remove it, or name another --out")
-        leaves = [jnp.asarray(arrays[f"leaf{n}"], leaf.dtype) for n, leaf in enumerate(leaves)]
-        spent, history = float(arrays["spent"]), [float(value) for value in arrays["history"]]
-        log(f"continued after {spent:.0f} of {seconds:.0f} seconds")
-    train, moments = jax.tree.unflatten(tree, leaves)
-    queue, seen = jnp.zeros((KEPT, width)), np.zeros(KEPT, bool)
+        kept = jax.tree.unflatten(tree, [jnp.asarray(arrays[f"leaf{n}"], x.dtype) for n, x in enumerate(leaves)])
+        total, history = int(arrays["total"]), [float(value) for value in arrays["history"]]
+        log(f"continued after {len(history)} steps{f' of {total}' * (total > 0)}")
 
     def save() -> None:
         if file is not None:
-            data = io.BytesIO()
-            kept = {f"leaf{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves((train, moments)))}
-            np.savez(data, identity=identity, spent=spent, history=history, **kept)  # type: ignore[arg-type]
+            data, arrays = io.BytesIO(), {f"leaf{n}": np.asarray(x) for n, x in enumerate(jax.tree.leaves(kept))}
+            np.savez(data, identity=identity, total=total, history=history, **arrays)  # type: ignore[arg-type]
             atomic_write(file, data.getvalue())
 
-    touches, saved = None, spent
+    touches, clock, saved = None, list[float](), time.monotonic()  # the ends of steps: compiling is not training
     try:
         with bar(round(seconds), "seconds of training") as advance:
-            begun = time.monotonic() - spent
-            while spent < seconds:
+            while not total or len(history) < total:
                 number = len(history)
                 if touches is None or number % REUSE == 0:
                     touches = touches_of(number // REUSE)
-                rate = 0.5 * (1 + np.cos(np.pi * min(spent / seconds, 1)))
+                rate = float(0.5 * (1 + np.cos(np.pi * number / total))) if total else 1.0
                 key = jax.random.fold_in(jax.random.fold_in(root, 1 << 30), number)
-                train, moments, value, target = step(train, moments, frozen, key, touches, queue, seen, rate)
-                if number % REUSE == 0:
-                    at = number // REUSE * COUNT % KEPT
-                    queue, seen[at : at + COUNT] = queue.at[at : at + COUNT].set(target), True
-                if number == 0:  # compiling is not training
-                    begun = time.monotonic() - spent
-                history.append(float(value))
-                spent = time.monotonic() - begun
-                advance(min(round(spent), round(seconds)))
-                if spent - saved > SAVED:
-                    saved = spent
+                new, value = step(kept, frozen, key, touches, number, rate)
+                kept, history = new, [*history, float(value)]  # at once: an interruption finds a whole step
+                clock.append(time.monotonic())
+                if not total and (len(clock) > TIMED or clock[-1] - clock[0] >= seconds):
+                    total = max(len(history), round(seconds * (len(clock) - 1) / (clock[-1] - clock[0])))
+                if total:
+                    advance(round(seconds * len(history) / total))
+                if clock[-1] - saved > SAVED:
+                    saved = clock[-1]
                     save()
     except KeyboardInterrupt:
         save()
-        return train, tuple(history), False
-    return train, tuple(history), True
+        return kept, tuple(history), False
+    return kept, tuple(history), True

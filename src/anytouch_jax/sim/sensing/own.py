@@ -105,11 +105,9 @@ def _fault(file: Path, _: int) -> str:
     except (OSError, ValueError) as error:
         return str(getattr(error, "strerror", None) or error)
     for name, shape in SHAPES.items():
-        array = arrays.get(name)
-        fits = array is not None and array.ndim == len(shape) and all(
-            b in (0, a) for a, b in zip(array.shape, shape, strict=True)
-        )  # fmt: skip
-        if array is None or not fits or not np.isfinite(array).all() or not 0 < array.size < 1 << 20:
+        array = arrays.get(name, np.zeros(0))
+        fits = array.ndim == len(shape) and all(b in (0, a) for a, b in zip(array.shape, shape, strict=True))
+        if not fits or not np.isfinite(array).all() or not 0 < array.size < 1 << 20:
             return f"the array {name} is missing, or has another shape than {shape}"
     return "" if len(arrays["bases"]) <= MOST_BASES else f"more than {MOST_BASES} untouched gels"
 

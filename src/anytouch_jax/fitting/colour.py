@@ -20,15 +20,16 @@ from anytouch_jax.sim.contact.mechanics import Gel, press
 from anytouch_jax.sim.sensing.sensors import POWERS, Photometry
 
 Array = np.ndarray
+Found = tuple[float, Array]  # a loss, and what has it
 PLACES = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of (u, v) that a coefficient drifts by
 # Largest tilt, and largest features of the halo, that change a colour: of open light, and of paint that is soon dark.
 LIMITS = (0.95, (9.0, 9.0, 1.5)), (0.3, (0.03, 0.03, 0.06))
 DEPTHS = np.linspace(0.05, 1.6, 24)  # mm
+REACH = np.array([[-np.inf, -np.inf, DEPTHS[0]], [np.inf, np.inf, DEPTHS[-1]]])  # of a pose
 _GRID, _SIDE = 96, 14.0  # points and mm of the solved gel
 SKIN = 0.13  # mm: detail that the coating and the lens pass
 # mm, of the soft shadow and of the gel: the best is chosen. The gel's decides the depth, and so the change by depth.
-HALOS, THICKNESSES = (0.35, 1.0, 1.6), (1.7, 2.1, 2.6, 3.2, 3.9, 4.7)
-TURNS = 4  # of colours and slopes, without a ball
+HALOS, THICKNESSES = (0.35, 1.0, 1.6), (1.8, 2.3, 3.0, 3.6, 4.5)
 THIN = 5  # the search looks at every so many pixels
 PLAIN = 9  # powers of the normal with which the presses are placed
 ROUNDS = (0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03)  # mm of place and depth
@@ -36,9 +37,7 @@ FEATURES = len(POWERS) * len(PLACES)
 # Root mean square of the slope of the gel, where its change is above a quarter of the strongest, and of its depth there
 # in mm, which give the right strength on average over simulated units. They set the scale where no ball does.
 USUAL_TILT, USUAL_DEPTH = 0.19, 0.27
-UNSURE = (
-    "Without a ball the strength is a usual one, which differs by {} (deviation over known sensors): edit contrast."
-)
+UNSURE = "Without a ball the strength is a usual one, which differs by {} (deviation over known sensors): edit contrast"
 
 
 class Colour(NamedTuple):
@@ -48,7 +47,6 @@ class Colour(NamedTuple):
     halo: float
     explained: float
     source: str
-    doubt: str = ""
     thickness: float = 3.0
 
 
@@ -164,30 +162,25 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
     flat, seen = change.reshape(len(change), -1, 3).astype(np.float64), clear.reshape(len(clear), -1, 1)
     flat = flat * seen
     few, thin, some = flat[:, ::THIN], Grid(*(values[::THIN] for values in part)), seen[:, ::THIN]
-    usual = known[THICKNESSES[2], HALOS[1], 0]
-    poses = np.stack([_first_pose(one, part, usual) for one in flat])
-    tries = {
-        key: _placed(few, some, thin, known[key], poses, ROUNDS[:4])
-        for key in product((THICKNESSES[2],), HALOS, range(len(LIMITS)))
-    }
-    nearest = min(tries, key=lambda key: tries[key][0])
-    poses = tries[nearest][1]
-    tries = {key: _placed(few, some, thin, known[key], poses, ROUNDS[3:]) for key in known if key[1] == nearest[1]}
-    best = min(tries, key=lambda key: tries[key][0])
-    if float(np.median(tries[best][1][:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
+    best = (THICKNESSES[2], HALOS[1], 0)
+    poses = np.stack([_first_pose(one, part, known[best]) for one in flat])
+    # Shadow and limits for one thickness; then thickness and shadow together, which replace each other; then limits.
+    for same, rounds in ((slice(1), ROUNDS[:4]), (slice(2, 3), ROUNDS[3:5]), (slice(2), ROUNDS[4:])):
+        keys = [key for key in known if key[same] == best[same]]
+        tries = {key: _placed(few, some, thin, known[key], poses, rounds) for key in keys}
+        best = min(tries, key=lambda key: tries[key][0])
+        poses = tries[best][1]
+    if float(np.median(poses[:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
         raise UserError(
             f"the dents are wider than a ball of {ball_mm:g} mm makes them, if the picture is {width_mm:g} mm wide; "
             "check --width-mm and --ball-mm"
         )
-    loss, coefficients = _colours(flat, seen, part, known[best], tries[best][1], plain=False)
-    look = assemble(coefficients, *LIMITS[best[2]])
-    source, explained = f"{len(change)} presses of a ball of {ball_mm:g} mm", -loss / float((flat**2).sum())
-    return Colour(look, best[1], explained, source, thickness=best[0])
+    loss, coefficients = _colours(flat, seen, part, known[best], poses, plain=False)
+    source = f"{len(change)} presses of a ball of {ball_mm:g} mm"
+    return Colour(assemble(coefficients, *LIMITS[best[2]]), best[1], -loss / float((flat**2).sum()), source, best[0])
 
 
-def _placed(
-    flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any
-) -> tuple[float, Array]:
+def _placed(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any) -> Found:
     """Return the loss of `_colours`, and better poses (N, 3): the colours and the poses are found in turn."""
     for step, deep in rounds:
         # Deeper dents with fainter colours look nearly alike, so all depths are also tried together.
@@ -201,9 +194,7 @@ def _placed(
     return _colours(flat, seen, part, profiles, poses, plain=False)[0], poses
 
 
-def _colours(
-    flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, *, plain: bool = True
-) -> tuple[float, Array]:
+def _colours(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, plain: bool = True) -> Found:
     """Return minus the squares of the change that the best colours explain, and these colours (22 or 129, 3)."""
     rows = [w * design(*_features(part, profiles, pose), plain=plain) for pose, w in zip(poses, seen, strict=True)]
     gram, target = sum(r.T @ r for r in rows), sum(r.T @ d for r, d in zip(rows, flat, strict=True))
@@ -229,14 +220,12 @@ def _search(
     """Return a pose that no step along x, y or depth makes better, after four steps at most."""
 
     def loss(one: Array) -> float:
-        return float(
-            ((change - seen * (design(*_features(grid, profiles, one), plain=True) @ coefficients)) ** 2).sum()
-        )
+        made = design(*_features(grid, profiles, one), plain=True) @ coefficients
+        return float(((change - seen * made) ** 2).sum())
 
     least = loss(pose)
     for _ in range(4):
-        moves = [pose + sign * move for move in np.diag(steps) for sign in (-1, 1)]
-        moves = [np.array([x, y, np.clip(depth, DEPTHS[0], DEPTHS[-1])]) for x, y, depth in moves]
+        moves = [np.clip(pose + sign * move, *REACH) for move in np.diag(steps) for sign in (-1, 1)]
         losses = [loss(one) for one in moves]
         if min(losses) >= least:
             break
@@ -250,14 +239,11 @@ def fit_presses(change: Array, clear: Array) -> Colour:
     strength = np.abs(smooth).max(-1)
     touched = strength > 0.25 * np.percentile(strength, 99.5, axis=(1, 2))[:, None, None]
     values, axes = np.linalg.eigh(np.cov(smooth.reshape(-1, 3).T, ddof=0))
-    mean = smooth[touched].mean(0)
-    even = float((mean @ axes[:, -1]) ** 2 / (smooth[touched] @ axes[:, -1]).var())
-    if values[1] < 0.03 * values[2] and even > 0.1:  # one colour, of one sign: depth and not slope
-        strength = np.sqrt(((smooth[touched] @ axes[:, -1]) ** 2).mean()) / USUAL_DEPTH
-        coefficients = np.zeros((FEATURES + 9, 3))
-        coefficients[FEATURES + 6] = axes[:, -1] * np.sign(mean @ axes[:, -1]) * strength
-        source = f"{len(change)} presses of unknown objects, of a gel that changes by depth"
-        return Colour(assemble(coefficients), 0.35, float(values[2] / values.sum()), source, UNSURE.format("30 %"))
+    main, coefficients = smooth[touched] @ axes[:, -1], np.zeros((FEATURES + 9, 3))
+    if values[1] < 0.03 * values[2] and main.mean() ** 2 > 0.1 * main.var():  # one colour, of one sign: no slope
+        coefficients[FEATURES + 6] = axes[:, -1] * np.sign(main.mean()) * np.sqrt((main**2).mean()) / USUAL_DEPTH
+        source = f"{len(change)} presses of unknown objects, of a gel that changes by depth. {UNSURE.format('30 %')}"
+        return Colour(assemble(coefficients), 0.35, float(values[2] / values.sum()), source)
     values, axes = np.linalg.eigh(np.cov(smooth[clear].T, ddof=0))
     white = (smooth @ axes[:, 1:]) / np.sqrt(values[1:])  # (N, H, W, 2), uncorrelated: slopes up to a turn
     down, across = (np.gradient(white, axis=axis)[clear] for axis in (1, 2))
@@ -271,7 +257,7 @@ def fit_presses(change: Array, clear: Array) -> Colour:
         slopes = -slopes
     # The colours drift over the picture: those of the nearest surface, and the slopes by these colours, in turn.
     place = np.stack([np.ones_like(grid.u), grid.u, grid.v], -1)
-    for _ in range(TURNS):
+    for _ in range(4):
         fitting = np.stack(np.gradient(_depth_of(slopes), axis=(2, 1)), -1)
         fitting *= USUAL_TILT / np.sqrt((fitting[touched] ** 2).sum(-1).mean())
         rows = (fitting[..., None] * place[:, :, None]).reshape(*smooth.shape[:3], 6)[clear]
@@ -280,11 +266,10 @@ def fit_presses(change: Array, clear: Array) -> Colour:
         square = colours @ colours.swapaxes(2, 3)
         square += 0.01 * np.trace(square.mean((0, 1))) * np.eye(2)
         slopes = np.einsum("hwde,hwec,nhwc->nhwd", np.linalg.inv(square), colours, smooth)
-    coefficients = np.zeros((FEATURES + 9, 3))
     coefficients[:3], coefficients[len(PLACES) : len(PLACES) + 3] = linear
     left = ((smooth[clear] - rows @ linear.reshape(6, 3)) ** 2).sum() / (smooth[clear] ** 2).sum()
-    source = f"{len(change)} presses of unknown objects"
-    return Colour(assemble(coefficients), 1.0, 1 - float(left), source, UNSURE.format("20 %"))
+    source = f"{len(change)} presses of unknown objects. {UNSURE.format('20 %')}"
+    return Colour(assemble(coefficients), 1.0, 1 - float(left), source)
 
 
 def _depth_of(slopes: Array) -> Array:

@@ -74,15 +74,14 @@ def fit_sensor(
         ink: Any = tuple(round(float(value), 3) for value in dots.ink)
         step, radius = round(dots.pitch * pixel, 4), round(dots.radius * pixel, 4)
         markers = Markers(step, radius, round(dots.aspect, 3), 1.0, ink, round(dots.bend, 4))
-    presses = int(seen.pressed.sum())
     sure = {
-        "pictures": f"{len(pictures)}, of which {presses} show a press",
+        "pictures": f"{len(pictures)}, of which {int(seen.pressed.sum())} show a press",
         "untouched gel": f"{seen.source}; its lights and vignette are in it",
         "dots": "none seen" if dots is None else f"steps from dot to dot {dots.spread:.1%} around the lattice",
         "noise": f"{seen.noise_spread:.0%} from picture to picture",
-        "colour": f"from {found.source}; explains {found.explained:.0%} of the change. {found.doubt}",
+        "colour": f"explains {found.explained:.0%} of the change, from {found.source}",
         "size": "as given",
-        "thickness_mm, halo_mm": "not seen" if found.doubt else "the best of a few",
+        "thickness_mm, halo_mm": "not seen" if ball_mm is None else "the best of a few",
         "modulus_kpa, skin_mm": "not seen in pictures: usual values, edit what you know",
     }
     numbers = OwnSensor(

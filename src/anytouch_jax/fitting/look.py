@@ -93,12 +93,9 @@ def _check_one_unit(frames: Sequence[Array]) -> None:
     small = np.stack([cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32) for one in frames])
     apart = np.array([np.median(np.abs(small - one), axis=(1, 2)).max(1) for one in small])
     near = apart <= TINT
-    first = near[np.argmax(near.sum(1))]
-    rest = np.flatnonzero(~first)
-    if len(rest) < max(2, ANOTHER * len(frames)):
-        return
-    among = near[np.ix_(rest, rest)].sum(1).max()
-    if among >= max(2, 0.5 * len(rest)):
+    rest = np.flatnonzero(~near[np.argmax(near.sum(1))])
+    enough = len(rest) >= max(2, ANOTHER * len(frames))
+    if enough and near[np.ix_(rest, rest)].sum(1).max() >= max(2, 0.5 * len(rest)):
         raise UserError(
             f"{len(rest)} of {len(frames)} pictures differ from the others in most places, as if taken with another "
             "unit or in other light; fit each unit by itself"
@@ -125,10 +122,8 @@ def find_dots(gel: Array) -> Dots | None:
 def _dots_of(gel: Array, sign: int) -> Dots | None:
     long = max(gel.shape[:2])
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(0.045 * long) + 1,) * 2)
-    if sign > 0:
-        depth = cv2.subtract(cv2.morphologyEx(gel, cv2.MORPH_CLOSE, kernel), gel)
-    else:
-        depth = cv2.subtract(gel, cv2.morphologyEx(gel, cv2.MORPH_OPEN, kernel))
+    shown = gel if sign > 0 else 255 - gel
+    depth = cv2.subtract(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, kernel), shown)
     deep = cv2.GaussianBlur(depth.max(2).astype(np.float32), (0, 0), long / 320)
     strongest = float(np.percentile(deep, 99))
     _, labels, stats, _ = cv2.connectedComponentsWithStats((deep > max(8.0, 0.5 * strongest)).astype(np.uint8))

@@ -191,8 +191,7 @@ def _train(
                 clock.append(time.monotonic())
                 if not total and (len(clock) > TIMED or clock[-1] - clock[0] >= seconds):
                     total = max(len(history), round(seconds * (len(clock) - 1) / (clock[-1] - clock[0])))
-                if total:
-                    advance(round(seconds * len(history) / total))
+                advance(round(seconds * len(history) / total) if total else 0)
                 if clock[-1] - saved > SAVED:
                     saved = clock[-1]
                     save()

@@ -29,7 +29,7 @@ REACH = np.array([[-np.inf, -np.inf, DEPTHS[0]], [np.inf, np.inf, DEPTHS[-1]]]) 
 _GRID, _SIDE = 96, 14.0  # points and mm of the solved gel
 SKIN = 0.13  # mm: detail that the coating and the lens pass
 # mm, of the soft shadow and of the gel: the best is chosen. The gel's decides the depth, and so the change by depth.
-HALOS, THICKNESSES = (0.35, 1.0, 1.6), (1.8, 2.3, 3.0, 3.6, 4.5)
+HALOS, THICKNESSES = (0.35, 1.0, 1.6), (1.8, 2.3, 2.8, 3.3, 3.9, 4.6)
 THIN = 5  # the search looks at every so many pixels
 PLAIN = 9  # powers of the normal with which the presses are placed
 ROUNDS = (0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03)  # mm of place and depth
@@ -171,10 +171,7 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
         best = min(tries, key=lambda key: tries[key][0])
         poses = tries[best][1]
     if float(np.median(poses[:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
-        raise UserError(
-            f"the dents are wider than a ball of {ball_mm:g} mm makes them, if the picture is {width_mm:g} mm wide; "
-            "check --width-mm and --ball-mm"
-        )
+        raise UserError(f"the dents are wider than those of a ball of {ball_mm:g} mm; check --width-mm and --ball-mm")
     loss, coefficients = _colours(flat, seen, part, known[best], poses, plain=False)
     source = f"{len(change)} presses of a ball of {ball_mm:g} mm"
     return Colour(assemble(coefficients, *LIMITS[best[2]]), best[1], -loss / float((flat**2).sum()), source, best[0])

@@ -74,10 +74,7 @@ def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
     if not pressed.any():
         raise UserError("no picture shows a press; press objects of all kinds into the gel, at changing places")
     if background is None and median_gel(small) is None:
-        raise UserError(
-            "every picture shows a press at the same place, so the untouched gel is unknown; add pictures of it, or "
-            "name one with --background"
-        )
+        raise UserError("every picture shows a press at the same place; name the untouched gel with --background")
     dots = find_dots(gel)
     noise, spread = _noise(np.stack(frames), gel, dots)
     change, clear = _changes([frames[i] for i in np.flatnonzero(pressed)], gel, dots)

@@ -63,9 +63,7 @@ def adapt_by_simulation(
     config, params, row = with_row(loaded, params, numbers.name, str(run), log)
     known = tuple(name for name in loaded.trained_sensors or CAMERAS if name in known)
     if not known:
-        raise UserError(
-            f"{run} was trained on no sensor that is simulated, so nothing can be matched; name another run"
-        )
+        raise UserError(f"{run} was trained on no sensor that is simulated; name another run")
     size = config.model.image_size
     rows = np.array([row, *(config.model.sensor_row(name) for name in known)], np.int32)
     net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))

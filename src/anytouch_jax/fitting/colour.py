@@ -20,12 +20,12 @@ from anytouch_jax.sim.contact.mechanics import Gel, press
 from anytouch_jax.sim.sensing.sensors import POWERS, Photometry
 
 Array = np.ndarray
-Found = tuple[float, Array]  # a loss, and what has it
+_Found = tuple[float, Array]  # a loss, and what has it
 PLACES = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of (u, v) that a coefficient drifts by
 # Largest tilt, and largest features of the halo, that change a colour: of open light, and of paint that is soon dark.
-LIMITS = (0.95, (9.0, 9.0, 1.5)), (0.3, (0.03, 0.03, 0.06))
+_LIMITS = (0.95, (9.0, 9.0, 1.5)), (0.3, (0.03, 0.03, 0.06))
 DEPTHS = np.linspace(0.05, 1.6, 24)  # mm
-REACH = np.array([[-np.inf, -np.inf, DEPTHS[0]], [np.inf, np.inf, DEPTHS[-1]]])  # of a pose
+_REACH = np.array([[-np.inf, -np.inf, DEPTHS[0]], [np.inf, np.inf, DEPTHS[-1]]])  # of a pose
 _GRID, _SIDE = 96, 14.0  # points and mm of the solved gel
 SKIN = 0.13  # mm: detail that the coating and the lens pass
 # mm, of the soft shadow and of the gel: the best is chosen. The gel's decides the depth, and so the change by depth.
@@ -82,7 +82,7 @@ class _Profiles(NamedTuple):
 
 
 def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
-    """Return the dents of a ball by thickness of the gel, halo, and number of the LIMITS."""
+    """Return the dents of a ball by thickness of the gel, halo, and number of the _LIMITS."""
     line = (np.arange(_GRID) - (_GRID - 1) / 2) * _SIDE / _GRID
     away, radius = np.hypot(*np.meshgrid(line, line)), ball_mm / 2
     surface = np.where(away < radius, np.sqrt(np.maximum(radius**2 - away**2, 0)) - radius, -radius - 5)
@@ -103,7 +103,7 @@ def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
             return lines, np.gradient(lines, pitch, axis=1)
 
         sharp = rows(SKIN)[1]
-        for halo, (number, (steepest, widest)) in product(HALOS, enumerate(LIMITS)):
+        for halo, (number, (steepest, widest)) in product(HALOS, enumerate(_LIMITS)):
             found[thickness, halo, number] = _Profiles(line[middle:], sharp, *rows(halo), steepest, np.array(widest))
     return found
 
@@ -148,7 +148,7 @@ _PENALTY = np.concatenate([
 ])  # fmt: skip
 
 
-def assemble(coefficients: Array, steepest: float = LIMITS[0][0], widest: Any = LIMITS[0][1]) -> Photometry:
+def assemble(coefficients: Array, steepest: float = _LIMITS[0][0], widest: Any = _LIMITS[0][1]) -> Photometry:
     """Return the `Photometry` of the coefficients (129, 3) of `design`."""
     normal = coefficients[:FEATURES].reshape(len(POWERS), len(PLACES), 3).astype(np.float32)
     halo = coefficients[FEATURES:].reshape(3, 3, 3).astype(np.float32)
@@ -174,10 +174,10 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
         raise UserError(f"the dents are wider than those of a ball of {ball_mm:g} mm; check --width-mm and --ball-mm")
     loss, coefficients = _colours(flat, seen, part, known[best], poses, plain=False)
     source = f"{len(change)} presses of a ball of {ball_mm:g} mm"
-    return Colour(assemble(coefficients, *LIMITS[best[2]]), best[1], -loss / float((flat**2).sum()), source, best[0])
+    return Colour(assemble(coefficients, *_LIMITS[best[2]]), best[1], -loss / float((flat**2).sum()), source, best[0])
 
 
-def _placed(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any) -> Found:
+def _placed(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any) -> _Found:
     """Return the loss of `_colours`, and better poses (N, 3): the colours and the poses are found in turn."""
     for step, deep in rounds:
         # Deeper dents with fainter colours look nearly alike, so all depths are also tried together.
@@ -191,7 +191,7 @@ def _placed(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Ar
     return _colours(flat, seen, part, profiles, poses, plain=False)[0], poses
 
 
-def _colours(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, plain: bool = True) -> Found:
+def _colours(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, plain: bool = True) -> _Found:
     """Return minus the squares of the change that the best colours explain, and these colours (22 or 129, 3)."""
     rows = [w * design(*_features(part, profiles, pose), plain=plain) for pose, w in zip(poses, seen, strict=True)]
     gram, target = sum(r.T @ r for r in rows), sum(r.T @ d for r, d in zip(rows, flat, strict=True))
@@ -222,7 +222,7 @@ def _search(
 
     least = loss(pose)
     for _ in range(4):
-        moves = [np.clip(pose + sign * move, *REACH) for move in np.diag(steps) for sign in (-1, 1)]
+        moves = [np.clip(pose + sign * move, *_REACH) for move in np.diag(steps) for sign in (-1, 1)]
         losses = [loss(one) for one in moves]
         if min(losses) >= least:
             break

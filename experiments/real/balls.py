@@ -4,8 +4,9 @@
     python -m experiments.real.balls --calibration
 
 A ball of known radius R that touches the gel in a circle of radius a has the profile sqrt(R^2 - r^2) - sqrt(R^2 - a^2)
-above the rim of its contact. The circle is detected in the difference from the untouched gel (`find_circle`), and
-`--picture` shows it. So depth is compared with the rim's: what the gel does outside the contact is not known.
+above the rim of its contact. The circle is detected in the difference from the untouched gel (`find_circle`). So depth
+is compared with the rim's: what the gel does outside the contact is not known. `--picture` draws real and simulated
+presses, and their colours by slope.
 
 `--calibration` is what the field does for one unit: slopes of the ball are fitted to colours and places on half of the
 presses, by a polynomial or a small network, and integrated (Poisson). The halves are exchanged, so that every press is
@@ -17,11 +18,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
+import jax
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import dctn, idctn
@@ -32,9 +35,13 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from tyro.conf import Positional
 
-from anytouch_jax.data.images import decode, encode
+from anytouch_jax.data.images import decode
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.plots import panels, write_figure
+from anytouch_jax.sim.recorder import ball as ball_map
+from anytouch_jax.sim.recorder import simulate_touch
+from anytouch_jax.sim.sensing.sensors import SENSORS, identity_unit
 from experiments.command import run_script
 from experiments.records import write_record
 
@@ -45,6 +52,7 @@ _WIDTH = 320  # pixels of the picture in which circles are sought
 _INNER = 0.9  # of the circle's radius: the part that the sphere is fitted to
 _PIXELS = 800  # of each press inside its circle, and as many outside
 DRAWS = 1000  # of a bootstrap over presses
+_SHOWN = 3  # presses in the picture
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,7 @@ class BallOptions:
 
     models: Positional[tuple[str, ...]] = ()  # Encoders that measure.
     calibration: bool = False  # Also the calibration of the unit itself.
-    picture: Path | None = None  # PNG of the circles that were found.
+    picture: Path | None = None  # PNG of real and simulated presses.
     data: Path = FOLDER  # Folder of the presses.
     out: Path = Path("experiments/results/balls.jsonl")  # JSON lines.
 
@@ -336,16 +344,35 @@ def unknown_record(depths: Sequence[Array], presses: Sequence[Press], mm: float)
     return {"presses": len(whole), "fitted_radius_mm": interval(fitted), "quartiles_over_median": spread}
 
 
-def show(unit: Unit, gel: Array, presses: Sequence[Press]) -> Array:
-    """Return a sheet of the differences with their circles."""
-    tiles = []
-    for press in presses:
-        tile = np.clip(difference(press.frame, gel) + 128, 0, 255).astype(np.uint8).copy()
-        cv2.circle(tile, (round(press.x), round(press.y)), round(press.radius), (255, 255, 255), 1, cv2.LINE_AA)
-        cv2.putText(tile, press.name[-12:], (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
-        tiles.append(cv2.resize(tile, (240, 180), interpolation=cv2.INTER_AREA))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % 8)
-    return np.vstack([np.hstack(tiles[n : n + 8]) for n in range(0, len(tiles), 8)])
+def draw_colours(path: Path, unit: Unit, gel: Array, presses: Sequence[Press]) -> None:
+    """Draw differences of presses above simulated ones of the same balls and circles, and their strength by slope."""
+    mm, kind = (unit.width_mm or 0.0) / gel.shape[1], SENSORS[unit.sensor]
+    device = identity_unit(kind)._replace(gain=np.full(3, kind.contrast, np.float32))
+    simulate = jax.jit(partial(simulate_touch, sensor=unit.sensor, size=len(gel), unit=device))
+    figure, axes = panels(2, _SHOWN + 1, 2.6, 2.0)
+    inside: dict[str, list[tuple[Array, Array]]] = {"real": [], "simulated": []}
+    for column, press in enumerate(presses[_SHOWN :: len(presses) // _SHOWN]):
+        depth = 0.57 * (mm * press.radius) ** 2 / press.ball  # of a layer, whose contact is wider than a half-space's
+        place = (mm * (side / 2 - at) for side, at in zip(gel.shape[1::-1], (press.x, press.y), strict=True))
+        made = simulate(ball_map(2 * press.ball, 400), np.array([[*place, 0.0, depth]]))
+        image, behind, dent, pressure = (np.asarray(one[0]) for one in (*made[:3], made.pressure))
+        slope, away = np.hypot(*np.gradient(dent, kind.field[1] / dent.shape[1])), distance(press)[2]
+        for axis, name, change, sine, touched in (
+            (axes[0][column], "real", difference(press.frame, gel), mm * away / press.ball, away < press.radius - 1),
+            (axes[1][column], "simulated", difference(image, behind), slope / np.hypot(slope, 1),
+             pressure > 0.05 * pressure.max()),
+        ):  # fmt: skip
+            axis.imshow(np.clip(change + 128, 0, 255).astype(np.uint8))
+            axis.set_axis_off()
+            axis.set_title(f"{name}, {2 * press.ball:g} mm", fontsize=8)
+            inside[name].append((sine[touched], np.linalg.norm(change, axis=2)[touched]))
+    for row, (name, parts) in zip(axes, inside.items(), strict=True):
+        sine, strength = (np.concatenate(part) for part in zip(*parts, strict=True))
+        places = np.arange(0.025, sine.max(), 0.05)
+        row[_SHOWN].plot(places, [np.median(strength[np.abs(sine - at) < 0.025]) for at in places])
+        row[_SHOWN].set(xlim=(0, 0.7), ylim=(0, 90))
+        row[_SHOWN].set_title(f"{name}: grey levels by sine of slope", fontsize=8)
+    write_figure(path, figure)
 
 
 def run(options: BallOptions) -> int:
@@ -353,11 +380,11 @@ def run(options: BallOptions) -> int:
     if not options.models and not options.calibration:
         raise UserError("name encoders that measure, or pass --calibration")
     encoders = {name: load_encoder(name) for name in options.models}
-    sheets = list[Array]()
     for unit in UNITS:
         gel, presses = read_presses(unit, options.data)
-        sheets.append(show(unit, gel, presses))
         known = all(np.isfinite(list(unit.presses)))
+        if known and options.picture is not None:
+            draw_colours(options.picture, unit, gel, [press for press in presses if press.is_whole])
         mm = (unit.width_mm or 0.0) / gel.shape[1]
         records = dict[str, dict[str, Any]]()
         if known and options.calibration:
@@ -375,10 +402,6 @@ def run(options: BallOptions) -> int:
             write_record(options.out, f"{unit.name}, {name}", record | {"mm_per_pixel": mm})
             shown = {key: value for key, value in record.items() if key != "each"}
             print(f"{unit.name}, {name}: {shown}")
-    if options.picture is not None:
-        width = max(sheet.shape[1] for sheet in sheets)
-        padded = [np.pad(sheet, ((0, 12), (0, width - sheet.shape[1]), (0, 0))) for sheet in sheets]
-        options.picture.write_bytes(encode(np.vstack(padded)))
     return 0
 
 

@@ -34,7 +34,7 @@ def mean(values: Array, count: Array | int | None = None) -> Array:
 def row_sums(x: Array) -> Array:
     """Return the sums (..., 1) of x (..., N) over its last axis.
 
-    On a CPU by a product with ones, into which XLA fuses what makes `x`. Its sums write `x` to memory first.
+    On a CPU it is a product with ones. XLA fuses what makes `x` into a product, but writes `x` to memory for a sum.
     """
     if jax.default_backend() != "cpu":
         return jnp.sum(x, axis=-1, keepdims=True)

@@ -263,7 +263,7 @@ def test_a_classifier_taught_by_touching(encoder, tmp_path, monkeypatch, capsys)
             camera.shape = name
             until(lambda about: about["contact"])
             order(do="record", object=name)
-            until(lambda about: about["recording"]["on"] and about["recording"]["written"] > 5)
+            until(lambda about: about["recording"]["on"] and about["recording"]["written"] > 12)  # the camera's round
             order(do="stop")
             camera.shape = ""
             until(lambda about: about["contact"] is False)

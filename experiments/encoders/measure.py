@@ -25,7 +25,7 @@ from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, normalise_touch
-from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE
+from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.sim import endless, scene
 from anytouch_jax.simulated import FIELDS, field_batch
 from anytouch_jax.train.mesh import enable_compilation_cache
@@ -135,30 +135,40 @@ def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], 
         batch = field_batch(key, touch, jnp.full((size, 1), row), config, size)
         out = jax.device_get(measure(params, normalise_touch(batch.clip), batch.sensor, batch.aspect))
         batch, width, stiff = jax.device_get((batch, touch.width[:, -1], touch.modulus[:, -1]))
-        touched, pixels = batch.pressure > TOUCHED, (slice(None), None, None)
-        depth, true = out.depth * width[pixels], batch.depth * width[pixels]
-        seen = out.contact > 0
-        enough = touched.sum((1, 2)) >= 8
-        share = (np.abs(depth - true) * touched).sum((1, 2)) / np.maximum(touched.sum((1, 2)), 1)
-        either = (seen | touched).sum((1, 2))
-        moved = touched & (np.linalg.norm(batch.shear, axis=-1) * width[pixels] > 0.1)
-        angle = np.degrees(np.abs(_angle(out.shear, batch.shear)))
-        scale = stiff * width**2 * 1e-3
-        force, real = out.force[:, 2] * scale, batch.force[:, 2] * scale
-        deviation = np.sqrt(2) * np.exp(5 * np.tanh(out.depth_log / 5)) * LENGTH * factors["depth"]
-        inside = np.abs(out.depth - batch.depth)[touched] < deviation[touched]
-        values = {
-            "depth": share[enough], "relative": (share / np.maximum(true.max((1, 2)), 1e-3))[enough],
-            "iou": ((seen & touched).sum((1, 2)) / np.maximum(either, 1))[enough], "inside": inside,
-            "force": (np.abs(force - real) / np.maximum(real, 0.05))[enough],
-        }  # fmt: skip
-        if frames > 1:
-            values["shear"] = angle[moved] < 20
+        values = touch_errors(out, batch, width, stiff, factors["depth"])
         for name, value in values.items():
             rows.setdefault(name, []).append(np.asarray(value, np.float64).ravel())
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
     medians = ("force",)
     return {name: float(np.median(v) if name in medians else v.mean()) for name, v in joined.items()}
+
+
+def touch_errors(
+    out: FieldOutput, batch: FieldBatch, width: np.ndarray, stiff: np.ndarray, factor: float = 1.0
+) -> dict[str, np.ndarray]:
+    """Return errors of what was read of touches, of gels that are `width` mm wide and `stiff` kPa.
+
+    A touch that shows fewer than 8 pixels of contact has no error of depth, overlap and force.
+    """
+    touched, pixels = batch.pressure > TOUCHED, (slice(None), None, None)
+    depth, true = out.depth * width[pixels], batch.depth * width[pixels]
+    seen = out.contact > 0
+    enough = touched.sum((1, 2)) >= 8
+    share = (np.abs(depth - true) * touched).sum((1, 2)) / np.maximum(touched.sum((1, 2)), 1)
+    either = (seen | touched).sum((1, 2))
+    scale = stiff * width**2 * 1e-3
+    force, real = out.force[:, 2] * scale, batch.force[:, 2] * scale
+    deviation = np.sqrt(2) * np.exp(5 * np.tanh(out.depth_log / 5)) * LENGTH * factor
+    inside = np.abs(out.depth - batch.depth)[touched] < deviation[touched]
+    values = {
+        "depth": share[enough], "relative": (share / np.maximum(true.max((1, 2)), 1e-3))[enough],
+        "iou": ((seen & touched).sum((1, 2)) / np.maximum(either, 1))[enough], "inside": inside,
+        "force": (np.abs(force - real) / np.maximum(real, 0.05))[enough],
+    }  # fmt: skip
+    if batch.clip.shape[1] > 1:
+        moved = touched & (np.linalg.norm(batch.shear, axis=-1) * width[pixels] > 0.1)
+        values["shear"] = np.degrees(np.abs(_angle(out.shear, batch.shear)))[moved] < 20
+    return values
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:

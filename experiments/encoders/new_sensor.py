@@ -1,16 +1,16 @@
-"""A known sensor as if it was new: fitted from pictures of one device, adapted by simulation, asked for look-alikes.
+"""A known sensor as if it was new: fitted from pictures of one device, adapted by simulation, then asked.
 
-    python -m experiments.encoders.new_sensor anytouch-tiny --minutes 8
+    python -m experiments.encoders.new_sensor anytouch-tiny --minutes 4
 
 A simulated device of DIGIT, GelSlim and 9DTact has hidden parameters. Its tokens are trained on simulated touches of
 the fitted sensor alone. Then the device itself, of the hidden parameters, touches held-out objects: which of some 150
-touches by other sensors is the same? The parts of the encoder that all sensors share have met the sensor in training.
+touches by other sensors is the same, how deep, and how hard? A GelSight Mini is fitted to real pictures, and asked for
+real objects. The parts of the encoder that all sensors share have met every sensor in training.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import shutil
 import time
@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.config import UNIVERSAL
+from anytouch_jax.data.images import decode
 from anytouch_jax.encoder.adapt import save
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import CheckError
@@ -34,11 +35,18 @@ from anytouch_jax.fitting.touches import COUNT, SIZE, own_world
 from anytouch_jax.sim import endless
 from anytouch_jax.sim.endless import CAMERAS, Sampling
 from anytouch_jax.sim.sensing.sensors import SENSORS, draw_unit
+from anytouch_jax.simulated import FIELDS, field_batch, prepared
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.benchmarks import machine
+from experiments.encoders.measure import subtracted, touch_errors
+from experiments.real import recordings
+from experiments.real.features import encoder_features
+from experiments.real.scores import other_finger_score
 from experiments.records import write_record
 
-HIDDEN = ("digit", "gelslim", "9dtact")
+HIDDEN, REAL = ("digit", "gelslim", "9dtact"), "gelsight_mini"
+PICTURES = 18  # to fit a sensor to
+PRESSED = 7.0  # score of contact, above which it is mostly visible
 BATCHES = 8
 
 
@@ -50,7 +58,35 @@ def device_touches(key: Any, world: Any, unit: Any, sampling: Sampling) -> Any:
     numbers = jax.tree.map(lambda old, one: old.at[:, 1].set(one[0]), drawn.numbers, world.families)
     take = jax.vmap(jax.vmap(partial(endless.simulate_take, sampling=sampling)))
     out = take(drawn.clip._replace(unit=own), numbers, drawn.pitch)
-    return out.image[:, :, 0], out.background, drawn.sensor, drawn.object
+    field = numbers.field
+    return endless.SimulatedTouches(
+        out.image, out.background, drawn.sensor, drawn.object, drawn.photo, out.field[:, :, -1],
+        field[..., 1] * own.zoom, jnp.log(field[..., 0] / field[..., 1]), numbers.gel[..., 0], out.labels,
+    )  # fmt: skip
+
+
+def adapted_to(
+    encoder: Encoder, pictures: list[np.ndarray], gel: np.ndarray, width_mm: float, name: str, folder: Path,
+    minutes: float, seed: int, ball_mm: float | None = None,
+) -> tuple[Encoder, str, dict[str, Any]]:  # fmt: skip
+    """Return an encoder with tokens for the sensor of these pictures, the name of the tokens, and how it was fitted.
+
+    Tokens that find fewer touches than the universal ones are refused: then the universal ones stay.
+    """
+    mine, run = folder / f"my_{name}.sensor", folder / f"run_{name}"
+    begun = time.monotonic()
+    fitted = fit_sensor(pictures, f"new_{name.strip('9')}_unit", width_mm, mine, background=gel, ball_mm=ball_mm)
+    about: dict[str, Any] = {"fit_seconds": time.monotonic() - begun, "simulated": None}
+    known = tuple(other for other in CAMERAS if other != name)
+    try:
+        adapted = adapt_by_simulation(encoder.source, mine, minutes=minutes, known=known, seed=seed)
+    except CheckError:
+        return encoder, UNIVERSAL, about
+    assert adapted is not None
+    shutil.rmtree(run, ignore_errors=True)
+    save(adapted, encoder.source, run)
+    about["simulated"] = [len(adapted.losses), adapted.before, adapted.after]
+    return load_encoder(run, engine="xla"), fitted.numbers.name, about
 
 
 def study(
@@ -62,55 +98,82 @@ def study(
     device = draw_unit(SENSORS[name], rng)
     device = device._replace(mirror=np.ones(2, np.float32), base=endless.untouched(SENSORS[name])[0],
                              offset=np.zeros(2, np.float32), rotation=np.float32(0))  # fmt: skip
-    unit = jax.tree.map(jnp.asarray, device)
-    touches = partial(device_touches, unit=unit, sampling=Sampling(takes=2, size=SIZE))
+    sampling = Sampling(takes=2, size=SIZE, fields=FIELDS)
+    touches = partial(device_touches, unit=jax.tree.map(jnp.asarray, device), sampling=sampling)
     root = jax.random.key(seed)
     own = partial(own_world, known=known)
-    image, behind, *_ = jax.device_get(touches(jax.random.fold_in(root, 1), own(name, "train", ball_mm=ball_mm)))
+    first = jax.device_get(touches(jax.random.fold_in(root, 1), own(name, "train", ball_mm=ball_mm)))
     height, width = (round(SIZE * side / min(SENSORS[name].field)) for side in SENSORS[name].field)
-    shown = [cv2.resize(one, (width, height)) for one in (behind[0, 1], *image[:18, 1])]
-    mine, run = folder / f"my_{name}.sensor", folder / f"run_{name}"
-    begun = time.monotonic()
-    fitted = fit_sensor(shown[1:], f"new_{name.strip('9')}_unit", float(SENSORS[name].field[1] * device.zoom), mine,
-                        background=shown[0], ball_mm=ball_mm)  # fmt: skip
-    seconds = time.monotonic() - begun
-    after, own_name, simulated = encoder, UNIVERSAL, None
-    with contextlib.suppress(CheckError):  # the tokens were refused: the universal ones stay
-        adapted = adapt_by_simulation(encoder.source, mine, minutes=minutes, known=known, seed=seed)
-        assert adapted is not None
-        shutil.rmtree(run, ignore_errors=True)
-        save(adapted, encoder.source, run)
-        after, own_name = load_encoder(run, engine="xla"), fitted.numbers.name
-        simulated = [len(adapted.losses), adapted.before, adapted.after]
-    rows = {"universal": encoder.config.model.universal_row, "own": encoder.sensor_row(name)}
-    test, parts = own(name, "test"), []
+    seen = (first.background[0, 1], *first.clip[:PICTURES, 1, -1])
+    gel, *pictures = (cv2.resize(one, (width, height)) for one in seen)
+    width_mm = float(SENSORS[name].field[1] * device.zoom)
+    after, own_name, about = adapted_to(encoder, pictures, gel, width_mm, name, folder, minutes, seed, ball_mm)
+    rows = {
+        "universal": (encoder, encoder.config.model.universal_row), "adapted": (after, after.sensor_row(own_name)),
+        "own": (encoder, encoder.sensor_row(name)),
+    }  # fmt: skip
+    test, parts, errors = own(name, "test"), [], {kind: list[dict[str, np.ndarray]]() for kind in rows}
+    config = subtracted(encoder.config)
     for number in range(BATCHES):
-        image, behind, sensor, thing = jax.device_get(touches(jax.random.fold_in(root, 100 + number), test))
-        use = sensor[:, 0] > 0
-        ready = np.stack([encoder.prepare(a, b) for a, b in zip(image[use].reshape(-1, *image.shape[2:]),
-                          behind[use].reshape(-1, *behind.shape[2:]), strict=True)])  # fmt: skip
-        other = [encoder.sensor_row(known[n - 1]) for n in sensor[use][:, 0]]
-        features = {"target": encoder.encode_touch(ready[::2], np.array(other, np.int32))}
-        for kind, row in rows.items():
-            features[kind] = encoder.encode_touch(ready[1::2], np.full(use.sum(), row, np.int32))
-        features["adapted"] = after.encode_touch(ready[1::2], own_name)
-        parts.append(features | {"object": thing[use]})
+        key = jax.random.fold_in(root, 100 + number)
+        found = touches(key, test)
+        batch = jax.device_get(field_batch(key, found, jnp.zeros((COUNT, 2), jnp.int32), config, COUNT))
+        found = jax.device_get(found)
+        use = found.sensor[:, 0] > 0
+        known_clip = prepared(key, found.clip[:, 0], found.background[:, 0], config, jitter=False)
+        other = [encoder.sensor_row(known[n - 1]) for n in found.sensor[use][:, 0]]
+        features = {"target": encoder.encode_touch(np.asarray(known_clip)[use], np.array(other, np.int32))}
+        for kind, (reader, row) in rows.items():
+            numbers = np.full(COUNT, row, np.int32)
+            features[kind] = reader.encode_touch(batch.clip, numbers)[use]
+            out = reader.encode_and_measure(batch.clip, numbers, batch.aspect)[1]
+            errors[kind].append(touch_errors(out, batch, found.width[:, 1], found.modulus[:, 1]))
+        parts.append(features | {"object": found.object[use]})
     joined = {kind: np.concatenate([part[kind] for part in parts]) for kind in parts[0]}
     objects = joined.pop("object")
     unit_norm = {kind: values / np.linalg.norm(values, axis=1, keepdims=True) for kind, values in joined.items()}
     target = unit_norm.pop("target")
     right = {kind: (z @ target.T).argmax(1) == np.arange(len(z)) for kind, z in unit_norm.items()}
-    return {
-        "touches": len(target), "fit_seconds": seconds, "simulated": simulated,
+    return about | {
+        "touches": len(target),
         "scores": {kind: {"share": float(one.mean()), "interval": mean_interval(one.astype(float), objects)}
                    for kind, one in right.items()},
+        "depth": {kind: _mean(of, "depth") for kind, of in errors.items()},
+        "force": {kind: _mean(of, "force") for kind, of in errors.items()},
     }  # fmt: skip
+
+
+def _mean(errors: list[dict[str, np.ndarray]], name: str) -> dict[str, Any]:
+    values = np.concatenate([one[name] for one in errors]).astype(float)
+    return {"share": float(values.mean()), "interval": mean_interval(values, np.arange(len(values)))}
+
+
+def real_study(encoder: Encoder, pack: Path, folder: Path, minutes: float, seed: int) -> dict[str, Any]:
+    """Return scores on real objects of a GelSight Mini whose look is fitted to its real pictures of training."""
+    data = recordings.read(pack)
+    score = data.manifest.number_column("label.contact_score")
+    pressed = np.flatnonzero((data.split == "train") & (data.finger == "cam0") & (score > PRESSED))
+    gel_name = data.manifest.text_column("background_path")
+    pressed = pressed[gel_name[pressed] == np.unique(gel_name[pressed])[-1]]
+    chosen = np.random.default_rng(seed).choice(pressed, PICTURES, replace=False)
+    gel = data.gels.shared(lambda picture: picture)(chosen[0])
+    assert gel is not None
+    pictures = [decode(data.manifest.file(row)) for row in chosen]
+    width_mm = SENSORS[REAL].field[1]
+    after, own_name, about = adapted_to(encoder, pictures, gel, width_mm, REAL, folder, minutes, seed)
+    rows = {"universal": (encoder, UNIVERSAL), "adapted": (after, own_name), "own": (encoder, REAL)}
+    found = {
+        kind: other_finger_score(encoder_features(reader, data, sensor=name), data)
+        for kind, (reader, name) in rows.items()
+    }
+    return about | {"scores": {kind: {"share": one.share, "interval": one.interval()} for kind, one in found.items()}}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model")
-    parser.add_argument("--sensors", nargs="*", default=HIDDEN, choices=CAMERAS)
+    parser.add_argument("--sensors", nargs="*", default=(*HIDDEN, REAL), choices=(*HIDDEN, REAL))
+    parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"), help="real recordings")
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--ball-mm", type=float, help="press a ball instead of all kinds of objects")
     parser.add_argument("--seed", type=int, default=0)
@@ -121,8 +184,12 @@ def main() -> None:
     encoder = load_encoder(options.model, engine="xla")
     about = {"encoder": encoder.fingerprint, "machine": dataclasses.asdict(machine.describe())}
     for name in options.sensors:
-        record = study(encoder, name, options.folder, options.minutes, options.seed, options.ball_mm)
-        key = f"{name}, {'presses of a ball' if options.ball_mm else 'presses of objects'}"
+        if name == REAL:
+            key = f"{name}, real objects by the other finger"
+            record = real_study(encoder, options.data, options.folder, options.minutes, options.seed)
+        else:
+            key = f"{name}, {'presses of a ball' if options.ball_mm else 'presses of objects'}"
+            record = study(encoder, name, options.folder, options.minutes, options.seed, options.ball_mm)
         write_record(options.out, key, about | {"minutes": options.minutes} | record)
         print(name, record, flush=True)
 

@@ -111,18 +111,24 @@ def lookalikes(folder: Path) -> Page:
 
 
 def new_sensor(folder: Path) -> Page:
-    """Look-alikes asked by a known sensor as if it was new."""
+    """Look-alikes, real objects, depth and force asked by a known sensor as if it was new."""
     kinds = {"universal": "universal tokens", "adapted": "adapted by simulation", "own": "its own tokens"}
-    rows, gains, apart = [], [], False
+    rows, gains = [], []
+
+    def value(record: Record, part: str, kind: str, unit: float) -> Value | None:
+        one = record.get(part, {}).get(kind)
+        return one and Value(one["share"], *one["interval"]).times(unit)
+
     for key, record in read_records(folder / "new_sensor.jsonl").items():
-        scores = {kind: percent([one["share"], *one["interval"]]) for kind, one in record["scores"].items()}
-        apart |= max(one.low or 0 for one in scores.values()) > min(one.high or 0 for one in scores.values())
         steps = record["simulated"][0] if record["simulated"] else 0
-        rows += [(key, words, steps if kind == "adapted" else None, scores[kind]) for kind, words in kinds.items()]
+        for kind, words in kinds.items():
+            values = [value(record, part, kind, unit) for part, unit in (("scores", 100), ("depth", 1), ("force", 100))]
+            rows.append((key, words, steps if kind == "adapted" else None, *values))
+        found = {kind: value(record, "scores", kind, 100) for kind in kinds}
         refused = "" if steps else " (refused: the universal tokens stay)"
-        gains.append(f"{key}: {scores['universal'].mean:.0f} % with universal tokens, {scores['adapted'].mean:.0f} % "
-                     f"adapted{refused}, {scores['own'].mean:.0f} % with its own.")  # fmt: skip
-    return Page("new_sensor", [rows], gains if apart else ["No difference is shown: the intervals overlap."])
+        gains.append(f"{key}: {found['universal'].mean:.0f} % with universal tokens, {found['adapted'].mean:.0f} % "
+                     f"adapted{refused}, {found['own'].mean:.0f} % with its own.")  # fmt: skip
+    return Page("new_sensor", [rows], gains)
 
 
 def trust(folder: Path) -> Page:

@@ -13,10 +13,13 @@ from anytouch_jax.train.progress import silent
 from experiments.real.recordings import Recordings
 
 
-def encoder_features(encoder: Encoder, data: Recordings) -> np.ndarray:
-    """Return the class token and the mean of the patch tokens (n, 2E), each with unit variance over train frames."""
-    rows = np.arange(len(data.manifest))
-    x = embed_rows(encoder, data.manifest, rows, pooling="both", gels=data.gels, log=silent)[1]
+def encoder_features(encoder: Encoder, data: Recordings, sensor: str | None = None) -> np.ndarray:
+    """Return the class token and the mean of the patch tokens (n, 2E), each with unit variance over train frames.
+
+    With `sensor` all frames get the tokens of that sensor.
+    """
+    rows, row = np.arange(len(data.manifest)), None if sensor is None else encoder.sensor_row(sensor)
+    x = embed_rows(encoder, data.manifest, rows, pooling="both", sensor_row=row, gels=data.gels, log=silent)[1]
     fit = x[data.split == "train"]
     return np.asarray((x - fit.mean(0)) / (fit.std(0) + 1e-6), np.float32)
 

@@ -19,7 +19,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,14 +74,14 @@ class Unit(NamedTuple):
     presses: dict[float, str]  # radius of the ball in mm (NaN: unknown), and the pattern of its pictures
     width_mm: float | None
     radii: tuple[int, int] | None  # pixels of a contact circle at least and at most, or None: it has no sharp rim
-    others: tuple[str, ...] = ()  # sensors that it is also read as
+    fitted: float | None = None  # of this ball every second press fitted the colours of the simulated sensor
 
 
 # The source's own configuration gives 0.0634 mm a pixel: https://github.com/rpl-cmu/gelslam, config.yaml (ppmm).
 UNITS = (
     Unit("GelSight Mini", "gelsight_mini", "gelslam-gelsight_mini/background.png",
          {3.155: "gelslam-gelsight_mini/6.310mm/*.png", 4.75: "gelslam-gelsight_mini/9.500mm/*.png"},
-         320 * 0.0634, (20, 48), ("gelsight",)),
+         320 * 0.0634, (20, 48), 3.155),
     Unit("9DTact", "9dtact", "9dtact-9dtact/sensor_1/ref.png",
          {float("nan"): "9dtact-9dtact/sensor_1/ball_press.png"}, None, (40, 200)),
     Unit("GelSlim, gel a", "gelslim", "nc/mcubelab_gelslim-gelslim3/gel_a_ball/ref.jpg",
@@ -390,14 +389,18 @@ def run(options: BallOptions) -> int:
         if known and options.calibration:
             for kind in ("polynomial", "network"):
                 records[f"calibration, {kind}"] = record_of(calibrated_depths(kind, gel, presses, mm), presses, mm)
-        for (name, encoder), sensor in product(encoders.items(), (unit.sensor, *unit.others)):
-            depths, deviations, areas = measured_depths(encoder, unit._replace(sensor=sensor), gel, presses)
-            width = encoder.measure(presses[0].frame, gel, sensor, width_mm=unit.width_mm).width_mm
+        fresh = [number for number, press in enumerate(presses) if number % 2 or press.ball != unit.fitted]
+        for name, encoder in encoders.items():
+            depths, deviations, areas = measured_depths(encoder, unit, gel, presses)
+            width = encoder.measure(presses[0].frame, gel, unit.sensor, width_mm=unit.width_mm).width_mm
             mm = (width or 1.0) / gel.shape[1]
             circles = np.array([np.pi * (mm * press.radius) ** 2 for press in presses])
             record = (record_of if known else unknown_record)(depths, presses, mm)
             record |= {"area_over_circle": interval(areas / circles), "centre_std": interval(deviations)}
-            records[name if sensor == unit.sensor else f"{name} read as {sensor}"] = record
+            records[name] = record
+            if unit.fitted is not None:
+                some = record_of([depths[n] for n in fresh], [presses[n] for n in fresh], mm)
+                records[f"{name}, presses that fitted no colours"] = some
         for name, record in records.items():
             write_record(options.out, f"{unit.name}, {name}", record | {"mm_per_pixel": mm})
             shown = {key: value for key, value in record.items() if key != "each"}

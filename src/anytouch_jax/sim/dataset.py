@@ -32,7 +32,7 @@ from anytouch_jax.sim.world import objects
 
 MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
 GROUP = 8  # touches in a part
-VERSION = 6  # a change of the simulator that changes the data of a seed raises it
+VERSION = 7  # a change of the simulator that changes the data of a seed raises it
 Row = dict[str, Any]
 
 

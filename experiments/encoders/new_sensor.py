@@ -5,7 +5,10 @@
 A simulated device of DIGIT, GelSlim and 9DTact has hidden parameters. Its tokens are trained on simulated touches of
 the fitted sensor alone. Then the device itself, of the hidden parameters, touches held-out objects: which of some 150
 touches by other sensors is the same, how deep, and how hard? A GelSight Mini is fitted to real pictures, and asked for
-real objects. The parts of the encoder that all sensors share have met every sensor in training.
+real objects. The parts of the encoder that all sensors share have met every sensor in training. But those of
+commit 7546a43 had not met the colours that a GelSight Mini has now:
+
+    python -m experiments.encoders.new_sensor WEIGHTS --sensors gelsight_mini --ball-mm 6.31 --title "colours unseen"
 """
 
 from __future__ import annotations
@@ -172,7 +175,8 @@ def real_study(encoder: Encoder, pack: Path, folder: Path, minutes: float, seed:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model")
-    parser.add_argument("--sensors", nargs="*", default=(*HIDDEN, REAL), choices=(*HIDDEN, REAL))
+    parser.add_argument("--sensors", nargs="*", default=(*HIDDEN, "real"), choices=(*HIDDEN, REAL, "real"))
+    parser.add_argument("--title", default="", help="of the encoder in the table, where it is not that of the package")
     parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"), help="real recordings")
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--ball-mm", type=float, help="press a ball instead of all kinds of objects")
@@ -184,12 +188,13 @@ def main() -> None:
     encoder = load_encoder(options.model, engine="xla")
     about = {"encoder": encoder.fingerprint, "machine": dataclasses.asdict(machine.describe())}
     for name in options.sensors:
-        if name == REAL:
-            key = f"{name}, real objects by the other finger"
+        if name == "real":
+            key = f"{REAL}, real objects by the other finger"
             record = real_study(encoder, options.data, options.folder, options.minutes, options.seed)
         else:
             key = f"{name}, {'presses of a ball' if options.ball_mm else 'presses of objects'}"
             record = study(encoder, name, options.folder, options.minutes, options.seed, options.ball_mm)
+        key += f", {options.title}" * bool(options.title)
         write_record(options.out, key, about | {"minutes": options.minutes} | record)
         print(name, record, flush=True)
 

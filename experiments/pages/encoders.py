@@ -85,8 +85,10 @@ def measure(folder: Path) -> Page:
     low, high = (bound(row[1] for row in rows) for bound in (min, max))
     findings = [
         f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
-        "Real balls: a calibration of the unit is better. As a GelSight Mini they read too flat: its simulated colours "
-        "are full at a slope of 0.3, and real ones grow on. Those of a GelSight do too, so its name is better here.",
+        *(
+            f"{name}: the radius is off by {100 * one['radius'][0]:.0f} %, the centre by {one['centre'][0]:.2f} mm."
+            for name, one in balls.items()
+        ),
     ]
     answer = "On new simulated units the depth in contact is off by this much."
     return Page("measure", [real, rows], findings, (answer, f"{low:.2f} to {high:.2f} mm"))

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import shutil
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,9 +47,7 @@ from experiments.real.scores import other_finger_score
 from experiments.records import write_record
 
 HIDDEN, REAL = ("digit", "gelslim", "9dtact"), "gelsight_mini"
-PICTURES = 18  # to fit a sensor to
-PRESSED = 7.0  # score of contact, above which it is mostly visible
-BATCHES = 8
+PICTURES, PRESSED, BATCHES = 18, 7.0, 8  # to fit a sensor to; their least score of contact; of touches
 
 
 @partial(jax.jit, static_argnames="sampling")
@@ -77,9 +74,8 @@ def adapted_to(
     Tokens that find fewer touches than the universal ones are refused: then the universal ones stay.
     """
     mine, run = folder / f"my_{name}.sensor", folder / f"run_{name}"
-    begun = time.monotonic()
     fitted = fit_sensor(pictures, f"new_{name.strip('9')}_unit", width_mm, mine, background=gel, ball_mm=ball_mm)
-    about: dict[str, Any] = {"fit_seconds": time.monotonic() - begun, "simulated": None}
+    about: dict[str, Any] = {"simulated": None}
     known = tuple(other for other in CAMERAS if other != name)
     try:
         adapted = adapt_by_simulation(encoder.source, mine, minutes=minutes, known=known, seed=seed)
@@ -115,11 +111,10 @@ def study(
         "universal": (encoder, encoder.config.model.universal_row), "adapted": (after, after.sensor_row(own_name)),
         "own": (encoder, encoder.sensor_row(name)),
     }  # fmt: skip
-    test, parts, errors = own(name, "test"), [], {kind: list[dict[str, np.ndarray]]() for kind in rows}
-    config = subtracted(encoder.config)
+    test, config, parts = own(name, "test"), subtracted(encoder.config), []
+    errors = {kind: list[dict[str, np.ndarray]]() for kind in rows}
     for number in range(BATCHES):
-        key = jax.random.fold_in(root, 100 + number)
-        found = touches(key, test)
+        found = touches(key := jax.random.fold_in(root, 100 + number), test)
         batch = jax.device_get(field_batch(key, found, jnp.zeros((COUNT, 2), jnp.int32), config, COUNT))
         found = jax.device_get(found)
         use = found.sensor[:, 0] > 0
@@ -147,7 +142,7 @@ def study(
 
 
 def _mean(errors: list[dict[str, np.ndarray]], name: str) -> dict[str, Any]:
-    values = np.concatenate([one[name] for one in errors]).astype(float)
+    values = np.concatenate([one[name] for one in errors], dtype=float)
     return {"share": float(values.mean()), "interval": mean_interval(values, np.arange(len(values)))}
 
 
@@ -156,13 +151,12 @@ def real_study(encoder: Encoder, pack: Path, folder: Path, minutes: float, seed:
     data = recordings.read(pack)
     score = data.manifest.number_column("label.contact_score")
     pressed = np.flatnonzero((data.split == "train") & (data.finger == "cam0") & (score > PRESSED))
-    gel_name = data.manifest.text_column("background_path")
-    pressed = pressed[gel_name[pressed] == np.unique(gel_name[pressed])[-1]]
+    gel_name = data.manifest.text_column("background_path")[pressed]
+    pressed = pressed[gel_name == np.unique(gel_name)[-1]]
     chosen = np.random.default_rng(seed).choice(pressed, PICTURES, replace=False)
     gel = data.gels.shared(lambda picture: picture)(chosen[0])
     assert gel is not None
-    pictures = [decode(data.manifest.file(row)) for row in chosen]
-    width_mm = SENSORS[REAL].field[1]
+    pictures, width_mm = [decode(data.manifest.file(row)) for row in chosen], SENSORS[REAL].field[1]
     after, own_name, about = adapted_to(encoder, pictures, gel, width_mm, REAL, folder, minutes, seed)
     rows = {"universal": (encoder, UNIVERSAL), "adapted": (after, own_name), "own": (encoder, REAL)}
     found = {

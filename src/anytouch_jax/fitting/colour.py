@@ -36,7 +36,7 @@ ROUNDS = (0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.
 FEATURES = len(POWERS) * len(PLACES)
 # Root mean square of the slope of the gel, where its change is above a quarter of the strongest, and of its depth there
 # in mm, which give the right strength on average over simulated units. They set the scale where no ball does.
-USUAL_TILT, USUAL_DEPTH = 0.19, 0.27
+USUAL_TILT, USUAL_DEPTH = 0.21, 0.27
 UNSURE = "Without a ball the strength is a usual one, which differs by {} (deviation over known sensors): edit contrast"
 
 

@@ -56,13 +56,7 @@ def device_touches(key: Any, world: Any, unit: Any, sampling: Sampling) -> Any:
     drawn = endless.draw_touches(key, world, sampling, COUNT, 0)
     own = jax.tree.map(lambda old, one: old.at[:, 1].set(one), drawn.clip.unit, unit)
     numbers = jax.tree.map(lambda old, one: old.at[:, 1].set(one[0]), drawn.numbers, world.families)
-    take = jax.vmap(jax.vmap(partial(endless.simulate_take, sampling=sampling)))
-    out = take(drawn.clip._replace(unit=own), numbers, drawn.pitch)
-    field = numbers.field
-    return endless.SimulatedTouches(
-        out.image, out.background, drawn.sensor, drawn.object, drawn.photo, out.field[:, :, -1],
-        field[..., 1] * own.zoom, jnp.log(field[..., 0] / field[..., 1]), numbers.gel[..., 0], out.labels,
-    )  # fmt: skip
+    return endless.simulate_drawn(drawn._replace(clip=drawn.clip._replace(unit=own), numbers=numbers), sampling)
 
 
 def adapted_to(

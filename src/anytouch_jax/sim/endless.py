@@ -187,8 +187,12 @@ def sample_touches(
 
     The second take is by the family `gallery`, if given. A key gives the same touches on one machine.
     """
-    drawn = draw_touches(key, world, sampling, count, gallery)
-    out = jax.vmap(jax.vmap(partial(simulate_take, sampling=sampling)))(drawn.clip, drawn.numbers, drawn.pitch)
+    return simulate_drawn(draw_touches(key, world, sampling, count, gallery), sampling)
+
+
+def simulate_drawn(drawn: DrawnTouches, sampling: Sampling) -> SimulatedTouches:
+    """Return what `sample_touches` returns of drawn touches."""
+    out = jax.vmap(jax.vmap(partial(_simulate_take, sampling=sampling)))(drawn.clip, drawn.numbers, drawn.pitch)
     field = drawn.numbers.field
     fields = None if out.field is None else out.field[:, :, -1]
     return SimulatedTouches(
@@ -206,7 +210,7 @@ def draw_touches(
     return jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
 
 
-def simulate_take(clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling: Sampling) -> ClipOutput:
+def _simulate_take(clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling: Sampling) -> ClipOutput:
     """Return the simulated clip of one take by a sensor of these numbers, on a grid of `pitch` mm."""
     side = (sampling.field_size, sampling.field_size)
     view = View((GRID, GRID), pitch, (sampling.size, sampling.size), numbers.photometry, True, side)

@@ -2,7 +2,8 @@
 
 `looks.npz` has the untouched gels of camera sensors and the colours of their dents (`experiments/results/tried.md`).
 GelSight, GelSight Mini, DIGIT and 9DTact look like real units. The colours of the Mini are fitted to 17 presses of a
-ball of 6.31 mm (GelSLAM) by `fitting.fit`. GelSlim and DuraGel are a few lights each, set by eye.
+ball of 6.31 mm (GelSLAM) by `fitting.fit`. Its `contrast` makes simulated balls as strong as real ones. GelSlim and
+DuraGel are a few lights each, set by eye.
 Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field and has no image.
 """
 

@@ -1,9 +1,10 @@
 """Deviations and errors of the depth, shear, contact and force that an encoder reads.
 
-    python -m experiments.encoders.measure calibrate runs/anytouch-tiny/anytouch-tiny
+    python -m experiments.encoders.measure train anytouch-tiny --minutes 75 --out runs/anytouch-tiny
+    python -m experiments.encoders.measure calibrate runs/anytouch-tiny
     python -m experiments.encoders.measure test anytouch-tiny
 
-`calibrate` scales the deviations on objects of the validation split, and writes the folder again. `test` measures
+`train` trains the decoder alone, so features stay as they are. `calibrate` scales the deviations on objects of the validation split, and writes the folder again. `test` measures
 errors on objects of the test split, by sensor, and writes `measure.jsonl`. Both see new units of the sensors only.
 """
 
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -24,10 +26,11 @@ import numpy as np
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.nn.functional import build
-from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, normalise_touch
+from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
 from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.sim import endless, scene
-from anytouch_jax.simulated import FIELDS, field_batch
+from anytouch_jax.simulated import FIELDS, field_batch, moved_gel
+from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.progress import to_stderr as log
 from anytouch_jax.weights.load import load_model
@@ -36,6 +39,11 @@ from experiments.benchmarks import machine
 from experiments.records import write_record
 
 UNIVERSAL = 0.25  # share of the touches that get the universal tokens
+SETTINGS: dict[str, Any] = {
+    "data.background": "either", "data.batch_size": 24, "optim.learning_rate": 3e-4, "optim.warmup": 40,
+    "optim.grad_clip": 1.0, "optim.weight_decay": 0.0, "run.steps": 100_000, "run.save_every": 0, "run.keep": 1,
+    "run.figure_every": 0,
+}  # fmt: skip
 QUANTITIES = ("depth", "shear", "normal", "tangential", "torque", "slip")
 
 
@@ -51,7 +59,9 @@ def world_of(split: Any, variants: int = 1) -> endless.World:
     return jax.device_put(endless.make_world(endless.objects_of(scenes, split, variants=variants), settings.sensors))
 
 
-def batches(world: endless.World, config: Config, count: int, seed: int, **options: float) -> Iterator[FieldBatch]:
+def batches(
+    world: endless.World, config: Config, count: int, seed: int, *, moved: bool = False, first: int = 0, **options: float
+) -> Iterator[FieldBatch]:
     """Yield batches with normalised pixels and sensor rows: three of stills, which cost less, then one of clips."""
     rows = np.array(
         [config.model.sensor_row(name) for name in SimulatedConfig().sensors] + [config.model.universal_row]
@@ -61,12 +71,14 @@ def batches(world: endless.World, config: Config, count: int, seed: int, **optio
     def make(key: jax.Array, world: endless.World, frames: int) -> FieldBatch:
         draw, prepare, toss = jax.random.split(key, 3)
         touches = endless.sample_touches(draw, world, sampling(frames, **options), count)
+        if moved:
+            touches = moved_gel(jax.random.fold_in(key, 7), touches)
         batch = field_batch(prepare, touches, jnp.asarray(rows)[touches.sensor], config, count)
         own = jax.random.uniform(toss, (count,)) >= UNIVERSAL
         sensor = jnp.where(own, batch.sensor, config.model.universal_row)
         return batch._replace(clip=normalise_touch(batch.clip), sensor=sensor)
 
-    number = 0
+    number = first
     while True:
         frames = config.model.frames if number % 4 == 3 else 1
         yield make(jax.random.fold_in(jax.random.key(seed), number), world, frames)
@@ -86,6 +98,32 @@ def calibrate(folder: Path) -> None:
     full = dataclasses.replace(loaded, config=config, metadata={**loaded.metadata, "fields": factors})
     notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
     write_encoder(folder, full, notes, parts=(*PARTS, "fields"))
+
+
+def train(model: str, minutes: float, out: Path) -> None:
+    """Train the decoder on endless touches and untouched gels that moved a little, and write the encoder to `out`."""
+    path = locate(model)
+    loaded = load_model(path)
+    config, net = loaded.config.with_settings(SETTINGS), build(loaded.config.model)
+    touch, world = jax.device_put(loaded.params["touch"]), world_of("train", 2)
+
+    def stream(start: int, stop: int) -> Iterator[tuple[int, Any, dict[str, Any]]]:
+        source = batches(world, config, config.data.batch_size, 62, moved=True, first=start, wild=0.2, free=0.15)
+        for step in range(start, stop):
+            yield step, (next(source), touch), {}
+
+    def loss(params: Any, batch: Any, key: Any, progress: Any) -> tuple[Any, dict[str, Any]]:
+        touches, frozen = batch
+        return field_terms(params | {"touch": frozen}, touches, net=net)
+
+    params, until = {"fields": loaded.params["fields"]}, time.monotonic() + 60 * minutes
+    result = fit(config, params=params, loss_fn=loss, batches=stream, run_dir=out.with_name("run"), until=until, log=log)
+    log(f"{result.step} steps of {config.data.batch_size}, {result.metrics}")
+    card = parse_json((path.parent / "config.json").read_text())
+    config = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings({"run.steps": card["steps"]})
+    full = dataclasses.replace(loaded, params=loaded.params | jax.device_get(result.params), config=config)
+    notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
+    write_encoder(out, full, notes, parts=(*PARTS, "fields"), tokenizer=path.parent / "tokenizer.json")
 
 
 def subtracted(config: Config) -> Config:
@@ -192,6 +230,10 @@ def test(model: Path, out: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
+    zeroth = commands.add_parser("train", help="train the decoder of an encoder")
+    zeroth.add_argument("model", type=Path)
+    zeroth.add_argument("--minutes", type=float, default=75.0)
+    zeroth.add_argument("--out", type=Path, required=True, help="folder to write, named as the encoder")
     first = commands.add_parser("calibrate", help="scale the deviations of an encoder's folder")
     first.add_argument("model", type=Path)
     second = commands.add_parser("test", help="measure errors on objects that training never touched")
@@ -199,7 +241,9 @@ def main() -> None:
     second.add_argument("--out", type=Path, default=Path("experiments/results/measure.jsonl"))
     given = parser.parse_args()
     enable_compilation_cache()
-    if given.command == "calibrate":
+    if given.command == "train":
+        train(str(given.model), given.minutes, given.out)
+    elif given.command == "calibrate":
         calibrate(given.model)
     else:
         test(given.model, given.out)

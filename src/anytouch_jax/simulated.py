@@ -39,6 +39,8 @@ MOST_PIXELS = 4_000_000_000  # bytes of real frames that are kept on the device
 FIELD_SHARE = 0.5  # of a batch's touches: those whose fields are learned
 FIELDS = ("displacement", "shear", "pressure")
 SUBTRACTED = 0.7  # share of touches whose background is subtracted with --data.background either
+# Largest deviation, in pixels, of the place of a gel since its picture: 0.2 on still recordings of a GelSight Mini.
+MOVED = 0.5
 Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 
@@ -303,6 +305,7 @@ def _assemble(
     """Return the batch of a step from simulated touches and the real frames."""
     count, missing = len(touches.object), config.data.batch_size - len(touches.object)
     sensor = jnp.asarray(rows)[touches.sensor]
+    touches = moved_gel(jax.random.fold_in(key, 7), touches)
     keys = jax.random.split(key, 6)
     takes = [
         _Touches(prepared(keys[m], touches.clip[:, m], touches.background[:, m], config), sensor[:, m])
@@ -424,6 +427,19 @@ def prepared(key: Array, clip: Array, background: Array, config: Config, *, jitt
         gain, colour, level = jax.random.normal(light, (3, *size))
         x = x * jnp.exp(0.15 * gain[..., :1] + 0.08 * colour) + 3.0 * level
     return jnp.round(jnp.clip(x + UNTOUCHED, 0, 255)).astype(jnp.uint8)
+
+
+def moved_gel(key: Array, touches: SimulatedTouches, most: float = MOVED) -> SimulatedTouches:
+    """Return touches whose backgrounds are shifted by fractions of a pixel: a gel gives way in its mount."""
+    share, to = jax.random.split(key)
+    size = touches.background.shape[:2]
+    shift = most * jax.random.uniform(share, (*size, 1)) * jax.random.normal(to, (*size, 2))
+
+    def moved(picture: Array, by: Array) -> Array:
+        picture = picture.astype(jnp.float32)
+        return jax.image.scale_and_translate(picture, picture.shape, (0, 1), jnp.ones(2), by, "linear", antialias=False)
+
+    return touches._replace(background=jax.vmap(jax.vmap(moved))(touches.background, shift))
 
 
 def field_batch(key: Array, touches: SimulatedTouches, sensor: Array, config: Config, count: int) -> FieldBatch:

@@ -32,6 +32,8 @@ class Dots(NamedTuple):
     aspect: float
     ink: Array
     mask: Array  # bool (h, w), of the untouched gel
+    sign: int  # 1 for dots that are darker than the gel, -1 for lighter ones
+    change: Array  # (3,) grey levels by which a dot differs from the gel
     spread: float  # of the step, relative
 
 
@@ -116,11 +118,22 @@ def find_dots(gel: Array) -> Dots | None:
     return next((one for one in found if one is not None), None)
 
 
+def _spots(picture: Array, sign: int) -> Array:
+    """Return by how many grey levels (h, w, 3) small spots are darker (`sign` 1) or lighter than what is around."""
+    shown, side = picture if sign > 0 else 255 - picture, 2 * round(0.045 * max(picture.shape[:2])) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return np.asarray(cv2.subtract(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, kernel), shown))
+
+
+def _hidden(frame: Array, dots: Dots) -> Array:
+    """Return where (h, w) dots hide the gel of a pressed frame u8 (h, w, 3), or hid it before they moved."""
+    strong = dots.change >= 0.5 * dots.change.max()  # a dot changes these colours all at once, and a slope does not
+    share = (_spots(frame, dots.sign)[..., strong] / dots.change[strong]).min(-1)
+    return dots.mask | (cv2.dilate((share > 0.3).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+
 def _dots_of(gel: Array, sign: int) -> Dots | None:
-    long = max(gel.shape[:2])
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(0.045 * long) + 1,) * 2)
-    shown = gel if sign > 0 else 255 - gel
-    depth = cv2.subtract(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, kernel), shown)
+    long, depth = max(gel.shape[:2]), _spots(gel, sign)
     deep = cv2.GaussianBlur(depth.max(2).astype(np.float32), (0, 0), long / 320)
     strongest = float(np.percentile(deep, 99))
     _, labels, stats, _ = cv2.connectedComponentsWithStats((deep > max(8.0, 0.5 * strongest)).astype(np.uint8))
@@ -155,7 +168,8 @@ def _dots_of(gel: Array, sign: int) -> Dots | None:
         return None
     grown = cv2.dilate((deep > max(6.0, 0.25 * strongest)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     ink = np.median(np.array(centres), 0) / 255
-    return Dots(pitch, bend, float(np.sqrt(area / (np.pi * aspect))), aspect, ink, grown, spread)
+    change = np.percentile(depth[grown], 80, axis=0)
+    return Dots(pitch, bend, float(np.sqrt(area / (np.pi * aspect))), aspect, ink, grown, sign, change, spread)
 
 
 def _lattice(at: Array, apart: Array, rough: float, shape: tuple[int, ...]) -> tuple[float, float, float]:
@@ -207,20 +221,22 @@ def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Ar
     """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, without light and dots, and where they show."""
     height, width = gel.shape[:2]
     size = (round(width * WORK / max(height, width)), round(height * WORK / max(height, width)))
-    weight = np.ones((height, width), np.float32) if dots is None else (~dots.mask).astype(np.float32)
-    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
-    near = cv2.GaussianBlur(share, (0, 0), 2)
     changes, clear = [], []
     for frame in frames:
+        weight = np.ones((height, width), np.float32)
+        if dots is not None:
+            weight[_hidden(frame, dots)] = 0
+        share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
         change = frame.astype(np.float32) - gel
         change -= change_of_light(change)
         small = cv2.resize(change * weight[..., None], size, interpolation=cv2.INTER_AREA)
         own = small / np.maximum(share, 1e-3)[..., None]
         if dots is not None:  # what the dots hide is as around them
+            near = cv2.GaussianBlur(share, (0, 0), 2)
             around = cv2.GaussianBlur(small, (0, 0), 2) / np.maximum(near, 1e-3)[..., None]
             own = np.where(share[..., None] > 0.3, own, around)
         changes.append(own / 255)
-        limited = ((frame.min(2) < 3) | (frame.max(2) > 252)).astype(np.float32)
+        limited = weight * ((frame.min(2) < 3) | (frame.max(2) > 252))
         clear.append((share > 0.3) & (cv2.resize(limited, size, interpolation=cv2.INTER_AREA) < 0.1))
     return np.stack(changes), np.stack(clear)
 

@@ -10,7 +10,16 @@ from batch_leaves import assert_same
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.pretrain import pretrain
-from anytouch_jax.simulated import SIMULATED, SimulatedLoader, _partners, augmented, caption_tokenizer, load_real
+from anytouch_jax.simulated import (
+    MOVED,
+    SIMULATED,
+    SimulatedLoader,
+    _partners,
+    augmented,
+    caption_tokenizer,
+    load_real,
+    moved_gel,
+)
 
 TINY = Stack(width=16, depth=1, heads=2, mlp=16)
 
@@ -95,6 +104,18 @@ def test_augmentation_moves_all_frames_alike():
     moved = np.asarray(augmented(jax.random.key(2), clip, config))
     np.testing.assert_array_equal(moved[:, 0], moved[:, 1])
     assert np.abs(moved[0].astype(int) - clip[0]).max() > 0 and moved.max() > 150
+
+
+def test_a_gel_moves_by_fractions_of_a_pixel_since_its_picture():
+    touches = SimulatedLoader(tiny()).touches(0)
+    down, across = np.mgrid[:28, :28]
+    ramp = np.stack([3 * across, 5 * down, 0 * down], -1).astype(np.uint8)
+    behind = np.broadcast_to(ramp, (2000, 1, 28, 28, 3))
+    moved = moved_gel(jax.random.key(0), touches._replace(background=behind))
+    change = (ramp - np.asarray(moved.background)[:, 0])[:, 10:-10, 10:-10, :2].mean((1, 2)) / (3, 5)
+    np.testing.assert_allclose(change.std(0), MOVED / np.sqrt(3), rtol=0.1)
+    assert np.abs(change.mean(0)).max() < 0.03 and np.abs(np.corrcoef(change.T)[0, 1]) < 0.1
+    assert_same(moved._replace(background=behind), touches._replace(background=behind))
 
 
 @pytest.mark.parametrize("mixed", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -4,8 +4,9 @@
     python -m experiments.encoders.measure calibrate runs/anytouch-tiny
     python -m experiments.encoders.measure test anytouch-tiny
 
-`train` trains the decoder alone, so features stay as they are. `calibrate` scales the deviations on objects of the validation split, and writes the folder again. `test` measures
-errors on objects of the test split, by sensor, and writes `measure.jsonl`. Both see new units of the sensors only.
+`train` trains the decoder alone, so features stay as they are. `calibrate` scales the deviations on objects of the
+validation split, and writes the folder again. `test` measures errors on objects of the test split, by sensor, and
+writes `measure.jsonl`. Both see new units of the sensors only.
 """
 
 from __future__ import annotations
@@ -60,8 +61,9 @@ def world_of(split: Any, variants: int = 1) -> endless.World:
 
 
 def batches(
-    world: endless.World, config: Config, count: int, seed: int, *, moved: bool = False, first: int = 0, **options: float
-) -> Iterator[FieldBatch]:
+    world: endless.World, config: Config, count: int, seed: int, number: int = 0, *, moved: bool = False,
+    **options: float,
+) -> Iterator[FieldBatch]:  # fmt: skip
     """Yield batches with normalised pixels and sensor rows: three of stills, which cost less, then one of clips."""
     rows = np.array(
         [config.model.sensor_row(name) for name in SimulatedConfig().sensors] + [config.model.universal_row]
@@ -78,7 +80,6 @@ def batches(
         sensor = jnp.where(own, batch.sensor, config.model.universal_row)
         return batch._replace(clip=normalise_touch(batch.clip), sensor=sensor)
 
-    number = first
     while True:
         frames = config.model.frames if number % 4 == 3 else 1
         yield make(jax.random.fold_in(jax.random.key(seed), number), world, frames)
@@ -93,11 +94,7 @@ def calibrate(folder: Path) -> None:
         name: float(np.quantile(np.abs(values["error"]) / values["deviation"], 0.68)) for name, values in errors.items()
     }
     log(f"deviations are multiplied by {factors}")
-    card = parse_json((folder / "config.json").read_text())
-    config = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings({"run.steps": card["steps"]})
-    full = dataclasses.replace(loaded, config=config, metadata={**loaded.metadata, "fields": factors})
-    notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
-    write_encoder(folder, full, notes, parts=(*PARTS, "fields"))
+    rewrite(folder, folder, dataclasses.replace(loaded, metadata={**loaded.metadata, "fields": factors}))
 
 
 def train(model: str, minutes: float, out: Path) -> None:
@@ -108,7 +105,7 @@ def train(model: str, minutes: float, out: Path) -> None:
     touch, world = jax.device_put(loaded.params["touch"]), world_of("train", 2)
 
     def stream(start: int, stop: int) -> Iterator[tuple[int, Any, dict[str, Any]]]:
-        source = batches(world, config, config.data.batch_size, 62, moved=True, first=start, wild=0.2, free=0.15)
+        source = batches(world, config, config.data.batch_size, 62, start, moved=True, wild=0.2, free=0.15)
         for step in range(start, stop):
             yield step, (next(source), touch), {}
 
@@ -116,14 +113,22 @@ def train(model: str, minutes: float, out: Path) -> None:
         touches, frozen = batch
         return field_terms(params | {"touch": frozen}, touches, net=net)
 
-    params, until = {"fields": loaded.params["fields"]}, time.monotonic() + 60 * minutes
-    result = fit(config, params=params, loss_fn=loss, batches=stream, run_dir=out.with_name("run"), until=until, log=log)
+    result = fit(
+        config, params={"fields": loaded.params["fields"]}, loss_fn=loss, batches=stream, run_dir=out.with_name("run"),
+        until=time.monotonic() + 60 * minutes, log=log,
+    )  # fmt: skip
     log(f"{result.step} steps of {config.data.batch_size}, {result.metrics}")
-    card = parse_json((path.parent / "config.json").read_text())
+    rewrite(path.parent, out, dataclasses.replace(loaded, params=loaded.params | jax.device_get(result.params)))
+
+
+def rewrite(folder: Path, out: Path, loaded: Any) -> None:
+    """Write an encoder with the card of `folder` to `out`."""
+    card = parse_json((folder / "config.json").read_text())
     config = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings({"run.steps": card["steps"]})
-    full = dataclasses.replace(loaded, params=loaded.params | jax.device_get(result.params), config=config)
     notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
-    write_encoder(out, full, notes, parts=(*PARTS, "fields"), tokenizer=path.parent / "tokenizer.json")
+    full = dataclasses.replace(loaded, config=config)
+    tokenizer = None if out == folder else folder / "tokenizer.json"
+    write_encoder(out, full, notes, parts=(*PARTS, "fields"), tokenizer=tokenizer)
 
 
 def subtracted(config: Config) -> Config:

@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -163,24 +163,35 @@ def collect(params: Any, config: Config, split: str, count: int, size: int = 32)
 
 
 def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], touches: int = 192) -> dict[str, float]:
-    """Return the errors of one sensor on new units and objects of the test split, stills and clips together."""
+    """Return the errors of one sensor on new units and objects of the test split, stills and clips together.
+
+    `false_contact` and `false_force` are shares of gels that nothing touches, but that moved a little since the picture
+    of them: those with a pixel of contact, and those with more than 0.05 N.
+    """
     settings = SimulatedConfig()
     scenes = scene.Scenes(objects=settings.objects, seed=settings.seed, depth=settings.depth)
     world = jax.device_put(endless.make_world(endless.objects_of(scenes, "test"), (sensor,)))
     row, size, measure = config.model.sensor_row(sensor), 32, jax.jit(build(config.model).measure)
+    sample = jax.jit(endless.sample_touches, static_argnums=(2, 3))
+
+    def read(number: int, frames: int, free: float) -> tuple[Any, ...]:
+        key = jax.random.fold_in(jax.random.key(11), number)
+        touch = sample(key, world, sampling(frames, wild=0, free=free), size)
+        touch = moved_gel(key, touch) if free else touch
+        batch = field_batch(key, touch, jnp.full((size, 1), row), config, size)
+        out = measure(params, normalise_touch(batch.clip), batch.sensor, batch.aspect)
+        return cast(tuple[Any, ...], jax.device_get((out, batch, touch.width[:, -1], touch.modulus[:, -1])))
+
     rows: dict[str, list[np.ndarray]] = {}
     for number in range(touches // size):
-        frames = (1, config.model.frames)[number % 2]
-        key = jax.random.fold_in(jax.random.key(11), number)
-        touch = jax.jit(endless.sample_touches, static_argnums=(2, 3))(
-            key, world, sampling(frames, wild=0, free=0), size
-        )
-        batch = field_batch(key, touch, jnp.full((size, 1), row), config, size)
-        out = jax.device_get(measure(params, normalise_touch(batch.clip), batch.sensor, batch.aspect))
-        batch, width, stiff = jax.device_get((batch, touch.width[:, -1], touch.modulus[:, -1]))
-        values = touch_errors(out, batch, width, stiff, factors["depth"])
-        for name, value in values.items():
+        for name, value in touch_errors(
+            *read(number, (1, config.model.frames)[number % 2], 0), factors["depth"]
+        ).items():
             rows.setdefault(name, []).append(np.asarray(value, np.float64).ravel())
+        out, _, width, stiff = read(1000 + number, 1, 1)
+        rows.setdefault("false_contact", []).append((out.contact > 0).any((1, 2)).astype(float))
+        newton = np.abs(out.force[:, 2]) * stiff * width**2 * 1e-3
+        rows.setdefault("false_force", []).append((newton > 0.05).astype(float))
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
     medians = ("force",)
     return {name: float(np.median(v) if name in medians else v.mean()) for name, v in joined.items()}

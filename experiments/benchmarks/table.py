@@ -15,15 +15,9 @@ from experiments.values import Value
 WORKS = ("one touch", "stage1 clips", "stage2 align", "embed clips")  # in the order of their rows
 HEAD = ("work", "way", Measure("ms"), Measure("time / ours in float32", ".2f"), Measure("error", ".0e"))
 SIMULATED = (
-    "device",
-    "touches",
-    Measure("frames/s", ",.0f"),
-    Measure("processor ms a frame", ".2f"),
-    Measure("roofline, %", ".0f"),
-    Measure("mm", ".4f"),
-    Measure("kPa", ".2f"),
-    Measure("grey levels", ".2f"),
-)
+    "device", "touches", Measure("frames/s", ",.0f"), Measure("processor ms a frame", ".2f"),
+    Measure("roofline, %", ".0f"), Measure("mm", ".4f"), Measure("kPa", ".2f"), Measure("grey levels", ".2f"),
+)  # fmt: skip
 Rows = list[tuple[Any, ...]]
 
 

@@ -18,14 +18,16 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
+from anytouch_jax.data.dots import DotFlow
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
 from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
@@ -53,11 +55,12 @@ def sampling(frames: int, *, wild: float, free: float) -> endless.Sampling:
     return endless.Sampling(frames=frames, wild=wild, free=free, fields=FIELDS)
 
 
-def world_of(split: Any, variants: int = 1) -> endless.World:
+def world_of(split: Any, variants: int = 1, sensors: tuple[str, ...] = ()) -> endless.World:
     """Return the world of the objects of a split, with those kinds held out that training of the encoder held out."""
     settings = SimulatedConfig()
     scenes = scene.Scenes(objects=settings.objects, seed=settings.seed, depth=settings.depth)
-    return jax.device_put(endless.make_world(endless.objects_of(scenes, split, variants=variants), settings.sensors))
+    things = endless.objects_of(scenes, split, variants=variants)
+    return jax.device_put(endless.make_world(things, sensors or settings.sensors))
 
 
 def batches(
@@ -168,9 +171,7 @@ def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], 
     `false_contact` and `false_force` are shares of gels that nothing touches, but that moved a little since the picture
     of them: those with a pixel of contact, and those with more than 0.05 N.
     """
-    settings = SimulatedConfig()
-    scenes = scene.Scenes(objects=settings.objects, seed=settings.seed, depth=settings.depth)
-    world = jax.device_put(endless.make_world(endless.objects_of(scenes, "test"), (sensor,)))
+    world = world_of("test", sensors=(sensor,))
     row, size, measure = config.model.sensor_row(sensor), 32, jax.jit(build(config.model).measure)
     sample = jax.jit(endless.sample_touches, static_argnums=(2, 3))
 
@@ -180,21 +181,34 @@ def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], 
         touch = moved_gel(key, touch) if free else touch
         batch = field_batch(key, touch, jnp.full((size, 1), row), config, size)
         out = measure(params, normalise_touch(batch.clip), batch.sensor, batch.aspect)
-        return cast(tuple[Any, ...], jax.device_get((out, batch, touch.width[:, -1], touch.modulus[:, -1])))
+        return tuple(jax.device_get((out, batch, touch)))
 
     rows: dict[str, list[np.ndarray]] = {}
     for number in range(touches // size):
-        for name, value in touch_errors(
-            *read(number, (1, config.model.frames)[number % 2], 0), factors["depth"]
-        ).items():
+        out, batch, touch = read(number, (1, config.model.frames)[number % 2], 0)
+        found = touch_errors(out, batch, touch.width[:, -1], touch.modulus[:, -1], factors["depth"])
+        out, _, free = read(1000 + number, 1, 1)
+        newton = np.abs(out.force[:, 2]) * free.modulus[:, -1] * free.width[:, -1] ** 2 * 1e-3
+        found |= {"false_contact": (out.contact > 0).any((1, 2)), "false_force": newton > 0.05}
+        for name, value in (found | dots_errors(batch, touch)).items():
             rows.setdefault(name, []).append(np.asarray(value, np.float64).ravel())
-        out, _, width, stiff = read(1000 + number, 1, 1)
-        rows.setdefault("false_contact", []).append((out.contact > 0).any((1, 2)).astype(float))
-        newton = np.abs(out.force[:, 2]) * stiff * width**2 * 1e-3
-        rows.setdefault("false_force", []).append((newton > 0.05).astype(float))
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
-    medians = ("force",)
-    return {name: float(np.median(v) if name in medians else v.mean()) for name, v in joined.items()}
+    return {name: float(np.median(v) if name == "force" else v.mean()) for name, v in joined.items() if len(v)}
+
+
+def dots_errors(batch: FieldBatch, touch: Any) -> dict[str, np.ndarray]:
+    """Return where the shear of dots, of gels that have some, is within 20 degrees and within one deviation."""
+    near, inside = [np.zeros(0)], [np.zeros(0)]
+    for row, (gel, clip, width) in enumerate(zip(touch.background[:, -1], touch.clip[:, -1], touch.width, strict=True)):
+        size = 240, max(1, round(240 * float(np.exp(batch.aspect[row]))))
+        gel, frame = (cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in (gel, clip[-1]))
+        if flow := DotFlow(gel):
+            true, (shear, deviation) = batch.shear[row], flow(frame, *batch.shear.shape[1:3])
+            touched = batch.pressure[row] > TOUCHED
+            moved = touched & (np.linalg.norm(true, axis=-1) * width[-1] > 0.1)
+            near.append((np.degrees(np.abs(_angle(shear, true))) < 20)[moved] & shear[moved].any(-1))
+            inside.append((np.abs(shear - true).mean(-1) < deviation)[touched])
+    return {"dots_shear": np.concatenate(near), "dots_inside": np.concatenate(inside)}
 
 
 def touch_errors(
@@ -225,7 +239,7 @@ def touch_errors(
     return values
 
 
-def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _angle(a: Any, b: Any) -> np.ndarray:
     cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return np.arctan2(cross, (a * b).sum(-1))
 

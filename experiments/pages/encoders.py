@@ -77,8 +77,9 @@ def motion(folder: Path) -> Page:
 def measure(folder: Path) -> Page:
     """Errors of depth, shear and force, simulated and on real balls."""
     sensors = read_records(folder / "measure.jsonl")
-    names = ("depth", "iou", "force", "shear", "inside", "false_contact", "false_force")
-    rows = [(name, one["depth"], *(100 * one[part] for part in names[1:])) for name, one in sensors.items()]
+    names = ("iou", "force", "inside", "dots_shear", "shear", "false_contact", "false_force")
+    shares = {name: [100 * one[part] if part in one else None for part in names] for name, one in sensors.items()}
+    rows = [(name, one["depth"], *shares[name]) for name, one in sensors.items()]
     balls = {name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one}
     real = [(name, *(percent(one["radius"]) if part == "radius" else Value(*one[part]) for part in
                      ("radius", "centre", "profile"))) for name, one in balls.items()]  # fmt: skip

@@ -173,3 +173,22 @@ def test_the_surface_is_a_mesh_in_mm(tmp_path):
     assert points["at"][:, 2].min() == pytest.approx(-0.05 * 14.25) and len(body) == 192 * 15 + 330 * 13
     picture = fields.overlay(gel(64, 48), one)
     assert picture.shape == (64, 48, 3) and np.abs(picture[:28].astype(int) - gel(64, 48)[:28]).mean() > 20
+
+
+def test_shear_is_the_motion_of_dots_in_mm(encoder):
+    y, x = np.mgrid[:120, :160]
+
+    def picture(by, sides=1):
+        ink = np.hypot((x - by) % 16 - 8, y % 16 - 8) < 3
+        return np.clip(np.where(ink, 30, 120 + x / 4)[..., None] + (0, 15 * sides, -20 * sides), 0, 255).astype(
+            np.uint8
+        )
+
+    moved = encoder.measure(np.stack([picture(0), picture(3)]), picture(0), "tacto", width_mm=16.0)
+    assert np.abs(np.median(moved.shear, (1, 2)) - [[0, 0], [0.3, 0]]).max() < 0.02
+    assert moved.shear.shape == (*moved.depth.shape, 2) and moved.shear_std.shape == moved.depth.shape
+    assert np.median(moved.shear_std) < 0.05
+    shares = encoder.measure(picture(3), picture(0), "tacto").shear
+    np.testing.assert_allclose(16 * shares[0], moved.shear[1], atol=1e-5)
+    grey = encoder.measure(picture(3, 0), picture(0), "tacto", width_mm=16.0, log=lambda _: None)
+    assert grey.faults and np.median(grey.shear_std) > 0.5

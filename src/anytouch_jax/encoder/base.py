@@ -297,7 +297,7 @@ class Encoder:
             numbers = np.full(len(part), row, np.int32), np.full(len(part), aspect, np.float32)
             parts.append(self.encode_and_measure(ready, *numbers)[1])
         out = FieldOutput._make(arrays.check_features(np.concatenate(values)) for values in zip(*parts, strict=True))
-        return measure(out, to_rgb(clips[0, -1], "the frame"))
+        return measure(out, [to_rgb(clip[-1], "the frame") for clip in clips])
 
     def measure_of(
         self, sensor: str, background: npt.ArrayLike | None = None, width_mm: float | None = None, log: Log = warn,

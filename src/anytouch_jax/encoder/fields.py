@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from anytouch_jax.data.dots import DotFlow
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import METADATA, Array
 from anytouch_jax.encoder.health import UnitFrames, check_layout, known_gels
@@ -79,12 +80,12 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
 class Fields:
     """What B frames measure, each value with its standard deviation, as maps (B, h, w) over the whole picture.
 
-    `depth` mm into the gel. `shear` (B, h, w, 2) mm along x and y of the picture, and one deviation for both. `contact`
-    is a probability. `force` (B, 3) N along x, along y and into the gel. `torque` (B,) N mm about the centre of
-    pressure. `slip` (B,) share of the contact that slides. `area` (B,) mm2. `centre` (B, 2) mm of the pressure from the
-    middle of the picture, x to the right and y down, NaN without contact. Without a width (`width_mm` None) lengths are
-    shares of the picture's width, areas of its square, and force and torque are None. `shape` is height over width.
-    With `faults` the deviations are wide.
+    `depth` mm into the gel. `shear` (B, h, w, 2) mm along x and y of the picture, and one deviation for both: that of
+    the dots, or a guess without them. `contact` is a probability. `force` (B, 3) N along x, along y and into the gel.
+    `torque` (B,) N mm about the centre of pressure. `slip` (B,) share of the contact that slides. `area` (B,) mm2.
+    `centre` (B, 2) mm of the pressure from the middle of the picture, x to the right and y down, NaN without contact.
+    Without a width (`width_mm` None) lengths are shares of the picture's width, areas of its square, and force and
+    torque are None. `shape` is height over width. With `faults` the deviations are wide.
     """
 
     depth: Array
@@ -227,7 +228,8 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
 class Measure:
     """Turns outputs of the network for frames of one sensor into `Fields`, and logs faults of the first frame once.
 
-    `background` is the picture of its untouched gel. `oriented` turns and mirrors pictures as `Preprocess` does.
+    `background` is the picture of its untouched gel. If that has dots, shear is their motion (`DotFlow`), not what the
+    network says. `oriented` turns and mirrors pictures as `Preprocess` does.
     """
 
     def __init__(
@@ -236,15 +238,22 @@ class Measure:
         self.scale, self.oriented = scale, partial(orient_frame, rotate=rotate, flip=flip)
         self._sensor, self._log = sensor, log
         self._background = None if background is None else self.oriented(background)
+        self._flow = None if self._background is None else DotFlow(self._background)
         self._faults: tuple[str, ...] | None = None
 
-    def __call__(self, out: FieldOutput, frame: Array) -> Fields:
-        """Return the fields of frames that look like `frame`, RGB u8 (h, w, 3), oriented."""
+    def __call__(self, out: FieldOutput, frames: Sequence[Array]) -> Fields:
+        """Return the fields of B frames RGB u8 (h, w, 3), oriented."""
+        height, width = frames[0].shape[:2]
         if self._faults is None:
-            self._faults = faults_of(frame, self._background, self._sensor, self.scale.shape)
+            self._faults = faults_of(frames[0], self._background, self._sensor, self.scale.shape)
             for fault in self._faults:
                 self._log(f"do not trust what is measured, its deviations are wide: {fault}")
-        return fields_of(out, self.scale, frame.shape[0] / frame.shape[1], self._faults)
+        measured = fields_of(out, self.scale, height / width, self._faults)
+        if not self._flow or self._faults:
+            return measured
+        shifts = [self._flow(frame, *measured.depth.shape[1:]) for frame in frames]
+        shear, std = (np.stack(part) * (self.scale.width or 1.0) for part in zip(*shifts, strict=True))
+        return replace(measured, shear=shear.astype(np.float32), shear_std=std.astype(np.float32))
 
 
 def faults_of(frame: Array, background: Array | None, sensor: str, shape: float | None) -> tuple[str, ...]:

@@ -180,7 +180,7 @@ def stream(
                         picture = measure.oriented(clip.last.pixels)
                         aspect = np.log(picture.shape[0] / picture.shape[1])
                         out, raw = embed(there, np.full(1, aspect, np.float32))
-                        measured = measure(raw, picture)
+                        measured = measure(raw, [picture])
                     values = check_features(np.asarray(out)[0])
                 end = time.perf_counter()
                 last, at = clip.last, clip.last.read - start

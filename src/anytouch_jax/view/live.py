@@ -276,7 +276,7 @@ class Live:
         """Measure a picture, the last of some prepared frames."""
         clip = tables.last_clip(prepared, self._encoder.config.model.frames)
         row, aspect = np.array([self._row], np.int32), np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
-        return measure(self._encoder.encode_and_measure(clip[None], row, aspect)[1], picture)
+        return measure(self._encoder.encode_and_measure(clip[None], row, aspect)[1], [picture])
 
     def _classify(self, values: Array) -> dict[str, Any]:
         if (head := self.teacher.head or self._head) is None:

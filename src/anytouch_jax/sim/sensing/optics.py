@@ -93,19 +93,10 @@ def _light(uneven: Array, tint: Array, place: PictureView, sensor: Sensor) -> Ar
 
 
 def render(
-    displacement: Array | None,
-    tangential: Array | None,
-    pitch: float | Array,
-    sensor: Sensor,
-    unit: Unit,
-    key: Array | None = None,
-    *,
-    resolution: tuple[int, int] | None = None,
-    photometry: Photometry | None = None,
-    behind: Array | None = None,
-    drift: Array | None = None,
-    stretched: bool = False,
-) -> Array:
+    displacement: Array | None, tangential: Array | None, pitch: float | Array, sensor: Sensor, unit: Unit,
+    key: Array | None = None, *, resolution: tuple[int, int] | None = None, photometry: Photometry | None = None,
+    behind: Array | None = None, drift: Array | None = None, stretched: bool = False,
+) -> Array:  # fmt: skip
     """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
 
     The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
@@ -207,16 +198,11 @@ def _channels(
     """Return the inputs that differ between colour channels, each with a leading axis of three."""
     ink = sensor.markers.ink if sensor.markers else (0.0, 0.0, 0.0)
     return {
-        "normal": jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0),
-        "halo": jnp.moveaxis(jnp.asarray(photometry.halo), -1, 0),
-        "behind": behind,
-        "gain": unit.gain,
-        "tint": unit.tint,
-        "uneven": unit.uneven.T,
-        "ink": jnp.asarray(ink),
-        "drift": jnp.zeros((3, 3)) if drift is None else drift.T,
+        "normal": jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0), "behind": behind, "ink": jnp.asarray(ink),
+        "halo": jnp.moveaxis(jnp.asarray(photometry.halo), -1, 0), "gain": unit.gain, "tint": unit.tint,
+        "uneven": unit.uneven.T, "drift": jnp.zeros((3, 3)) if drift is None else drift.T,
         "shift": jnp.array([0, 10, 20], jnp.uint32),
-    }
+    }  # fmt: skip
 
 
 def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: Any) -> Array:

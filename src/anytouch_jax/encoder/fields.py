@@ -309,7 +309,7 @@ def depth_levels(depth: Array, width_mm: float | None) -> tuple[Array, float]:
 
 
 def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) -> Array:
-    """Return a picture u8 (h, w, 3) of a frame: its depth in colour, the rim of contact, shear, and force as `text`."""
+    """Return a picture u8 (h, w, 3) of a frame: depth in colour, rim of contact, sure shear, and force as `text`."""
     height, width = frame.shape[:2]
     one = measured[row].at(height, width)
     level, _ = depth_levels(one.depth[0], one.width_mm)
@@ -322,7 +322,7 @@ def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) 
     step, long = max(min(height, width) // 14, 1), 4 * width / (one.width_mm or 1.0)  # arrows four times their length
     for y in range(step // 2, height, step):
         for x in range(step // 2, width, step):
-            if inside[y, x]:
+            if inside[y, x] and np.linalg.norm(one.shear[0, y, x]) > one.shear_std[0, y, x]:
                 tip = np.rint((x, y) + long * one.shear[0, y, x]).astype(int)
                 cv2.arrowedLine(view, (x, y), tuple(tip.tolist()), (120, 255, 120), 1, cv2.LINE_AA, tipLength=0.3)
     if not text:

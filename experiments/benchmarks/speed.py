@@ -247,28 +247,14 @@ def _row(program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wr
     operations = program.work.operations
     rate = operations / seconds
     return SpeedRow(
-        workload=program.work.name,
-        variant=program.variant.name,
-        samples=program.work.samples,
-        seconds=seconds,
-        seconds_iqr=_iqr(mine),
-        ratio=float(np.median(ratios)),
-        ratio_iqr=_iqr(ratios),
-        operations=operations,
-        peak_share=rate / peaks[_kind(program)],
-        float32_share=rate / peaks[_FULL],
-        p50=float(np.percentile(times, 50)),
-        p99=float(np.percentile(times, 99)),
-        calls=times.size,
-        trace_seconds=program.trace_seconds,
-        compile_seconds=program.compile_seconds,
-        peak_bytes=program.peak_bytes,
-        temp_bytes=program.temp_bytes,
-        copies=program.copies,
-        error_output=wrong.get("output"),
-        error_loss=wrong.get("loss"),
+        workload=program.work.name, variant=program.variant.name, samples=program.work.samples, seconds=seconds,
+        seconds_iqr=_iqr(mine), ratio=float(np.median(ratios)), ratio_iqr=_iqr(ratios), operations=operations,
+        peak_share=rate / peaks[_kind(program)], float32_share=rate / peaks[_FULL], p50=float(np.percentile(times, 50)),
+        p99=float(np.percentile(times, 99)), calls=times.size, trace_seconds=program.trace_seconds,
+        compile_seconds=program.compile_seconds, peak_bytes=program.peak_bytes, temp_bytes=program.temp_bytes,
+        copies=program.copies, error_output=wrong.get("output"), error_loss=wrong.get("loss"),
         error_gradient=wrong.get("gradient"),
-    )
+    )  # fmt: skip
 
 
 def _empty(work: Workload, variant: Variant, note: str) -> SpeedRow:

@@ -28,6 +28,7 @@ import numpy as np
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.data.dots import DotFlow
+from anytouch_jax.encoder.fields import Measure, Scale
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
 from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
@@ -185,30 +186,38 @@ def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], 
 
     rows: dict[str, list[np.ndarray]] = {}
     for number in range(touches // size):
-        out, batch, touch = read(number, (1, config.model.frames)[number % 2], 0)
-        found = touch_errors(out, batch, touch.width[:, -1], touch.modulus[:, -1], factors["depth"])
+        fields, batch, touch = read(number, (1, config.model.frames)[number % 2], 0)
+        found = touch_errors(fields, batch, touch.width[:, -1], touch.modulus[:, -1], factors["depth"])
         out, _, free = read(1000 + number, 1, 1)
         newton = np.abs(out.force[:, 2]) * free.modulus[:, -1] * free.width[:, -1] ** 2 * 1e-3
         found |= {"false_contact": (out.contact > 0).any((1, 2)), "false_force": newton > 0.05}
-        for name, value in (found | dots_errors(batch, touch)).items():
+        for name, value in (found | dots_errors(fields, batch, touch)).items():
             rows.setdefault(name, []).append(np.asarray(value, np.float64).ravel())
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
     return {name: float(np.median(v) if name == "force" else v.mean()) for name, v in joined.items() if len(v)}
 
 
-def dots_errors(batch: FieldBatch, touch: Any) -> dict[str, np.ndarray]:
-    """Return where the shear of dots, of gels that have some, is within 20 degrees and within one deviation."""
-    near, inside = [np.zeros(0)], [np.zeros(0)]
+def dots_errors(out: FieldOutput, batch: FieldBatch, touch: Any) -> dict[str, np.ndarray]:
+    """Return where shear and force along gels with dots are within 20 degrees, and within one deviation."""
+    found = {name: [np.zeros(0)] for name in ("dots_shear", "dots_inside", "drag", "drag_inside")}
+    aspects = np.exp(batch.aspect)
     for row, (gel, clip, width) in enumerate(zip(touch.background[:, -1], touch.clip[:, -1], touch.width, strict=True)):
-        size = 240, max(1, round(240 * float(np.exp(batch.aspect[row]))))
+        size = 240, max(1, round(240 * float(aspects[row])))
         gel, frame = (cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in (gel, clip[-1]))
-        if flow := DotFlow(gel):
-            true, (shear, deviation) = batch.shear[row], flow(frame, *batch.shear.shape[1:3])
-            touched = batch.pressure[row] > TOUCHED
-            moved = touched & (np.linalg.norm(true, axis=-1) * width[-1] > 0.1)
-            near.append((np.degrees(np.abs(_angle(shear, true))) < 20)[moved] & shear[moved].any(-1))
-            inside.append((np.abs(shear - true).mean(-1) < deviation)[touched])
-    return {"dots_shear": np.concatenate(near), "dots_inside": np.concatenate(inside)}
+        if not DotFlow(gel):
+            continue
+        scale = Scale(float(width[-1]), float(touch.modulus[row, -1]), 0.0, None, dict.fromkeys(QUANTITIES, 1.0))
+        measure = Measure(scale, "simulated", gel, lambda _: None, 0, "none")
+        one = measure(FieldOutput._make(value[row : row + 1] for value in out), [frame])
+        true, touched = batch.shear[row] * scale.width, batch.pressure[row] > TOUCHED
+        moved = touched & (np.linalg.norm(true, axis=-1) > 0.1)
+        found["dots_shear"].append((_apart(one.shear[0], true) < 20)[moved])
+        found["dots_inside"].append((np.abs(one.shear[0] - true).mean(-1) < one.shear_std[0])[touched])
+        newton = np.array([touch.labels[f"force_{axis}"][row, -1, -1] for axis in "xy"])
+        if np.linalg.norm(newton) > 0.1:
+            found["drag"].append(_apart(one.force[:, :2], newton) < 20)
+            found["drag_inside"].append((np.abs(one.force[0] - [*newton, 0]) < one.force_std[0])[:2])
+    return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
 def touch_errors(
@@ -235,13 +244,14 @@ def touch_errors(
     }  # fmt: skip
     if batch.clip.shape[1] > 1:
         moved = touched & (np.linalg.norm(batch.shear, axis=-1) * width[pixels] > 0.1)
-        values["shear"] = np.degrees(np.abs(_angle(out.shear, batch.shear)))[moved] < 20
+        values["shear"] = _apart(out.shear, batch.shear)[moved] < 20
     return values
 
 
-def _angle(a: Any, b: Any) -> np.ndarray:
-    cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return np.arctan2(cross, (a * b).sum(-1))
+def _apart(a: Any, b: Any) -> Any:
+    """Return degrees between vectors (..., 2), 180 where `a` has no length."""
+    angle = np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(-1))
+    return np.where(np.any(a, -1), np.degrees(np.abs(angle)), 180)
 
 
 def test(model: Path, out: Path) -> None:

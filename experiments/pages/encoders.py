@@ -77,7 +77,7 @@ def motion(folder: Path) -> Page:
 def measure(folder: Path) -> Page:
     """Errors of depth, shear and force, simulated and on real balls."""
     sensors = read_records(folder / "measure.jsonl")
-    names = ("iou", "force", "inside", "dots_shear", "shear", "false_contact", "false_force")
+    names = ("iou", "force", "inside", "dots_shear", "drag", "shear", "false_contact", "false_force")
     shares = {name: [100 * one[part] if part in one else None for part in names] for name, one in sensors.items()}
     rows = [(name, one["depth"], *shares[name]) for name, one in sensors.items()]
     balls = {name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one}

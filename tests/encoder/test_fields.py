@@ -192,3 +192,12 @@ def test_shear_is_the_motion_of_dots_in_mm(encoder):
     np.testing.assert_allclose(16 * shares[0], moved.shear[1], atol=1e-5)
     grey = encoder.measure(picture(3, 0), picture(0), "tacto", width_mm=16.0, log=lambda _: None)
     assert grey.faults and np.median(grey.shear_std) > 0.5
+
+    scale = fields.Scale(16.0, 100.0, 0.0, None, dict.fromkeys(fields._NAMES, 1.0))
+    measure = fields.Measure(scale, "mine", picture(0), lambda _: None, 0, "none")
+    dragged = measure(output(), [picture(3)])  # a quarter of 16 x 12 mm is in contact: 48 mm2
+    wanted = fields.DRAG * 0.1 * 0.3 * np.sqrt(48)
+    np.testing.assert_allclose(dragged.force[0, :2], [wanted, 0], atol=0.05 * wanted)
+    assert dragged.force[0, 2] == pytest.approx(0.02 * 100 * 0.256, rel=1e-4)
+    free = measure(output(contact=np.full((1, SIDE, SIDE), -9.0)), [picture(3)])
+    assert not free.force[0, :2].any(), "a gel that moved in its mount is not dragged"

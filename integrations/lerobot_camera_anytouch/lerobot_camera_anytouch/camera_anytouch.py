@@ -94,7 +94,7 @@ class AnyTouchCamera(Camera):
     def _measured(self, frame: np.ndarray) -> Fields:
         measure, row = self._measure
         aspect = np.full(1, np.log(frame.shape[0] / frame.shape[1]), np.float32)
-        return measure(self._encoder.encode_and_measure(self._ready(frame)[None, None], row, aspect)[1], frame)
+        return measure(self._encoder.encode_and_measure(self._ready(frame)[None, None], row, aspect)[1], [frame])
 
     @cached_property
     def _measure(self) -> tuple[Measure, np.ndarray]:

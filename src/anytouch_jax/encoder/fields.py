@@ -37,6 +37,8 @@ GELS = {
 }  # fmt: skip
 OTHER_MODULUS, OTHER_SPREAD = 170.0, 0.4  # kPa of an unknown gel, and its deviation as a share
 LEAST_FORCE = 1e-3  # over modulus times width squared: the deviation of a smaller normal force is that of this one
+DRAG = 2.4  # see `_dragged`
+DRAG_LEAST, DRAG_SPREAD = 3e-4, 0.4  # deviation of its force as a share of modulus times width squared, and of it
 SHAPE_LIMIT = 0.1  # difference of proportions that shows a turned or cropped picture
 _NAMES = ("depth", "shear", "normal", "tangential", "torque", "slip")
 _SIDE = 40  # pixels of a picture's width, when compared with its background
@@ -225,11 +227,28 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
     return Fields(**values, contact=contact, width_mm=scale.width, shape=shape, faults=faults)
 
 
+def _dragged(measured: Fields, scale: Scale) -> Fields:
+    """Return fields whose force along the gel is that which drags the contact by its `shear`: none without contact.
+
+    The force on a disc is the modulus times its shift times the root of its area, times a number (Johnson 1985,
+    "Contact Mechanics", 7.2). The number is fitted to simulated layers.
+    """
+    assert measured.force is not None and measured.force_std is not None
+    inside = (measured.contact > 0.5)[..., None]
+    shift = (measured.shear * inside).sum((1, 2)) / np.maximum(inside.sum((1, 2)), 1)
+    along = DRAG * scale.modulus / 1000 * shift * np.sqrt(measured.area)[:, None]
+    least = DRAG_LEAST * scale.modulus / 1000 * (scale.width or 1.0) ** 2
+    std = np.hypot(least, np.hypot(DRAG_SPREAD, scale.spread) * np.linalg.norm(along, axis=1))
+    force, deviation = measured.force.copy(), measured.force_std.copy()
+    force[:, :2], deviation[:, :2] = along, std[:, None]
+    return replace(measured, force=force, force_std=deviation)
+
+
 class Measure:
     """Turns outputs of the network for frames of one sensor into `Fields`, and logs faults of the first frame once.
 
-    `background` is the picture of its untouched gel. If that has dots, shear is their motion (`DotFlow`), not what the
-    network says. `oriented` turns and mirrors pictures as `Preprocess` does.
+    `background` is the picture of its untouched gel. If that has dots, shear is their motion (`DotFlow`), and the force
+    along the gel follows from it. `oriented` turns and mirrors pictures as `Preprocess` does.
     """
 
     def __init__(
@@ -253,7 +272,8 @@ class Measure:
             return measured
         shifts = [self._flow(frame, *measured.depth.shape[1:]) for frame in frames]
         shear, std = (np.stack(part) * (self.scale.width or 1.0) for part in zip(*shifts, strict=True))
-        return replace(measured, shear=shear.astype(np.float32), shear_std=std.astype(np.float32))
+        measured = replace(measured, shear=shear.astype(np.float32), shear_std=std.astype(np.float32))
+        return measured if measured.force is None else _dragged(measured, self.scale)
 
 
 def faults_of(frame: Array, background: Array | None, sensor: str, shape: float | None) -> tuple[str, ...]:

@@ -44,21 +44,10 @@ def at_rest(shape: tuple[int, int], dtype: Any = jnp.float32) -> Shear:
 
 
 def shear_step(
-    state: Shear | None,
-    contact: PressResult,
-    motion: Any,
-    gel: Gel,
-    pitch: Any,
-    friction: Any,
-    *,
-    fidelity: Fidelity = "exact",
-    modulus_object: Any = float("inf"),
-    centre: Any = (0.0, 0.0),
-    squeezed: Array | None = None,
-    coarse: bool = False,
-    tolerance: float = 1e-3,
-    iterations: int | None = None,
-) -> Shear:
+    state: Shear | None, contact: PressResult, motion: Any, gel: Gel, pitch: Any, friction: Any, *, fidelity:
+    Fidelity = "exact", modulus_object: Any = float("inf"), centre: Any = (0.0, 0.0), squeezed: Array | None = None,
+    coarse: bool = False, tolerance: float = 1e-3, iterations: int | None = None,
+) -> Shear:  # fmt: skip
     """Move the object by `motion` (dx mm, dy mm, dtheta rad about `centre` mm) under the pressure of `contact`.
 
     `state` is that of the previous frame, or None at rest. The traction starts from it, so a reversed motion leaves a

@@ -313,17 +313,9 @@ def _noise(bits: Array) -> Array:
 
 
 def measure_field(
-    displacement: Array,
-    tangential: Array,
-    pressure: Array,
-    traction: Array,
-    pitch: Any,
-    points: int = 20,
-    *,
-    noise: Any = 0.0,
-    gel: Gel | None = None,
-    key: Array | None = None,
-) -> Array:
+    displacement: Array, tangential: Array, pressure: Array, traction: Array, pitch: Any, points: int = 20, *,
+    noise: Any = 0.0, gel: Gel | None = None, key: Array | None = None,
+) -> Array:  # fmt: skip
     """Return the measurement of a field sensor, f32 (points, points, 6): displacement x, y, z mm, force x, y, z N.
 
     Inputs on the solve grid are `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h, w) kPa, `traction`

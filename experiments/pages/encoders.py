@@ -77,9 +77,11 @@ def motion(folder: Path) -> Page:
 def measure(folder: Path) -> Page:
     """Errors of depth, shear and force, simulated and on real balls."""
     sensors = read_records(folder / "measure.jsonl")
-    names = ("iou", "force", "inside", "dots_shear", "drag", "shear", "false_contact", "false_force")
-    shares = {name: [100 * one[part] if part in one else None for part in names] for name, one in sensors.items()}
-    rows = [(name, one["depth"], *shares[name]) for name, one in sensors.items()]
+    shares = {name: {part: 100 * value for part, value in one.items() if isinstance(value, float)}
+              for name, one in sensors.items()}  # fmt: skip
+    rows = [(name, one["depth"], *map(shares[name].get, ("iou", "force", "inside"))) for name, one in sensors.items()]
+    others = ("dots_shear", "drag", "shear", "false_contact", "false_force")
+    along = [(name, *map(one.get, others)) for name, one in shares.items()]
     balls = {name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one}
     real = [(name, *(percent(one["radius"]) if part == "radius" else Value(*one[part]) for part in
                      ("radius", "centre", "profile"))) for name, one in balls.items()]  # fmt: skip
@@ -92,7 +94,7 @@ def measure(folder: Path) -> Page:
         ),
     ]
     answer = "On new simulated units the depth in contact is off by this much."
-    return Page("measure", [real, rows], findings, (answer, f"{low:.2f} to {high:.2f} mm"))
+    return Page("measure", [real, rows, along], findings, (answer, f"{low:.2f} to {high:.2f} mm"))
 
 
 def lookalikes(folder: Path) -> Page:

@@ -278,7 +278,7 @@ class Encoder:
         """Return depth, shear, contact and force of B frames in mm and N, with their deviations.
 
         `frames` are those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), whose
-        last frame is measured. A still shows little of shear and slip. `background` is the untouched gel. A sensor that
+        last frame is measured. A still shows little of slip. `background` is the untouched gel. A sensor that
         is not in `fields.GELS` needs `width_mm`, the mm that the picture's width shows. Without it lengths are shares
         of that width, and there is no force. Raises UserError if the weights do not measure.
         """

@@ -231,7 +231,7 @@ def _dragged(measured: Fields, scale: Scale) -> Fields:
     """Return fields whose force along the gel is that which drags the contact by its `shear`: none without contact.
 
     The force on a disc is the modulus times its shift times the root of its area, times a number (Johnson 1985,
-    "Contact Mechanics", 7.2). The number is fitted to simulated layers.
+    "Contact Mechanics", 3.7). The number is fitted to simulated layers.
     """
     assert measured.force is not None and measured.force_std is not None
     inside = (measured.contact > 0.5)[..., None]

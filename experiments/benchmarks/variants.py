@@ -112,13 +112,7 @@ def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
     memory: Any = program.memory_analysis()
     sizes = (memory.argument_size_in_bytes, memory.output_size_in_bytes, memory.temp_size_in_bytes)
     return Program(
-        work=work,
-        variant=variant,
-        call=program,
-        batch=batch,
-        trace_seconds=traced - start,
-        compile_seconds=done - traced,
-        peak_bytes=sum(sizes) - memory.alias_size_in_bytes,
-        temp_bytes=memory.temp_size_in_bytes,
-        copies=(program.as_text() or "").count(" copy("),
-    )
+        work=work, variant=variant, call=program, batch=batch, trace_seconds=traced - start,
+        compile_seconds=done - traced, peak_bytes=sum(sizes) - memory.alias_size_in_bytes,
+        temp_bytes=memory.temp_size_in_bytes, copies=(program.as_text() or "").count(" copy("),
+    )  # fmt: skip

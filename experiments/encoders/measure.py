@@ -44,7 +44,7 @@ from experiments.records import write_record
 
 UNIVERSAL = 0.25  # share of the touches that get the universal tokens
 SETTINGS: dict[str, Any] = {
-    "data.background": "either", "data.batch_size": 24, "optim.learning_rate": 3e-4, "optim.warmup": 40,
+    "data.background": "either", "data.batch_size": 24, "optim.learning_rate": 5e-4, "optim.warmup": 40,
     "optim.grad_clip": 1.0, "optim.weight_decay": 0.0, "run.steps": 100_000, "run.save_every": 0, "run.keep": 1,
     "run.figure_every": 0,
 }  # fmt: skip
@@ -104,7 +104,7 @@ def calibrate(folder: Path) -> None:
 def train(model: str, minutes: float, out: Path) -> None:
     """Train the decoder on endless touches and untouched gels that moved a little, and write the encoder to `out`."""
     path = locate(model)
-    loaded = load_model(path)
+    loaded, folder = load_model(path), path if path.is_dir() else path.parent
     config, net = loaded.config.with_settings(SETTINGS), build(loaded.config.model)
     touch, world = jax.device_put(loaded.params["touch"]), world_of("train", 2)
 
@@ -122,7 +122,7 @@ def train(model: str, minutes: float, out: Path) -> None:
         until=time.monotonic() + 60 * minutes, log=log,
     )  # fmt: skip
     log(f"{result.step} steps of {config.data.batch_size}, {result.metrics}")
-    rewrite(path.parent, out, dataclasses.replace(loaded, params=loaded.params | jax.device_get(result.params)))
+    rewrite(folder, out, dataclasses.replace(loaded, params=loaded.params | jax.device_get(result.params)))
 
 
 def rewrite(folder: Path, out: Path, loaded: Any) -> None:

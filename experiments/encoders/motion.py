@@ -3,14 +3,15 @@
     python -m experiments.encoders.motion anytouch-tiny --data data/corpus/*/manifest.parquet
 
 Features that are averaged over a picture say little about the sign of a turn. The head reads a vector from every patch:
-how its token changes from the first to the last touched frame of a clip. The tokens are those after a third and two
-thirds of the blocks. Exchanging the two frames turns all vectors around. A turn is the sum of the vectors' moments
-about the touched place, a slide is their mean.
+how its token differs from that of the clip played backwards. A clip has the first, the middle and the last touched
+frame, and its tokens are those after a third and two thirds of the blocks. Playing it backwards turns all vectors
+around. A turn is the sum of the vectors' moments about the touched place, a slide is their mean.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,12 +33,13 @@ from experiments.records import write_record
 
 Array = np.ndarray
 TURNS, SLIDES = ("clockwise", "counterclockwise"), ("left", "right", "up", "down")
-HIDDEN, EPOCHS, BATCH, RATE = 48, 30, 64, 2e-3
+MIRRORED = dict(zip((*TURNS, *SLIDES[:2]), (*TURNS[::-1], *SLIDES[1::-1]), strict=True))
+HIDDEN, EPOCHS, BATCH, RATE = 48, 15, 64, 2e-3
 TOUCHED = 0.08  # mm of the deepest point that count as contact
 
 
 class Clips(NamedTuple):
-    """Tokens f16 (n, 2, P, E) of the first and last touched frame, with columns (n,) of the manifest."""
+    """Tokens f16 (n, 2, P, E) of clips played backwards and forwards, with columns (n,) of the manifest."""
 
     tokens: Array
     turn: Array
@@ -48,7 +50,7 @@ class Clips(NamedTuple):
 
 
 def read(encoder: Encoder, paths: list[Path], most: int) -> Clips:
-    """Embed the first and the last touched frame of clips that turn or slide, at most `most` of them."""
+    """Embed clips that turn or slide, at most `most` of them, and those of the training split in a mirror too."""
     manifest = manifests.read(paths)
     names = ("label.twist", "label.slide", "sensor", "split", "touch")
     columns = {name: manifest.text_column(name) for name in names}
@@ -60,23 +62,31 @@ def read(encoder: Encoder, paths: list[Path], most: int) -> Clips:
     rows = rows[np.lexsort((frame[rows], sequence[rows]))]
     starts = np.flatnonzero(np.diff(sequence[rows], prepend=-1))
     ends = np.append(starts[1:], len(rows)) - 1
-    pairs = np.stack([rows[starts], rows[ends]], 1)[ends > starts]
-    pairs = pairs[np.random.default_rng(0).permutation(len(pairs))[:most]]
+    three = np.stack([rows[starts], rows[(starts + ends + 1) // 2], rows[ends]], 1)[ends > starts]
+    three = three[np.random.default_rng(0).permutation(len(three))[:most]]
+    train = np.flatnonzero(columns["split"][three[:, 2]] == "train")
+    last = {name: np.concatenate([columns[name][three[:, 2]], columns[name][three[train, 2]]]) for name in names}
+    last["label.twist"][len(three) :] = [MIRRORED.get(one, one) for one in last["label.twist"][len(three) :]]
+    last["label.slide"][len(three) :] = [MIRRORED.get(one, one) for one in last["label.slide"][len(three) :]]
 
-    def picture(row: int) -> Array:
-        return encoder.preprocess(decode(manifest.file(row)), decode(manifest.file(row, "background_path")))
+    def clip(row: Array) -> Array:
+        gel = decode(manifest.file(int(row[0]), "background_path"))
+        return np.stack([encoder.preprocess(decode(manifest.file(int(one))), gel) for one in row])
+
+    def both_ways() -> Iterator[tuple[Array, np.int32]]:
+        for number, row in enumerate(np.concatenate([three, three[train]])):
+            frames, sensor = clip(row), np.int32(encoder.sensor_row(columns["sensor"][row[2]]))
+            frames = frames[:, :, ::-1] if number >= len(three) else frames
+            yield from ((frames[::-1], sensor), (frames, sensor))
 
     @jax.jit
-    def tokens(params: Any, frames: jax.Array, rows: jax.Array) -> jax.Array:
-        states = encoder.net.bind(params).touch.states(normalise_touch(frames[:, None]), rows, 4)
+    def tokens(params: Any, clips: jax.Array, rows: jax.Array) -> jax.Array:
+        states = encoder.net.bind(params).touch.states(normalise_touch(clips), rows, 4)
         first, last = encoder.net.model.touch.width, 3 * encoder.net.model.touch.width  # after a third and two thirds
         return states[:, 1 + encoder.net.model.sensor_tokens :, first:last].astype(jnp.float16)
 
-    flat = pairs.ravel()
-    items = ((picture(int(row)), np.int32(encoder.sensor_row(columns["sensor"][row]))) for row in flat)
-    values = run_in_batches(lambda part: tokens(encoder.params, *part), items, 64)
-    last = {name: columns[name][pairs[:, 1]] for name in names}
-    return Clips(values.reshape(len(pairs), 2, *values.shape[1:]), *last.values())
+    values = run_in_batches(lambda part: tokens(encoder.params, *part), both_ways(), 64)
+    return Clips(values.reshape(-1, 2, *values.shape[1:]), *last.values())
 
 
 def init(width: int, seed: int = 0) -> dict[str, jax.Array]:
@@ -94,7 +104,7 @@ def init(width: int, seed: int = 0) -> dict[str, jax.Array]:
 def head(params: dict[str, jax.Array], tokens: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the logit of a clockwise turn (B,) and those of SLIDES (B, 4) of token pairs (B, 2, P, E).
 
-    Exchanging the two frames changes the sign of the turn, and exchanges left and right, up and down.
+    Exchanging the pair changes the sign of the turn, and exchanges left and right, up and down.
     """
     before, after = tokens[:, 0], tokens[:, 1]
     change, state = after - before, (after + before) / 2

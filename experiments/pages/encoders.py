@@ -100,7 +100,9 @@ def measure(folder: Path) -> Page:
 def lookalikes(folder: Path) -> Page:
     """The same touch by another sensor, among 50 that resemble it."""
     rows, findings, readme = [], [], dict[str, Value]()
-    for key, record in read_records(folder / "lookalikes.jsonl").items():
+    records = read_records(folder / "lookalikes.jsonl")
+    curve = records.pop("training", {"pairs": [], "recall": []})
+    for key, record in records.items():
         grade = f"{key} alignment"
         scores = {name: percent([one["share"], *one["interval"]]) for name, one in record["scores"].items()}
         scores = dict(sorted(scores.items(), key=lambda item: -item[1].mean))
@@ -112,7 +114,9 @@ def lookalikes(folder: Path) -> Page:
         return Page("lookalikes", [rows], findings)
     best = next(iter(readme))
     answer = f"`{best}` finds this share first of 50, and raw pixels {readme['pixels'].mean:.1f} %."
-    return Page("lookalikes", [rows], findings, (answer, f"{readme[best].shown()} %"), readme=readme)
+    learned = list(zip(curve["pairs"], (100 * share for share in curve["recall"]), strict=True))
+    tables = [rows, learned] if learned else [rows]
+    return Page("lookalikes", tables, findings, (answer, f"{readme[best].shown()} %"), readme=readme)
 
 
 def new_sensor(folder: Path) -> Page:

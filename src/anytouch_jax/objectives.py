@@ -148,7 +148,7 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
         "depth": over_pixels(losses.laplace_loss(depth, out.depth_log)),
         "slopes": slopes,
         "shear": over_pixels(jnp.mean(losses.laplace_loss(shear, out.shear_log[..., None]), -1)),
-        "contact": over_pixels(losses.binary_loss(out.contact, touched)),
+        "contact": 2 * losses.mean(losses.binary_loss(out.contact, touched)),  # unweighted: it is a probability
         "pressure": over_pixels(pressure),
         "normal": losses.mean(losses.laplace_loss(ratio, out.force_log[:, 1])),
         "tangential": losses.mean(losses.laplace_loss(sideways, out.force_log[:, :1])),

@@ -217,19 +217,14 @@ def timed(
         low, high = np.percentile(middle / base, [25, 75])
         rows.append(
             {
-                "name": name,
-                "seconds": float(np.median(middle)),
-                "ratio": float(np.median(middle / base)),
-                "ratio_iqr": float(high - low),
-                "samples_per_second": work.samples / float(np.median(middle)),
+                "name": name, "seconds": float(np.median(middle)), "ratio": float(np.median(middle / base)),
+                "ratio_iqr": float(high - low), "samples_per_second": work.samples / float(np.median(middle)),
                 "gflops": work.operations / float(np.median(middle)) / 1e9,
                 "best_ratio": float(values.min() / seconds[0].min()),
                 "peak_share": work.operations / float(np.median(middle)) / rate,
-                "p50": float(np.percentile(values, 50)),
-                "p99": float(np.percentile(values, 99)),
-                **error,
+                "p50": float(np.percentile(values, 50)), "p99": float(np.percentile(values, 99)), **error,
             }
-        )
+        )  # fmt: skip
     return rows
 
 

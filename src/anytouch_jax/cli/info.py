@@ -211,11 +211,9 @@ def _run(path: Path) -> list[str]:
         lines = [
             f"{path}: a run of stage {config.stage}, step {metadata['step']} of {config.run.steps}{checkpoints}",
             f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
-            *model,
-            f"background: {config.data.background}",
-            f"started from {', '.join(starts) or 'random weights'}",
+            *model, f"background: {config.data.background}", f"started from {', '.join(starts) or 'random weights'}",
             f"data: {', '.join(config.data.manifests) or 'unknown'}{content}",
-        ]
+        ]  # fmt: skip
         lines += [] if loss is None else [f"loss {loss:.4g}, the mean since the previous checkpoint"]
     try:
         checkpoint.checked(checkpoint.resolve(path, None))
@@ -289,12 +287,10 @@ def _manifest(path: Path) -> list[str]:
     return [
         f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, {summary.clips:,} clips of "
         "three frames",
-        f"splits: {counts('split')}",
-        f"sensors: {counts('sensor')}",
-        f"rows with {', '.join(filled) or 'no optional column'}",
-        f"labels: {listed(labels) or 'none'}",
+        f"splits: {counts('split')}", f"sensors: {counts('sensor')}",
+        f"rows with {', '.join(filled) or 'no optional column'}", f"labels: {listed(labels) or 'none'}",
         f"content {summary.digest[:12]}",
-    ]
+    ]  # fmt: skip
 
 
 def _arrays(path: Path) -> list[str]:

@@ -162,6 +162,11 @@ def _fields(graph: _Graph, own: Any, model: ModelConfig, frames: int, states: li
         x = graph("Resize", x, "", [1.0, 1.0, factor, factor], mode="linear")
         return graph("Transpose", x, perm=[0, 2, 3, 1])
 
+    def refined(x: str, *names: str) -> str:
+        for name in names:
+            x = graph("Add", x, convolved(x, name))
+        return x
+
     clip = graph("Cast", "frames", to=1)  # float32
     last, first = (graph("Squeeze", graph("Slice", clip, [at], [at + 1], [1]), [1]) for at in (frames - 1, 0))
     change = graph("Mul", graph("Sub", last, first), _SCALE)
@@ -172,12 +177,15 @@ def _fields(graph: _Graph, own: Any, model: ModelConfig, frames: int, states: li
     tokens = graph.dense(graph("Slice", joined, [start], [start + model.patches], [1]), own["read"])
     tokens = graph("Add", tokens, graph("Unsqueeze", graph.dense(aspect, own["aspect"]), [1]))
     coarse = graph("Reshape", tokens, [-1, grid, grid, own["read"]["kernel"].shape[1]])
-    quarter = (half + 1) // 2
+    quarter, eighth = (half + 1) // 2, (half + 3) // 4
     x = convolved(graph("Concat", resized(coarse, quarter / grid), x, axis=-1), "middle1")
-    x = graph("Add", x, convolved(x, "middle2"))
+    x = refined(x, "middle2")
+    deep = refined(convolved(x, "deep", 2), "deep1", "deep2")
+    light = graph.dense(graph("Gelu", graph("ReduceMean", deep, [1, 2], keepdims=1)), own["light"])
+    deep = refined(graph("Add", deep, light), "deep3", "deep4")
+    x = graph("Add", x, resized(graph.dense(graph("Gelu", deep), own["up"]), quarter / eighth))
     pooled = graph("ReduceMean", x, [1, 2], keepdims=0)
-    x = convolved(graph("Concat", resized(x, half / quarter), sharp, axis=-1), "fine1")
-    x = graph("Add", x, convolved(x, "fine2"))
+    x = refined(convolved(graph("Concat", resized(x, half / quarter), sharp, axis=-1), "fine1"), "fine2")
     maps = graph.dense(graph("Gelu", x), own["maps"])
     token = graph("Squeeze", graph("Slice", joined, [0], [1], [1]), [1])
     whole = graph.dense(graph("Concat", token, pooled, axis=-1), own["whole"]["up"])

@@ -29,7 +29,7 @@ from anytouch_jax.encoder.arrays import METADATA, Array, Join, Pooling
 from anytouch_jax.encoder.engines import Engine
 from anytouch_jax.errors import CheckError, UserError, refuse_forked
 from anytouch_jax.files import atomic_write, cache_folder, remove_old
-from anytouch_jax.ops.fields import FieldOutput
+from anytouch_jax.ops.fields import LENGTH, FieldOutput
 from anytouch_jax.shown import described
 from anytouch_jax.weights.registry import list_encoders
 
@@ -90,12 +90,10 @@ class Exported:
 
     def __repr__(self) -> str:
         return described(
-            f"Exported {self.about.get('source', 'encoder')}",
-            input=str(self.about.get("input", "")),
+            f"Exported {self.about.get('source', 'encoder')}", input=str(self.about.get("input", "")),
             features=f"{self.about['features']}, pooling {self.about['pooling']}",
-            background=str(self.about["background"]),
-            sensors=", ".join(self.about["sensors"]),
-        )
+            background=str(self.about["background"]), sensors=", ".join(self.about["sensors"]),
+        )  # fmt: skip
 
     def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
         """Return features f32 (B, E) of touches (B, T, H, W, 3), u8 RGB or as another family prepares them.
@@ -265,7 +263,7 @@ def _worst(encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join
             live, mine = encoder.encode_and_measure(clips, rows, aspect, pooling)
             exported, theirs = run(clips, rows, aspect)
             pairs = [(np.asarray(a), np.asarray(b)) for a, b in zip(mine, theirs, strict=True)]
-            off = [np.inf if a.shape != b.shape else np.abs(a - b).max() / max(np.abs(a).max(), 1e-3) for a, b in pairs]
+            off = [np.inf if a.shape != b.shape else abs(a - b).max() / max(abs(a).max(), LENGTH) for a, b in pairs]
             worst = max(worst, float(np.max(off)))
         else:
             live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)

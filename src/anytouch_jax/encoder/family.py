@@ -67,10 +67,8 @@ class FamilyEncoder(Encoder):
         return {
             "input": f"frames: float32 (B, {frames}, {shape}, 3), oldest first, each from encoder.preprocess of "
             f"{self.family.title}; sensor: int32 (B,)",
-            "preparation": asdict(self.preparation),
-            "frame_shape": [*self.image_size, 3],
-            "frame_dtype": "float32",
-        }
+            "preparation": asdict(self.preparation), "frame_shape": [*self.image_size, 3], "frame_dtype": "float32",
+        }  # fmt: skip
 
     @property
     def contract(self) -> str:

@@ -151,9 +151,8 @@ class LinearHead:
             f"LinearHead for {self.label}",
             classes=f"{len(classes)}: {', '.join(classes[:8])}{f' and {more} more' if more > 0 else ''}",
             input=f"features of {len(self.mean)}, pooling {self.pooling}, frames {self.frames}",
-            encoder=self.fingerprint,
-            calibration="; ".join(self.promises()) or "none",
-        )
+            encoder=self.fingerprint, calibration="; ".join(self.promises()) or "none",
+        )  # fmt: skip
 
     def __call__(self, features: npt.ArrayLike) -> tuple[Array, Array]:
         """Return the likeliest class (n,) str and probabilities f32 (n, K) of features (n, d)."""

@@ -268,10 +268,8 @@ def _result_lines(result: ProbeResult) -> list[dict[str, str]]:
     else:
         refits = f"{share_text(result.refit_mean)} ± {100 * (result.refit_std or 0):.1f}" if result.seeds else "-"
         line |= {
-            "balanced": share_text(result.balanced_accuracy),
-            "refits": refits,
-            "classes": str(len(result.classes)),
-        }
+            "balanced": share_text(result.balanced_accuracy), "refits": refits, "classes": str(len(result.classes)),
+        }  # fmt: skip
     line["penalty or k"] = "-" if result.penalty is None else f"{result.penalty:g} ({result.chosen_on})"
     parts = [
         {"probe": f"{result.probe}: {part.name}", "protocol": result.protocol, "score": share_text(part.accuracy),

@@ -72,10 +72,8 @@ class AnyTouch(nnx.Module):
         parts = tokens.segments(clip, self.frames)
         b, s = parts.shape[:2]
         joins = {
-            "mean": lambda z: z.mean(1),
-            "sum": lambda z: z.sum(1),
-            "concat": lambda z: z.reshape(b, s * z.shape[2]),
-        }
+            "mean": lambda z: z.mean(1), "sum": lambda z: z.sum(1), "concat": lambda z: z.reshape(b, s * z.shape[2]),
+        }  # fmt: skip
         values = features(parts.reshape(b * s, *parts.shape[2:]), jnp.repeat(sensor, s))
         return jax.tree.map(lambda z: joins[join](z.reshape(b, s, z.shape[-1])), values)
 

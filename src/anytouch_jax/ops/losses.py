@@ -183,10 +183,8 @@ def alignment_loss(
         back = info_nce(b, a, scale, both, groups=groups)
         total = total + weight.astype(forth.dtype) * (forth + back)
         metrics |= {
-            f"{first}_to_{second}": forth,
-            f"{second}_to_{first}": back,
-            f"{first}_{second}_pairs": jnp.sum(both),
-        }
+            f"{first}_to_{second}": forth, f"{second}_to_{first}": back, f"{first}_{second}_pairs": jnp.sum(both),
+        }  # fmt: skip
     return total, metrics
 
 

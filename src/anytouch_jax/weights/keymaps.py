@@ -241,11 +241,9 @@ _TEXT = f"""
 TABLE = (
     *rows("patch vision_model.embeddings.patch_embedding image/patch"),
     *rows(VISION, "vision_model.", "image/"),
-    *rows("kernel visual_projection image/projection"),
-    *rows(_TEXT, "text_model.", "text/"),
-    *rows("kernel text_projection text/projection"),
-    *rows("same logit_scale logit_scale"),
-)
+    *rows("kernel visual_projection image/projection"), *rows(_TEXT, "text_model.", "text/"),
+    *rows("kernel text_projection text/projection"), *rows("same logit_scale logit_scale"),
+)  # fmt: skip
 TOWERS = {"image": r"vision_model\..*|visual_projection\..*", "text": r"text_model\..*|text_projection\..*"}
 TOWERS |= {"logit_scale": r"logit_scale"}
 HF_CLIP = KeyMap("clip", r"vision_model\.embeddings\.patch_embedding\.weight", TABLE, towers=TOWERS)

@@ -201,15 +201,12 @@ def _key(key: Any) -> Any:
 
 
 _BUILDERS: dict[str, Callable[..., Any]] = {
-    "torch._utils._rebuild_tensor": _tensor,
-    "torch._utils._rebuild_tensor_v2": _tensor,
-    "torch._utils._rebuild_parameter": lambda data, *_: data,
-    "torch.Size": lambda values=(): tuple(values),
+    "torch._utils._rebuild_tensor": _tensor, "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_parameter": lambda data, *_: data, "torch.Size": lambda values=(): tuple(values),
     "torch.device": lambda *_: _Other(),
     "collections.OrderedDict": lambda pairs=(): {_key(key): value for key, value in pairs},
-    "collections.defaultdict": lambda *_: {},
-    "argparse.Namespace": _Other,
-}
+    "collections.defaultdict": lambda *_: {}, "argparse.Namespace": _Other,
+}  # fmt: skip
 _STATES = ("torch.optim.", "tactile_ssl.model.custom_scheduler.")  # classes of a training state, which is not read
 _INERT = {f"torch.{kind}" for kind in _STORAGES}
 _INERT |= {f"torch.{n}" for n in ("float16", "float32", "float64", "bfloat16", "int32", "int64", "uint8", "bool")}

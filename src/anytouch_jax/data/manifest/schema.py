@@ -344,11 +344,9 @@ def _cast_flag(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 
 _CASTS: dict[pa.DataType | None, tuple[Cast, str]] = {
-    None: (lambda column: column, ""),
-    _TEXT: (_cast_text, "text"),
-    _WHOLE: (_cast_whole, "a whole number"),
+    None: (lambda column: column, ""), _TEXT: (_cast_text, "text"), _WHOLE: (_cast_whole, "a whole number"),
     _FLAG: (_cast_flag, "a 0 or 1"),
-}
+}  # fmt: skip
 
 
 def _first_invalid(column: pa.ChunkedArray, cast: Cast) -> int:

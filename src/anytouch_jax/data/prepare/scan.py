@@ -203,11 +203,9 @@ _NARROW = 14  # bits of 16: more may be all that a dark picture uses
 _FROZEN = 3  # equal pictures in a row: cameras have noise
 _LAGS = (2, 3, 4)  # pictures of so many sensors may take turns in a sequence
 _ALONE = (
-    ("flat", "of one colour"),
-    ("cut", "of one colour from some row to the bottom, as a file is that was cut"),
-    ("border", "with a black border"),
-    ("noise", "of noise only"),
-)
+    ("flat", "of one colour"), ("cut", "of one colour from some row to the bottom, as a file is that was cut"),
+    ("border", "with a black border"), ("noise", "of noise only"),
+)  # fmt: skip
 _IN_SEQUENCE = (
     ("frozen", f"equal to the frames before ({_FROZEN} or more in a row)"),
     ("alternating", "in sequences that jump between the pictures of several sensors"),

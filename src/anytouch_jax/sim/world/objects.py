@@ -109,16 +109,13 @@ class TextureKind(NamedTuple):
 # Contacts of 0.2 to 1.2 mm fill a good part of a field of 12 to 19 mm. Small contacts and raised figures have only
 # textures that do not hide them and are not hidden by them.
 PRIMITIVE_KINDS = {
-    "sphere": PrimitiveKind("ball", (5.0, 12.0)),
-    "cylinder": PrimitiveKind("rod", (4.0, 11.0)),
-    "edge": PrimitiveKind("edge", (0.5, 2.5)),
-    "corner": PrimitiveKind("corner", (0.5, 2.5)),
+    "sphere": PrimitiveKind("ball", (5.0, 12.0)), "cylinder": PrimitiveKind("rod", (4.0, 11.0)),
+    "edge": PrimitiveKind("edge", (0.5, 2.5)), "corner": PrimitiveKind("corner", (0.5, 2.5)),
     "cone": PrimitiveKind("cone", (3.5, 8.0), ("smooth", "bark", "sand", "ridges")),
     "ring": PrimitiveKind("ring", (4.0, 6.5), ("smooth", "sand", "weave", "dots", "ridges", "knit")),
-    "flat": PrimitiveKind("disc", (4.5, 11.0)),
-    "screw": PrimitiveKind("screw", (3.5, 7.0), ("smooth", "sand", "bark")),
+    "flat": PrimitiveKind("disc", (4.5, 11.0)), "screw": PrimitiveKind("screw", (3.5, 7.0), ("smooth", "sand", "bark")),
     "letters": PrimitiveKind("letter", (7.0, 12.0), ("smooth", "sand", "weave", "ridges")),
-}
+}  # fmt: skip
 TEXTURE_KINDS = {  # slopes are measured on the height maps, and a test repeats the measurement
     "smooth": TextureKind("smooth", (1.0, 1.0), 0.0),
     "weave": TextureKind("woven", (1.2, 2.6), 1.4),
@@ -293,24 +290,17 @@ SPACING: dict[str, tuple[str, ...]] = {
 WIDE = 1.85  # mm; from this pitch on a pattern is called wide
 
 FIRST = (
-    "The surface feels {hard} and {rough}, with {pattern}.",
-    "The surface is {rough} and {hard}, showing {pattern}.",
-    "A {hard}, {rough} surface with {pattern}.",
-    "A {rough} surface with {pattern}; it feels {hard}.",
-    "It feels {hard} to the touch, with a {rough} finish and {pattern}.",
-    "{Hard} and {rough}, with {pattern}.",
-    "{Rough}, {hard}, {pattern}.",
-    "The object has {pattern}, giving a {rough} feel, and its body is {hard}.",
+    "The surface feels {hard} and {rough}, with {pattern}.", "The surface is {rough} and {hard}, showing {pattern}.",
+    "A {hard}, {rough} surface with {pattern}.", "A {rough} surface with {pattern}; it feels {hard}.",
+    "It feels {hard} to the touch, with a {rough} finish and {pattern}.", "{Hard} and {rough}, with {pattern}.",
+    "{Rough}, {hard}, {pattern}.", "The object has {pattern}, giving a {rough} feel, and its body is {hard}.",
     "One can feel {pattern} on a {hard}, {rough} surface.",
     "To the fingertips it is {rough}, with {pattern}, and {hard} underneath.",
-)
+)  # fmt: skip
 SECOND = (
-    "It is {feel}.",
-    "The touch is {feel}.",
-    "Overall it feels {feel}.",
-    "The sensation is {feel}.",
+    "It is {feel}.", "The touch is {feel}.", "Overall it feels {feel}.", "The sensation is {feel}.",
     "The material seems {feel}.",
-)
+)  # fmt: skip
 
 
 def caption(thing: Object, rng: np.random.Generator) -> str:
@@ -322,11 +312,9 @@ def caption(thing: Object, rng: np.random.Generator) -> str:
 
     spacing = "wide" if shape.texture_pitch >= WIDE else "fine"
     words = {
-        "hard": pick(HARDNESS[hardness_of(thing)]),
-        "rough": pick(ROUGHNESS[roughness_of(thing)]),
-        "pattern": pick(PATTERN[shape.texture]).format(s=pick(SPACING[spacing])),
-        "feel": pick(thing.material.feel),
-    }
+        "hard": pick(HARDNESS[hardness_of(thing)]), "rough": pick(ROUGHNESS[roughness_of(thing)]),
+        "pattern": pick(PATTERN[shape.texture]).format(s=pick(SPACING[spacing])), "feel": pick(thing.material.feel),
+    }  # fmt: skip
     words |= {"Hard": words["hard"].capitalize(), "Rough": words["rough"].capitalize()}
     text = pick(FIRST).format(**words)
     if rng.random() < 0.75:

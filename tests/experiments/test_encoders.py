@@ -26,8 +26,9 @@ RNG = np.random.default_rng(0)
 
 
 @pytest.mark.slow
-def test_it_learns_a_field_that_no_mean_shows():
+def test_it_learns_a_field_that_no_mean_shows(monkeypatch):
     """The first two values of a token change with the field of a turn, whose mean over the picture is zero."""
+    monkeypatch.setattr(motion, "EPOCHS", 30)
     n, side = 300, 4
     y, x = np.mgrid[:side, :side].reshape(2, -1) / side - 0.375
     sign = RNG.choice([-1.0, 1.0], n)

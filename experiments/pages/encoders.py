@@ -101,7 +101,7 @@ def lookalikes(folder: Path) -> Page:
     """The same touch by another sensor, among 50 that resemble it."""
     rows, findings, readme = [], [], dict[str, Value]()
     records = read_records(folder / "lookalikes.jsonl")
-    curve = records.pop("training", {"pairs": [], "recall": []})
+    curve = records.pop("training", None)
     for key, record in records.items():
         grade = f"{key} alignment"
         scores = {name: percent([one["share"], *one["interval"]]) for name, one in record["scores"].items()}
@@ -110,13 +110,11 @@ def lookalikes(folder: Path) -> Page:
         parts = ", ".join(f"`{name}` finds {scores[name].mean:.0f} %" for name in scores if name in record["encoders"])
         findings.append(f"{grade}: {parts}, and pixels {scores['pixels'].mean:.0f} %.")
         readme = scores if key == "fine" else readme
-    if not readme:
+    if not (best := next(iter(readme), "")):
         return Page("lookalikes", [rows], findings)
-    best = next(iter(readme))
     answer = f"`{best}` finds this share first of 50, and raw pixels {readme['pixels'].mean:.1f} %."
-    learned = list(zip(curve["pairs"], (100 * share for share in curve["recall"]), strict=True))
-    tables = [rows, learned] if learned else [rows]
-    return Page("lookalikes", tables, findings, (answer, f"{readme[best].shown()} %"), readme=readme)
+    learned = [list(zip(curve["pairs"], (100 * share for share in curve["recall"]), strict=True))] if curve else []
+    return Page("lookalikes", [rows, *learned], findings, (answer, f"{readme[best].shown()} %"), readme=readme)
 
 
 def new_sensor(folder: Path) -> Page:

@@ -31,7 +31,7 @@ def convolved(x: Array, kernel: Array, side: int, stride: int, dtype: DTypeLike)
     """Convolve x (B, H, W, C) with a square kernel (side * side * C, outputs), rows in the order of `windows`."""
     if jax.default_backend() != "cpu":  # without tuning, cuDNN's gradient of so few channels takes a second
         x = windows(x, side, stride)
-        return product(x.reshape(-1, x.shape[-1]), kernel, dtype).reshape(*x.shape[:-1], -1)
+        return product(x.reshape(-1, x.shape[-1]), kernel, dtype).reshape(*x.shape[:-1], kernel.shape[-1])
     a, b = (value.astype(dtype).astype(x.dtype) for value in (x, kernel.reshape(side, side, x.shape[-1], -1)))
     around = [(side // 2, side // 2)] * 2
     return lax.conv_general_dilated(a, b, (stride, stride), around, dimension_numbers=("NHWC", "HWIO", "NHWC"))
@@ -83,7 +83,7 @@ class FieldDecoder(nnx.Module):
         tokens = self.read(states[:, self.special :]) + self.aspect(aspect[:, None])[:, None]
         sharp = self.stem(jnp.concatenate([clip[:, -1], clip[:, -1] - clip[:, 0]], -1))
         x = self.down(sharp)
-        coarse = _resized(tokens.reshape(len(clip), self.grid, self.grid, -1), x)
+        coarse = _resized(tokens.reshape(len(clip), self.grid, self.grid, tokens.shape[-1]), x)
         x = self.middle1(jnp.concatenate([coarse, x], -1))
         x = x + self.middle2(x)
         deep = self.deep(x)

@@ -147,7 +147,7 @@ class DotFlow:
         height, width = self._gel.shape
         ink = cv2.resize(self._ink(frame), (width, height), interpolation=cv2.INTER_LINEAR)
         dis: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        dis.setFinestScale(2)  # a third of the time, for two points of direction
+        dis.setFinestScale(2)  # a third of the time, for half a point of direction
         flow = cv2.multiply(dis.calc(self._gel, ink, None), self._weight)
         square = cv2.transform(cv2.multiply(flow, flow), np.ones((1, 2), np.float32))
         sums = cv2.merge([*cv2.split(flow), square, self._weight[..., 0]])

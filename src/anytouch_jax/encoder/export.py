@@ -252,7 +252,7 @@ def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: 
 
 
 def _worst(encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join, fields: bool) -> tuple[float, int]:
-    """Return the largest difference from the live model, as a share of the largest value, and the feature count."""
+    """Return the largest difference from the live model, over the largest (or a usual) value, and the feature count."""
     model, rng, worst, width, blank = encoder.config.model, np.random.default_rng(0), 0.0, 0, encoder.blank
     for count in _CHECKED:
         clips = rng.integers(0, 256, (count, frames, *blank.shape), np.uint8)

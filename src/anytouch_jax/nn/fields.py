@@ -89,7 +89,7 @@ class FieldDecoder(nnx.Module):
         deep = self.deep(x)
         deep = deep + self.deep1(deep)
         deep = deep + self.deep2(deep)
-        # All of the picture tells the lights of the unit.
+        # The whole picture shows the lights of the unit.
         deep = deep + self.light(gelu(jnp.mean(deep, (1, 2))))[:, None, None]
         deep = deep + self.deep3(deep)
         deep = deep + self.deep4(deep)

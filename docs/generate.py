@@ -21,7 +21,8 @@ DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 RESULTS = ROOT / "experiments" / "results"
 NOTEBOOKS = ROOT / "experiments" / "notebooks"
-_LOW = "---\nsearch:\n  boost: 0.2\n---\n\n"  # a search finds how-to pages before results and references
+# a search finds how-to pages before results and references
+_LOW = "---\nsearch:\n  boost: 0.2\n---\n\n"
 _ROOMS = {
     "encoder": "Encoders",
     "evaluate": "Probes",
@@ -81,7 +82,8 @@ def tutorial(notebook: Path, folder: Path) -> str:
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
         for place, output in enumerate(cell.get("outputs", ())):
             if printed := "".join(output.get("text", ())).strip():
-                fence = max(["``", *re.findall("`+", printed)], key=len) + "`"  # printed text does not end it
+                # printed text does not end it
+                fence = max(["``", *re.findall("`+", printed)], key=len) + "`"
                 parts.append(f"{fence}text\n{printed}\n{fence}")
             if picture := output.get("data", {}).get("image/png"):
                 name = f"{notebook.stem}-{number}-{place}.png"
@@ -111,21 +113,27 @@ def write() -> None:
     pages |= {ROOT / name: DOCS / name.lower() for name in ("CONTRIBUTING.md", "CHANGELOG.md")}
     for page, target in sorted(pages.items()):
         text = _inside(page.read_text(encoding="utf-8"), page, target, pages)
-        target.write_text(_LOW + text if target.parent.name == "results" else text, encoding="utf-8")
+        target.write_text(
+            _LOW + text if target.parent.name == "results" else text, encoding="utf-8"
+        )
 
 
 def _inside(text: str, page: Path, target: Path, pages: dict[Path, Path]) -> str:
     """Return a copied page whose links stay inside the site. Other links become text."""
 
     def link(match: re.Match[str]) -> str:
-        whole, title, address = match[0], match[1], match[2]
+        whole = match[0]
+        title = match[1]
+        address = match[2]
         if address.startswith(("http", "#")):
             return whole
         file, _, anchor = address.partition("#")
         source = (page.parent / file).resolve()
         home = pages.get(source, source)
         if home in pages.values() or (home.is_relative_to(DOCS) and home.exists()):
-            return f"[{title}]({os.path.relpath(home, target.parent)}{'#' + anchor if anchor else ''})"
+            return (
+                f"[{title}]({os.path.relpath(home, target.parent)}{'#' + anchor if anchor else ''})"
+            )
         if source.is_relative_to(RESULTS / "figures"):
             return whole
         return title

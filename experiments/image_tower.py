@@ -22,11 +22,14 @@ def image_tower_encoder(path: str | Path) -> Encoder:
     There are no sensor tokens. Raises UserError without an image tower.
     """
     loaded = load.load_model(path)
-    model, params = loaded.config.model, loaded.params
+    model = loaded.config.model
+    params = loaded.params
     if model.image is None or "image" not in params:
         raise UserError(f"{path} has no image tower; give a stage-2 run with one, or CLIP weights")
     tower = merge_lora(params, model.lora_alpha)["image"]
-    bare = replace(bare_model(model), touch=model.image, sensor_tokens=0, patch_encoder="shared", pre_norm=True)
+    bare = replace(
+        bare_model(model), touch=model.image, sensor_tokens=0, patch_encoder="shared", pre_norm=True
+    )
     with precision(loaded.config):
         fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
     touch = load.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)

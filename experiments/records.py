@@ -54,7 +54,9 @@ def differences(several: Iterable[Mapping[str, Any]]) -> str:
     for one in several:
         for name, value in one.items():
             values.setdefault(name, set()).add(str(value))
-    return "; ".join(f"{name} {' and '.join(sorted(some))}" for name, some in values.items() if len(some) > 1)
+    return "; ".join(
+        f"{name} {' and '.join(sorted(some))}" for name, some in values.items() if len(some) > 1
+    )
 
 
 def write_record(path: Path, key: str, record: Mapping[str, Any]) -> None:
@@ -65,7 +67,9 @@ def write_record(path: Path, key: str, record: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with _locked(path.parent):
         records = read_records(path) | {key: dict(record)}
-        lines = [json.dumps({"key": name, **records[name]}, allow_nan=False) for name in sorted(records)]
+        lines = [
+            json.dumps({"key": name, **records[name]}, allow_nan=False) for name in sorted(records)
+        ]
         atomic_write(path, "\n".join(lines) + "\n")
 
 
@@ -76,7 +80,8 @@ def _locked(folder: Path) -> Iterator[None]:
 
     handle = os.open(folder, os.O_RDONLY)
     try:
-        with contextlib.suppress(OSError):  # a disk without locks
+        # a disk without locks
+        with contextlib.suppress(OSError):
             fcntl.flock(handle, fcntl.LOCK_EX)
         yield
     finally:

@@ -33,13 +33,18 @@ class Value(NamedTuple):
 
     def shown(self, form: str = ".1f") -> str:
         """Return `mean [low, high]` in a format of Python."""
-        sides = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
+        sides = (
+            ""
+            if self.low is None or self.high is None
+            else f" [{self.low:{form}}, {self.high:{form}}]"
+        )
         return f"{self.mean:{form}}{sides}"
 
 
 def over_seeds(values: Sequence[float]) -> Value:
     """Return the mean over seeds with its interval (Student's t); of two seeds the interval is the two values."""
-    mean, count = float(np.mean(values)), len(values)
+    mean = float(np.mean(values))
+    count = len(values)
     if count < CLAIM:
         return Value(mean, *((min(values), max(values)) if count == 2 else (None, None)), count)
     half = float(t.ppf(0.975, count - 1) * np.std(values, ddof=1) / np.sqrt(count))
@@ -49,7 +54,9 @@ def over_seeds(values: Sequence[float]) -> Value:
 def shared_difference(first: Seeds, second: Seeds) -> Value | None:
     """Return `first` minus `second` over the seeds that both have, None without any."""
     shared = sorted(first.keys() & second.keys())
-    return over_seeds([first[seed] - second[seed] for seed in shared]) if shared else None
+    if shared:
+        return over_seeds([first[seed] - second[seed] for seed in shared])
+    return None
 
 
 def percent(several: Sequence[Any]) -> Value:

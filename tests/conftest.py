@@ -18,7 +18,9 @@ import pytest
 # Tests compile far more than they compute: both together make compilation five times faster. The flag is of jax 0.10;
 # another version might not know it, and XLA ends the process for a flag that it does not know.
 if jax.__version_info__[:2] == (0, 10):
-    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = (
+        os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
+    )
 jax.config.update("jax_disable_most_optimizations", True)
 # Tracing makes many objects and no garbage: collecting it as often as usual takes a third of the time of tracing.
 gc.set_threshold(50_000, 20, 50)
@@ -26,7 +28,8 @@ gc.set_threshold(50_000, 20, 50)
 LIBC = ctypes.CDLL(None)
 STATM = Path("/proc/self/statm")
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]  # experiments, tests.parity and the tests' helpers
+# experiments, tests.parity and the tests' helpers
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 
 
 def pytest_configure(config):
@@ -48,7 +51,9 @@ def compiled_once(tmp_path_factory):
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:  # workers have folders of their own below that of the session
+    if (
+        "PYTEST_XDIST_WORKER" in os.environ
+    ):  # workers have folders of their own below that of the session
         folder = folder.parent
     settings = {
         "jax_compilation_cache_dir": None,
@@ -59,7 +64,9 @@ def compiled_once(tmp_path_factory):
         jax.config.update(name, value)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        for name, value in (settings | {"jax_compilation_cache_dir": enable_compilation_cache()}).items():
+        for name, value in (
+            settings | {"jax_compilation_cache_dir": enable_compilation_cache()}
+        ).items():
             patch.setenv(name.upper(), str(value))  # for child processes
         yield
 

@@ -25,7 +25,9 @@ BUILD = "import sys; from setuptools import build_meta; build_meta.build_{}(sys.
 def ran(*command: object, cwd: Path) -> str:
     """Run a command without this project in its path, and return its output. Exit with its errors if it fails."""
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    done = subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         sys.exit(f"{' '.join(map(str, command))}\n{done.stderr}")
     return done.stdout
@@ -35,7 +37,8 @@ def build(folder: Path) -> tuple[Path, Path]:
     """Build the wheel and the source archive into a folder."""
     for kind in ("sdist", "wheel"):
         ran(sys.executable, "-c", BUILD.format(kind), folder, cwd=ROOT)
-    (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+    (wheel,) = folder.glob("*.whl")
+    (sdist,) = folder.glob("*.tar.gz")
     return wheel, sdist
 
 
@@ -43,21 +46,31 @@ def metadata_faults(wheel: Path) -> list[str]:
     """Return what the metadata of a wheel lack, as sentences."""
     with zipfile.ZipFile(wheel) as file:
         names = file.namelist()
-        text = file.read(next(name for name in names if name.endswith(".dist-info/METADATA"))).decode()
+        text = file.read(
+            next(name for name in names if name.endswith(".dist-info/METADATA"))
+        ).decode()
     about = message_from_string(text)
-    classifiers, links = about.get_all("Classifier") or [], about.get_all("Project-URL") or []
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    classifiers = about.get_all("Classifier") or []
+    links = about.get_all("Project-URL") or []
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "version"
+    ]
     wanted = {
-        f"the classifier of Python {one}": f"Programming Language :: Python :: {one}" in classifiers for one in VERSIONS
+        f"the classifier of Python {one}": f"Programming Language :: Python :: {one}" in classifiers
+        for one in VERSIONS
     }
     wanted |= {
         "a link to the project": bool(links),
-        "a licence": about["License-Expression"] == "MIT" and any(name.endswith("LICENSE") for name in names),
+        "a licence": about["License-Expression"] == "MIT"
+        and any(name.endswith("LICENSE") for name in names),
         "the README": "```python" in str(about.get_payload()),
         "a summary": bool(about["Summary"]),
         f"the version {version}": about["Version"] == version,
-        "the changelog of the version": f"[{version}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
-        "weights of an encoder": any("weights/encoders/" in name and name.endswith(".safetensors") for name in names),
+        "the changelog of the version": f"[{version}]"
+        in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+        "weights of an encoder": any(
+            "weights/encoders/" in name and name.endswith(".safetensors") for name in names
+        ),
         "py.typed": "anytouch_jax/py.typed" in names,
     }
     return [f"{name} is missing in {wheel.name}" for name, there in wanted.items() if not there]
@@ -86,7 +99,17 @@ def main() -> int:
         return 1
     venv.create(folder / "venv", with_pip=True)
     python = folder / "venv" / "bin" / "python"
-    ran(python, "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check", wheel, cwd=folder)
+    ran(
+        python,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-compile",
+        "--disable-pip-version-check",
+        wheel,
+        cwd=folder,
+    )
     print("installed into an empty environment", flush=True)
     (folder / "empty").mkdir()
     for code, shown in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8")):

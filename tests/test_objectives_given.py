@@ -26,7 +26,8 @@ def floats(*shape):
 
 
 def changed(config, model=None, **objective):
-    model, objective = replace(config.model, **(model or {})), replace(config.objective, **objective)
+    model = replace(config.model, **(model or {}))
+    objective = replace(config.objective, **objective)
     return replace(config, model=model, objective=objective)
 
 
@@ -45,19 +46,26 @@ def test_photographs_have_clips_statistics_and_touches_those_of_imagenet(monkeyp
     match = MatchBatch(pixels(4, 1), SENSOR[:4], pixels(4, 1), SENSOR[:4])
     if head == "mlp":
         match = match._replace(negative=pixels(4, 1), negative_sensor=SENSOR[:4])
-    net, args = build(config.model), (Stage2Batch(align, match), jax.random.key(0), np.float32(0.5))
+    net = build(config.model)
+    args = (Stage2Batch(align, match), jax.random.key(0), np.float32(0.5))
     run = lambda *args: (objectives.stage2_loss({}, *args, net=net, config=config), received)[1]  # noqa: E731
     ((shown, reported, _),) = jax.device_get(jax.jit(run)(*args))
     pairs = [(shown.image, align.image, CLIP), (shown.clip, align.clip, IMAGENET)]
     pairs += [(reported[i], match[i], IMAGENET) for i in ((0, 2, 4) if head == "mlp" else (0, 2))]
     for result, given, (mean, std) in pairs:
         assert result.dtype == jnp.float32
-        np.testing.assert_allclose(result, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5)
+        np.testing.assert_allclose(
+            result, (given / 255 - np.array(mean)) / np.array(std), atol=1e-5
+        )
 
 
 def test_objectives_take_lists_under_strict_types():
     def lists(x):
-        return type(x)(*map(lists, x)) if hasattr(x, "_fields") else x if x is None else np.asarray(x).tolist()
+        if hasattr(x, "_fields"):
+            return type(x)(*map(lists, x))
+        if x is None:
+            return x
+        return np.asarray(x).tolist()
 
     text = np.ones((1, 8), np.int32), np.ones((1, 8), bool), np.asarray([1], np.int32)
     align = AlignBatch(pixels(2, 3), SENSOR[:2], pixels(2), np.asarray([0, 2], np.int32), *text)
@@ -68,11 +76,17 @@ def test_objectives_take_lists_under_strict_types():
         config = tiny_config(stage)
         net = build(config.model)
         for given, progress in ((batch, jnp.float32(0.5)), (lists(batch), 0.5)):
-            run = partial(loss, batch=given, key=jax.random.key(0), progress=progress, net=net, config=config)
+            run = partial(
+                loss, batch=given, key=jax.random.key(0), progress=progress, net=net, config=config
+            )
             with jax.numpy_dtype_promotion("strict"):
-                (value, metrics), _ = jax.eval_shape(jax.value_and_grad(run, has_aux=True), net.abstract())
+                (value, metrics), _ = jax.eval_shape(
+                    jax.value_and_grad(run, has_aux=True), net.abstract()
+                )
             assert value.shape == () and value.dtype == jnp.float32 and metrics
-            assert objectives.trained_by(given, config=config) == objectives.trained_by(batch, config=config)
+            assert objectives.trained_by(given, config=config) == objectives.trained_by(
+                batch, config=config
+            )
 
 
 @pytest.mark.parametrize("stage", [1, 2])
@@ -82,10 +96,13 @@ def test_an_empty_batch_has_a_loss_of_0(stage):
     text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), SENSOR[:0]
     align = AlignBatch(pixels(0, 3), SENSOR[:0], pixels(0), SENSOR[:0], *text)
     match = MatchBatch(*(pixels(0, 1), SENSOR[:0]) * 3)
-    batch = TouchBatch(pixels(0, 4), SENSOR[:0], fields) if stage == 1 else Stage2Batch(align, match)
+    batch = (
+        TouchBatch(pixels(0, 4), SENSOR[:0], fields) if stage == 1 else Stage2Batch(align, match)
+    )
     config = tiny_config(stage, **({"fields": 8} if stage == 1 else {}))
     config = replace(config, model=replace(config.model, attention="mapped"))
-    net, loss = build(config.model), (objectives.stage1_loss, objectives.stage2_loss)[stage - 1]
+    net = build(config.model)
+    loss = (objectives.stage1_loss, objectives.stage2_loss)[stage - 1]
     run = lambda p: loss(p, batch, jax.random.key(0), 0.5, net=net, config=config)[0]  # noqa: E731
     value, slopes = jax.jit(jax.value_and_grad(run))(net.init(jax.random.key(0)))
     assert float(value) == 0 and all(np.isfinite(one).all() for one in jax.tree.leaves(slopes))
@@ -93,36 +110,49 @@ def test_an_empty_batch_has_a_loss_of_0(stage):
 
 def half(batch, i):
     """Half 0 or 1 of eight rows, and of the six slots of each kind."""
-    rows, slots = slice(4 * i, 4 * i + 4), slice(3 * i, 3 * i + 3)
+    rows = slice(4 * i, 4 * i + 4)
+    slots = slice(3 * i, 3 * i + 3)
     if isinstance(batch, MatchBatch):
         return MatchBatch(*(None if part is None else part[rows] for part in batch))
     touch = batch.clip[rows], batch.sensor[rows]
     image = batch.image[slots], batch.image_row[slots] - 4 * i
-    return AlignBatch(*touch, *image, batch.text[slots], batch.text_mask[slots], batch.text_row[slots] - 4 * i)
+    return AlignBatch(
+        *touch, *image, batch.text[slots], batch.text_mask[slots], batch.text_row[slots] - 4 * i
+    )
 
 
 @pytest.mark.parametrize("what", ["align", "match"])
 def test_groups_are_halves_that_do_not_know_of_each_other(what):
     config = changed(tiny_config(2), {"match_head": "cosine"}, center_embeddings=False)
-    net, params = compiled(config.model).net, compiled(config.model).params
+    net = compiled(config.model).net
+    params = compiled(config.model).params
     if what == "align":
         text = RNG.integers(1, 40, (6, 8)).astype(np.int32)
         rows = np.asarray([1, 0, 2, 7, 4, 6]), np.asarray([3, 1, 2, 4, 7, 6])
         batch = AlignBatch(floats(8, 1), SENSOR, floats(6), rows[0], text, text > 0, rows[1])
     else:
-        place = np.asarray([5, 2, 5, 1, 2, 3, 3, 5])  # some twice in a half, some in both
+        # some twice in a half, some in both
+        place = np.asarray([5, 2, 5, 1, 2, 3, 3, 5])
         batch = MatchBatch(floats(8, 1), SENSOR, floats(8, 1), SENSOR, place=place)
 
     @partial(jax.jit, static_argnums=1)
     def terms(batch, groups):
         batch = Stage2Batch(batch, None) if what == "align" else Stage2Batch(None, batch)
-        return objectives.stage2_terms(params, batch, None, net=net, config=changed(config, groups=groups))
+        return objectives.stage2_terms(
+            params, batch, None, net=net, config=changed(config, groups=groups)
+        )
 
     total, result = terms(batch, 2)
     halves = [terms(half(batch, i), 1) for i in (0, 1)]
-    names = ["align", "touch_to_vision", "text_to_touch", "vision_to_text"] if what == "align" else ["match"]
+    names = (
+        ["align", "touch_to_vision", "text_to_touch", "vision_to_text"]
+        if what == "align"
+        else ["match"]
+    )
     for name in names:
-        np.testing.assert_allclose(result[name], np.mean([half[name] for _, half in halves]), rtol=1e-5)
+        np.testing.assert_allclose(
+            result[name], np.mean([half[name] for _, half in halves]), rtol=1e-5
+        )
     np.testing.assert_allclose(total, np.mean([value for value, _ in halves]), rtol=1e-5)
     assert abs(float(terms(batch, 1)[1][what]) / float(result[what]) - 1) > 0.05
 
@@ -132,7 +162,8 @@ def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
     config = changed(tiny_config(2), {"match_head": head})
     net = compiled(config.model)
     params = net.params
-    touches = [(floats(5, 1), SENSOR[:5]) for _ in range(3)]  # an odd number: never half of them right
+    # an odd number: never half of them right
+    touches = [(floats(5, 1), SENSOR[:5]) for _ in range(3)]
     z = [np.asarray(net.encode_touch(params, *touch)) for touch in touches]
     z = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in z]
     same, other = (np.asarray(net.match(params, z[0], x)) for x in z[1:])
@@ -148,7 +179,11 @@ def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
 def test_all_shown_or_all_hidden_is_finite_even_of_one_row(ratio, frames):
     config = changed(tiny_config(1), mask_ratio=ratio)
     net = compiled(config.model)
-    terms = jax.jit(jax.value_and_grad(partial(objectives.stage1_terms, net=net.net, config=config), has_aux=True))
+    terms = jax.jit(
+        jax.value_and_grad(
+            partial(objectives.stage1_terms, net=net.net, config=config), has_aux=True
+        )
+    )
     noise = RNG.random((1, 16)).astype("f4")
     (loss, metrics), grads = terms(net.params, floats(1, frames), SENSOR[:1], noise)
     assert np.isfinite(loss) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))

@@ -24,12 +24,16 @@ def touches(frames: int) -> TouchBatch:
 def aligned(frames: int, images: int, texts: int) -> AlignBatch:
     text = np.ones((texts, 8), np.int32)
     image = np.zeros((images, 28, 28, 3), np.uint8)
-    return AlignBatch(*touches(frames)[:2], image, np.arange(images), text, text > 0, np.arange(texts))
+    return AlignBatch(
+        *touches(frames)[:2], image, np.arange(images), text, text > 0, np.arange(texts)
+    )
 
 
 def matched(frames: int, head: str) -> MatchBatch:
     one = touches(frames)[:2]
-    return MatchBatch(*one, *one, place=np.arange(ROWS)) if head == "cosine" else MatchBatch(*one, *one, *one)
+    if head == "cosine":
+        return MatchBatch(*one, *one, place=np.arange(ROWS))
+    return MatchBatch(*one, *one, *one)
 
 
 def batches(config: Config, every: bool) -> list:
@@ -39,12 +43,16 @@ def batches(config: Config, every: bool) -> list:
     """
     if config.stage == 1:
         return [touches(1), touches(4)]
-    frames, head = 4 if config.recipe == "release" else 3, config.model.match_head
+    frames = 4 if config.recipe == "release" else 3
+    head = config.model.match_head
     images, texts = (2 if tower else 0 for tower in (config.model.image, config.model.text))
     slots = {(1, 0, 0): 0, (1, images, 0): 0, (frames, 0, texts): 0, (frames, images, texts): 0}
     aligns = [aligned(*counts) for counts in slots]
     matches = [matched(count, head) for count in (1, 3)] if head != "none" else [None, None]
-    pairs = [(align, None) for align in aligns] + [(aligns[0], matches[1]), (aligns[-1], matches[0])]
+    pairs = [(align, None) for align in aligns] + [
+        (aligns[0], matches[1]),
+        (aligns[-1], matches[0]),
+    ]
     pairs += [(None, matches[0])]
     return [Stage2Batch(*pair) for pair in (pairs if every else [pairs[-2], pairs[0]])]
 
@@ -56,33 +64,56 @@ def check(config: Config, every: bool = True) -> None:
     sizes = {name: leaf.size for name, leaf in flatten(params).items()}
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
     for batch in batches(config, every):
-        used = used_parameters(partial(loss, net=net, config=config), params, batch, jax.random.key(0), 0.5)
+        used = used_parameters(
+            partial(loss, net=net, config=config), params, batch, jax.random.key(0), 0.5
+        )
         trained = match_rules(objectives.trained_by(batch, config=config), flatten(params))
         # A model without sensor tokens has an empty parameter for them, which the program reads.
-        wrong = {name for name, value in flatten(used).items() if value != trained[name] and sizes[name]}
+        wrong = {
+            name for name, value in flatten(used).items() if value != trained[name] and sizes[name]
+        }
         assert not wrong, jax.tree.map(np.shape, batch)
 
 
 PARTS = [{}, {"decoder_sensor_tokens": True}, {"patch_encoder": "sensor"}]
-HEADS = [("paper", "mlp"), ("paper", "cosine"), ("paper", "none"), ("release", "linear"), ("release", "cosine")]
-BASELINES = [(name, stage) for name, baseline in presets.BASELINES.items() for stage in baseline.stages]
+HEADS = [
+    ("paper", "mlp"),
+    ("paper", "cosine"),
+    ("paper", "none"),
+    ("release", "linear"),
+    ("release", "cosine"),
+]
+BASELINES = [
+    (name, stage) for name, baseline in presets.BASELINES.items() for stage in baseline.stages
+]
 
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("next_frame", [True, False])
 def test_stage_1(part, next_frame):
     config = tiny_config(1, **part)
-    check(replace(config, objective=replace(config.objective, next_frame=next_frame, norm_pix_loss=True)))
+    check(
+        replace(
+            config, objective=replace(config.objective, next_frame=next_frame, norm_pix_loss=True)
+        )
+    )
 
 
 @pytest.mark.parametrize("towers", ["scratch", "pretrained"])
 @pytest.mark.parametrize(("recipe", "head"), HEADS)
 def test_stage_2(recipe, head, towers):
     config = tiny_config(2, recipe, towers, match_head=head)
-    check(replace(config, objective=replace(config.objective, match_keep=0.5 if towers == "pretrained" else 1.0)))
+    check(
+        replace(
+            config,
+            objective=replace(config.objective, match_keep=0.5 if towers == "pretrained" else 1.0),
+        )
+    )
 
 
-@pytest.mark.parametrize("part", [*PARTS[1:], {"remat": True}, {"attention": "mapped"}, {"dtype": "bfloat16"}])
+@pytest.mark.parametrize(
+    "part", [*PARTS[1:], {"remat": True}, {"attention": "mapped"}, {"dtype": "bfloat16"}]
+)
 def test_parts_of_the_network(part):
     check(tiny_config(2, "release", **part), every=False)
 

@@ -51,7 +51,8 @@ def clips_only(config):
 @pytest.fixture(scope="session")
 def aligned(tmp_path_factory, world, straight):
     """Stage 2 on clips from that stage 1, four steps at once: (run folder, result, log)."""
-    run, log = tmp_path_factory.mktemp("aligned") / "run", []
+    run = tmp_path_factory.mktemp("aligned") / "run"
+    log = []
     return run, train(clips_only(run_config(world, 2)), run, log, init=straight[0]), log
 
 
@@ -61,7 +62,9 @@ def assert_equal_results(first, second):
 
 
 def assert_equal_arrays(wanted, arrays):
-    assert arrays.keys() == wanted.keys() and any(name.startswith("opt_state/mu") for name in arrays)
+    assert arrays.keys() == wanted.keys() and any(
+        name.startswith("opt_state/mu") for name in arrays
+    )
     for name, array in wanted.items():
         np.testing.assert_array_equal(arrays[name], array, err_msg=name)
 
@@ -70,15 +73,23 @@ def test_a_run_folder(straight, world):
     run, result = straight
     assert (result.step, result.traces) == (4, 2)  # stills and clips
     asked = run_config(world)
-    assert from_json((run / "config.json").read_text()) == replace(asked, optim=replace(asked.optim, warmup=1))
+    assert from_json((run / "config.json").read_text()) == replace(
+        asked, optim=replace(asked.optim, warmup=1)
+    )
     lines = read_metrics(run)
     assert [line["step"] for line in lines] == [0, 1, 2, 3]
     assert ["next_frame" in line for line in lines] == [False, True, False, True]
     assert [line["p_u"] for line in lines] == [0.0, 0.1875, 0.375, 0.5625]
     assert all(line["loss"] > 0 and line["skipped"] == 0 and line["samples"] == 8 for line in lines)
     metadata = checkpoint.read_metadata(run)
-    assert metadata["sensors"] == list(SENSORS) and metadata["source"] == {"init": None, "clip": None}
-    assert metadata["preprocessing"]["touch"]["size"] == 28 and metadata["preprocessing"]["touch"]["channels"] == "RGB"
+    assert metadata["sensors"] == list(SENSORS) and metadata["source"] == {
+        "init": None,
+        "clip": None,
+    }
+    assert (
+        metadata["preprocessing"]["touch"]["size"] == 28
+        and metadata["preprocessing"]["touch"]["channels"] == "RGB"
+    )
 
 
 def test_a_resumed_run_equals_one_run_bit_for_bit(straight, world, tmp_path):
@@ -91,8 +102,12 @@ def test_a_resumed_run_equals_one_run_bit_for_bit(straight, world, tmp_path):
     assert second.resumed == 2 and "continuing from the checkpoint of step 2" in log
     assert_equal_results(result, second)
     assert read_metrics(tmp_path / "r") == read_metrics(run)
-    figures = sorted((tmp_path / "r" / "figures").iterdir())  # at the end of each part
-    assert [figure.name for figure in figures] == ["reconstruction_000002.png", "reconstruction_000004.png"]
+    # at the end of each part
+    figures = sorted((tmp_path / "r" / "figures").iterdir())
+    assert [figure.name for figure in figures] == [
+        "reconstruction_000002.png",
+        "reconstruction_000004.png",
+    ]
     assert all(figure.stat().st_size > 1000 for figure in figures)
     assert train(config, tmp_path / "r", log).step == 4 and "nothing to do" in log[-1]
 
@@ -101,16 +116,32 @@ def test_a_resumed_run_equals_one_run_bit_for_bit(straight, world, tmp_path):
 @pytest.mark.parametrize("stage", [1, 2])
 def test_two_steps_and_two_more_are_bit_for_bit_four_as_users_run_them(world, tmp_path, stage):
     """Each part is its own process, on one device and with all of XLA's optimisations, unlike this process."""
-    settings = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
-    settings["PYTHONPATH"] = os.pathsep.join(str(p) for p in (TESTS.parent / "src", TESTS, TESTS / "support"))
+    settings = {
+        key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))
+    }
+    settings["PYTHONPATH"] = os.pathsep.join(
+        str(p) for p in (TESTS.parent / "src", TESTS, TESTS / "support")
+    )
 
     def part(name, stop):
-        command = [sys.executable, "-c", ALONE, str(world), str(stage), str(tmp_path / name), str(stop)]
+        command = [
+            sys.executable,
+            "-c",
+            ALONE,
+            str(world),
+            str(stage),
+            str(tmp_path / name),
+            str(stop),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, env=settings, timeout=900)
         assert done.returncode == 0, done.stderr[-2000:]
         return done.stdout.split()
 
-    assert [part("whole", 4), part("parts", 2), part("parts", 4)] == [["0", "4"], ["0", "2"], ["2", "4"]]
+    assert [part("whole", 4), part("parts", 2), part("parts", 4)] == [
+        ["0", "4"],
+        ["0", "2"],
+        ["2", "4"],
+    ]
     whole, parts_ = (dict(np.load(tmp_path / f"{name}.npz")) for name in ("whole", "parts"))
     assert_equal_arrays(whole, parts_)
     assert read_metrics(tmp_path / "parts") == read_metrics(tmp_path / "whole")
@@ -154,15 +185,18 @@ def test_stage_two_starts_from_stage_one_and_learns(straight, aligned, world, tm
 
 
 def test_stage_two_resumes_bit_for_bit_without_its_stage_one(straight, aligned, world, tmp_path):
-    config, log = clips_only(run_config(world, 2)), []
-    init, run = shutil.copytree(straight[0], tmp_path / "stage1"), tmp_path / "r"
+    config = clips_only(run_config(world, 2))
+    log = []
+    init = shutil.copytree(straight[0], tmp_path / "stage1")
+    run = tmp_path / "r"
     first = train(config, run, log, init=init, stop_after=1)
     # the learning rate of step 0 is 0: what stage 1 learned is still whole
     before = parts(load_model(init).params, "touch", "decoder")
     for name, array in parts(first.params, "touch", "decoder").items():
         np.testing.assert_array_equal(array, before[name], err_msg=name)
     tokenizer = (run / "tokenizer.json").read_bytes()
-    shutil.rmtree(init)  # a resumed run does not need it, whether or not it is named
+    # a resumed run does not need it, whether or not it is named
+    shutil.rmtree(init)
     assert train(config, run, log, init=init, stop_after=1).step == 1
     assert not any("is not read" in line for line in log)
     assert train(config, run, log, init=straight[0], clip="other.bin", stop_after=1).step == 1
@@ -171,10 +205,16 @@ def test_stage_two_resumes_bit_for_bit_without_its_stage_one(straight, aligned, 
     last = train(config, run, log)
     assert (last.resumed, last.step, last.traces) == (1, 4, 1)
     assert_equal_results(aligned[1], last)
-    assert (run / "tokenizer.json").read_bytes() == tokenizer and read_metrics(run) == read_metrics(aligned[0])
+    assert (run / "tokenizer.json").read_bytes() == tokenizer and read_metrics(run) == read_metrics(
+        aligned[0]
+    )
     learned = ("touch", "image", "text", "matcher", "logit_scale")
     after = parts(last.params, *learned)
-    assert not [name for name, array in parts(first.params, *learned).items() if np.array_equal(array, after[name])]
+    assert not [
+        name
+        for name, array in parts(first.params, *learned).items()
+        if np.array_equal(array, after[name])
+    ]
 
 
 def test_stage_two_of_the_release(straight, world, tmp_path):
@@ -182,8 +222,12 @@ def test_stage_two_of_the_release(straight, world, tmp_path):
     config = clips_only(run_config(world, 2, "release"))
     result = train(config, tmp_path / "r", init=run)
     lines = read_metrics(tmp_path / "r")
-    kinds = {("align" in line, "match" in line, "reconstruction" in line, "next_frame" in line) for line in lines}
-    assert kinds == {(True, False, True, True), (False, True, False, False)}  # never both in a step
+    kinds = {
+        ("align" in line, "match" in line, "reconstruction" in line, "next_frame" in line)
+        for line in lines
+    }
+    # never both in a step
+    assert kinds == {(True, False, True, True), (False, True, False, False)}
     assert {line["samples"] for line in lines} == {8, 4} and result.traces == 2
     for line in lines:
         sum_ = line.get("align", 0) + line.get("reconstruction", 0) + line.get("next_frame", 0)
@@ -200,21 +244,33 @@ def clip_folder(folder, config):
     return replace(config, model=model), params
 
 
-def test_pretrained_towers_keep_the_text_tower_and_adapt_the_image_tower_by_lora(straight, world, tmp_path):
-    config, clip = clip_folder(tmp_path / "clip", clips_only(run_config(world, 2, towers="pretrained", steps=4)))
+def test_pretrained_towers_keep_the_text_tower_and_adapt_the_image_tower_by_lora(
+    straight, world, tmp_path
+):
+    config, clip = clip_folder(
+        tmp_path / "clip", clips_only(run_config(world, 2, towers="pretrained", steps=4))
+    )
     result = train(config, tmp_path / "r", init=straight[0], clip=tmp_path / "clip", stop_after=3)
     assert (tmp_path / "r" / "tokenizer.json").exists()
-    for name, array in parts(clip, "image", "text").items():  # frozen, and CLIP's own
-        np.testing.assert_array_equal(parts(result.params, "image", "text")[name], array, err_msg=name)
+    # frozen, and CLIP's own
+    for name, array in parts(clip, "image", "text").items():
+        np.testing.assert_array_equal(
+            parts(result.params, "image", "text")[name], array, err_msg=name
+        )
     lora = parts(result.params, "lora")
-    assert all(np.any(np.asarray(array)) for array in lora.values())  # b starts at zero, so it has learned
+    # b starts at zero, so it has learned
+    assert all(np.any(np.asarray(array)) for array in lora.values())
     assert all(line["align"] > 0 for line in read_metrics(tmp_path / "r"))
-    assert train(config, tmp_path / "r").resumed == 3  # without CLIP's weights
-    assert "model.bin" in refused(config, tmp_path / "s", init=straight[0], clip=tmp_path / "clip" / "model.bin")
+    # without CLIP's weights
+    assert train(config, tmp_path / "r").resumed == 3
+    assert "model.bin" in refused(
+        config, tmp_path / "s", init=straight[0], clip=tmp_path / "clip" / "model.bin"
+    )
 
 
 def test_wrong_starts_are_one_sentence(straight, world, tmp_path):
-    stage2, pretrained = run_config(world, 2), run_config(world, 2, towers="pretrained")
+    stage2 = run_config(world, 2)
+    pretrained = run_config(world, 2, towers="pretrained")
     (tmp_path / "empty").mkdir()
     for init in ("gone", "empty"):
         assert str(tmp_path / init) in refused(stage2, tmp_path / "a", init=tmp_path / init)
@@ -245,7 +301,9 @@ def test_settings_without_effect_are_one_sentence(world, tmp_path):
         assert words in refused(config, tmp_path / "r") and not (tmp_path / "r").exists()
     jax.config.update("jax_enable_x64", True)
     try:
-        assert "unset it, or add --model.dtype float64" in refused(run_config(world), tmp_path / "r")
+        assert "unset it, or add --model.dtype float64" in refused(
+            run_config(world), tmp_path / "r"
+        )
     finally:
         jax.config.update("jax_enable_x64", False)
     config = run_config(world, 2)
@@ -260,13 +318,19 @@ def test_two_processes_never_train_one_run(straight, world, tmp_path):
     for started in (False, True):
         run.mkdir(exist_ok=True)
         with (run / ".lock").open("ab") as held:
-            fcntl.flock(held, fcntl.LOCK_EX)  # as another process holds it, from before its first checkpoint
+            # as another process holds it, from before its first checkpoint
+            fcntl.flock(held, fcntl.LOCK_EX)
             before = sorted(path.name for path in run.iterdir())
             assert f"another process trains in {run}" in refused(
                 clips_only(run_config(world, 2)), run, init=straight[0]
             )
-            assert sorted(path.name for path in run.iterdir()) == before  # not even a tokenizer
-        assert started or train(clips_only(run_config(world, 2)), run, init=straight[0], stop_after=1).step == 1
+            # not even a tokenizer
+            assert sorted(path.name for path in run.iterdir()) == before
+        assert (
+            started
+            or train(clips_only(run_config(world, 2)), run, init=straight[0], stop_after=1).step
+            == 1
+        )
 
 
 def test_warm_up_is_an_epoch_where_the_run_is_long(world, tmp_path):
@@ -275,16 +339,19 @@ def test_warm_up_is_an_epoch_where_the_run_is_long(world, tmp_path):
         run = tmp_path / str(steps)
         train(run_config(world, steps=steps), run, stop_after=0)
         assert from_json((run / "config.json").read_text()).optim.warmup == wanted
-        train(run_config(world, steps=steps), run, stop_after=0)  # and goes on by the same command
+        # and goes on by the same command
+        train(run_config(world, steps=steps), run, stop_after=0)
 
 
 def test_a_run_does_not_resume_on_other_rows(world, tmp_path):
-    rows, file = [list(row.values()) for row in read_rows(world)], world.parent / "grown.csv"
+    rows = [list(row.values()) for row in read_rows(world)]
+    file = world.parent / "grown.csv"
     write_manifest(file, rows[:-1])
     train(run_config(file), tmp_path / "r", stop_after=1)
     write_manifest(file, rows)
     message = refused(run_config(file), tmp_path / "r")
     assert "have changed since" in message and "--init" in message
     moved = shutil.copytree(world.parent, tmp_path / "moved")
-    write_manifest(moved / "other.csv", rows[:-1])  # the same rows and files at another place
+    # the same rows and files at another place
+    write_manifest(moved / "other.csv", rows[:-1])
     assert train(run_config(moved / "other.csv"), tmp_path / "r", stop_after=2).step == 2

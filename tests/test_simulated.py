@@ -26,22 +26,38 @@ TINY = Stack(width=16, depth=1, heads=2, mlp=16)
 
 def tiny(stage=1, **changes):
     config = preset("tiny", stage=stage)
-    model = replace(config.model, image_size=28, touch=TINY, decoder=TINY, embed=8, fields=4 if stage == 1 else 0)
+    model = replace(
+        config.model,
+        image_size=28,
+        touch=TINY,
+        decoder=TINY,
+        embed=8,
+        fields=4 if stage == 1 else 0,
+    )
     if stage == 2:
         text = replace(config.model.text, stack=TINY)
         model = replace(model, image=TINY, text=text, match_head="cosine")
     settings = {
-        "data.manifests": (SIMULATED,), "data.batch_size": 8, "data.clip_share": 0.0, "data.jitter": (0.0,) * 4,
-        "data.background": "either", "simulated.objects": 13, "simulated.sensors": ("digit", "gelsight_mini"),
-        "simulated.places": 2, "run.steps": 4, "run.save_every": 1, "run.figure_every": 0,
-    }  # fmt: skip
+        "data.manifests": (SIMULATED,),
+        "data.batch_size": 8,
+        "data.clip_share": 0.0,
+        "data.jitter": (0.0,) * 4,
+        "data.background": "either",
+        "simulated.objects": 13,
+        "simulated.sensors": ("digit", "gelsight_mini"),
+        "simulated.places": 2,
+        "run.steps": 4,
+        "run.save_every": 1,
+        "run.figure_every": 0,
+    }
     return replace(config, model=model).with_settings(settings | changes)
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     """Two units that touch two places, four frames each, one without a picture of its gel."""
-    folder, rng = tmp_path_factory.mktemp("real"), np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("real")
+    rng = np.random.default_rng(0)
     lines = ["path,sensor,sequence,frame_index,split,touch,unit,background_path,text"]
     for unit in ("left", "right"):
         cv2.imwrite(str(folder / f"{unit}.png"), np.full((40, 40, 3), 90, np.uint8))
@@ -58,11 +74,19 @@ def recordings(tmp_path_factory):
 
 def test_a_batch_depends_on_seed_and_step_alone():
     config = tiny(**{"simulated.reuse": 2})
-    loader, again = SimulatedLoader(config), SimulatedLoader(config)
+    loader = SimulatedLoader(config)
+    again = SimulatedLoader(config)
     batches = [loader.batch(step) for step in range(3)]
     assert_same(batches[2][:2], again.batch(2)[:2])
-    assert batches[0].clip.shape == (8, 1, 28, 28, 3) and batches[0].fields.depth.shape == (4, 14, 14)
-    changes = [np.abs(np.asarray(batches[n].clip, int) - np.asarray(batches[0].clip, int)).max() for n in (1, 2)]
+    assert batches[0].clip.shape == (8, 1, 28, 28, 3) and batches[0].fields.depth.shape == (
+        4,
+        14,
+        14,
+    )
+    changes = [
+        np.abs(np.asarray(batches[n].clip, int) - np.asarray(batches[0].clip, int)).max()
+        for n in (1, 2)
+    ]
     assert min(changes) > 0, "a touch that is drawn again differs by light, another one altogether"
     other = SimulatedLoader(config.with_settings({"run.seed": 1})).batch(0)
     assert np.abs(np.asarray(other.clip, int) - np.asarray(batches[0].clip, int)).max() > 0
@@ -71,13 +95,17 @@ def test_a_batch_depends_on_seed_and_step_alone():
 
 @pytest.mark.slow
 def test_stage_2_mixes_simulated_and_real_pairs(recordings):
-    config = tiny(2, **{"data.weights": ((SIMULATED, 1.0),), "data.manifests": (SIMULATED, str(recordings))})
+    config = tiny(
+        2, **{"data.weights": ((SIMULATED, 1.0),), "data.manifests": (SIMULATED, str(recordings))}
+    )
     manifest = manifests.read((str(recordings),))
     loader = SimulatedLoader(config, manifest, tokenizer=caption_tokenizer(config, manifest))
     align, match, fields = loader.batch(0)
     assert fields is None and match.clip.shape == (8, 1, 28, 28, 3)
     place = np.asarray(match.place)
-    assert list(place[:4]) == [0, 1, 2, 3] and min(place[4:]) >= 4, "four simulated places, then real ones"
+    assert list(place[:4]) == [0, 1, 2, 3] and min(place[4:]) >= 4, (
+        "four simulated places, then real ones"
+    )
     assert set(np.asarray(match.sensor[4:])) == {config.model.sensor_row("gelsight_mini")}
     assert np.all(np.asarray(align.text_row[4:]) == [4, 5, 6, 7]), "every real row has a caption"
     used = np.asarray(align.image_row) < 8
@@ -94,7 +122,9 @@ def test_real_partners_are_of_the_same_place_and_another_unit(recordings):
     np.testing.assert_array_equal(np.asarray(pairs.place)[other], np.asarray(pairs.place))
     assert np.mean(np.asarray(pairs.unit)[other] != np.asarray(pairs.unit)) > 0.9
     gels = np.asarray(real.gel)
-    assert len(gels) == 2 and np.any(np.all(gels[:, 0] == 90, axis=(1, 2, 3))), "one stored picture, one median"
+    assert len(gels) == 2 and np.any(np.all(gels[:, 0] == 90, axis=(1, 2, 3))), (
+        "one stored picture, one median"
+    )
 
 
 def test_augmentation_moves_all_frames_alike():
@@ -112,7 +142,10 @@ def test_a_gel_moves_by_fractions_of_a_pixel_since_its_picture():
     ramp = np.stack([3 * across, 5 * down, 0 * down], -1).astype(np.uint8)
     behind = np.broadcast_to(ramp, (2000, 1, 28, 28, 3))
     moved = moved_gel(jax.random.key(0), touches._replace(background=behind))
-    change = (ramp - np.asarray(moved.background)[:, 0])[:, 10:-10, 10:-10, :2].mean((1, 2)) / (3, 5)
+    change = (ramp - np.asarray(moved.background)[:, 0])[:, 10:-10, 10:-10, :2].mean((1, 2)) / (
+        3,
+        5,
+    )
     np.testing.assert_allclose(change.std(0), MOVED / np.sqrt(3), rtol=0.1)
     assert np.abs(change.mean(0)).max() < 0.03 and np.abs(np.corrcoef(change.T)[0, 1]) < 0.1
     assert moved.clip is touches.clip and moved.fields is touches.fields
@@ -135,4 +168,8 @@ def test_a_run_for_a_time_follows_the_time(tmp_path):
     for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines():
         rates.append(float(line.partition('"learning_rate": ')[2].partition(",")[0]))
     assert 2 < result.step < 1_000_000
-    assert rates[0] == 0 and max(rates) > 0.5 * config.optim.learning_rate and rates[-1] < 0.5 * max(rates)
+    assert (
+        rates[0] == 0
+        and max(rates) > 0.5 * config.optim.learning_rate
+        and rates[-1] < 0.5 * max(rates)
+    )

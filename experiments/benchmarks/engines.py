@@ -39,17 +39,24 @@ ENGINES = {
     "OpenVINO, float32": ("openvino", "f32.onnx"),
     "OpenVINO, int8": ("openvino", "int8.onnx"),
 }
-SENSOR, BATCH = 0, 16
+SENSOR = 0
+BATCH = 16
 
 
-def touches_of(encoder: Encoder, table: Any, split: str, frames: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+def touches_of(
+    encoder: Encoder, table: Any, split: str, frames: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return `count` prepared touches u8 (n, frames, H, W, 3) of a split, and their sensor rows (n,)."""
     rows = retrieval.deepest_rows(table, split=split, frames=frames)
     rows = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
     clips: list[np.ndarray] = []
-    given, _ = embed_rows(encoder, table, rows, frames, edit=lambda part, _: (clips.append(part), part)[1], log=silent)
+    given, _ = embed_rows(
+        encoder, table, rows, frames, edit=lambda part, _: (clips.append(part), part)[1], log=silent
+    )
     sensors = table.text_column("sensor")[given]
-    return np.concatenate(clips), np.array([encoder.sensor_row(one, silent) for one in sensors], np.int32)
+    return np.concatenate(clips), np.array(
+        [encoder.sensor_row(one, silent) for one in sensors], np.int32
+    )
 
 
 def encoders_on(source: Encoder, table: Any, frames: int, folder: Path) -> dict[str, Encoder]:
@@ -63,14 +70,21 @@ def encoders_on(source: Encoder, table: Any, frames: int, folder: Path) -> dict[
     }
 
 
-def errors(encoders: dict[str, Encoder], touches: tuple[np.ndarray, np.ndarray]) -> dict[str, float]:
+def errors(
+    encoders: dict[str, Encoder], touches: tuple[np.ndarray, np.ndarray]
+) -> dict[str, float]:
     """Return the largest difference of features from the first engine, as a share of its largest feature."""
     found = {
-        name: run_in_batches(lambda part, one=one: one.encode_touch(*part), zip(*touches, strict=True))
+        name: run_in_batches(
+            lambda part, one=one: one.encode_touch(*part), zip(*touches, strict=True)
+        )
         for name, one in encoders.items()
     }
     live = next(iter(found.values()))
-    return {name: float(np.abs(values - live).max() / np.abs(live).max()) for name, values in found.items()}
+    return {
+        name: float(np.abs(values - live).max() / np.abs(live).max())
+        for name, values in found.items()
+    }
 
 
 def one_touch(encoder: Encoder, frames: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -89,33 +103,50 @@ def timed(encoders: dict[str, Encoder], frames: int, rounds: int) -> dict[str, d
         for name, run in ready.items():
             begin = time.perf_counter()
             run(touches[number % BATCH])
-            times[name] += [time.perf_counter() - begin] if number else []  # the first one compiles
+            # the first one compiles
+            times[name] += [time.perf_counter() - begin] if number else []
             time.sleep(0.002)  # threads of an engine wait actively for a while
     base = np.array(next(iter(times.values())))
     return {
-        name: {"p50_ms": 1e3 * float(np.median(one)), "p99_ms": 1e3 * float(np.percentile(one, 99)),
-               "ratio": float(np.median(np.array(one) / base)), "rounds": rounds}
+        name: {
+            "p50_ms": 1e3 * float(np.median(one)),
+            "p99_ms": 1e3 * float(np.percentile(one, 99)),
+            "ratio": float(np.median(np.array(one) / base)),
+            "rounds": rounds,
+        }
         for name, one in times.items()
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("encoders", nargs="+", help="names, run folders or weights files")
-    parser.add_argument("--corpus", type=Path, required=True, help="manifest of touches by several sensors")
+    parser.add_argument(
+        "--corpus", type=Path, required=True, help="manifest of touches by several sensors"
+    )
     parser.add_argument("--frames", type=int, default=1, help="of a touch")
     parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--out", type=Path, default=Path("experiments/results/engines.jsonl"))
     options = parser.parse_args()
-    table, about = manifests.read(options.corpus), dataclasses.asdict(machine.describe())
+    table = manifests.read(options.corpus)
+    about = dataclasses.asdict(machine.describe())
     for name in options.encoders:
         source = load_encoder(name, engine="xla").computed_in("float32")
         shown = name if options.frames == 1 else f"{name}, clips"
         with TemporaryDirectory() as folder:
             several = encoders_on(source, table, options.frames, Path(folder))
             wrong = errors(several, touches_of(source, table, "test", options.frames, CALIBRATION))
-            for number, (engine, found) in enumerate(timed(several, options.frames, options.rounds).items()):
-                record = {"encoder": shown, "engine": engine, "error": wrong[engine], "data": table.content_hash}
+            for number, (engine, found) in enumerate(
+                timed(several, options.frames, options.rounds).items()
+            ):
+                record = {
+                    "encoder": shown,
+                    "engine": engine,
+                    "error": wrong[engine],
+                    "data": table.content_hash,
+                }
                 write_record(options.out, f"{shown}/{number}", record | found | {"machine": about})
                 print(shown, engine, wrong[engine], found, flush=True)
 

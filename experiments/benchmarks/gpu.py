@@ -50,8 +50,13 @@ def simulation(count: int, rounds: int) -> Row:
         jax.block_until_ready(draw(jax.random.key(number), world).clip)
         times.append(time.perf_counter() - begin)
     seconds = sorted(times[1:])[rounds // 2]
-    return {"variant": "float32", "samples": count, "seconds": seconds, "frames_per_second": count / seconds,
-            "compile_seconds": times[0] - seconds}  # fmt: skip
+    return {
+        "variant": "float32",
+        "samples": count,
+        "seconds": seconds,
+        "frames_per_second": count / seconds,
+        "compile_seconds": times[0] - seconds,
+    }
 
 
 def errors(work: Workload, fast: Variant) -> dict[str, float]:
@@ -59,7 +64,10 @@ def errors(work: Workload, fast: Variant) -> dict[str, float]:
     small = work.resized(min(work.samples, speed.ERROR_SAMPLES))
     state = first_state(work.config)
     params = jax.device_get(merge(state.trainable, state.frozen))
-    noise = jnp.zeros((small.samples, small.config.model.patches)) + jnp.arange(small.config.model.patches)[None]
+    noise = (
+        jnp.zeros((small.samples, small.config.model.patches))
+        + jnp.arange(small.config.model.patches)[None]
+    )
     exact, found = (speed.values_in(one, small, params, noise) for one in (BASELINE, fast))
     return {f"error_{name}": speed.relative(found[name], exact[name]) for name in exact}
 
@@ -70,7 +78,11 @@ def measured(options: argparse.Namespace, end: float) -> Iterator[tuple[str, str
     try:
         yield "tiny", "endless simulation", [simulation(count, rounds)]
     except (ImportError, RuntimeError) as error:
-        yield "tiny", "endless simulation", [{"variant": "none", "note": str(error).splitlines()[0]}]
+        yield (
+            "tiny",
+            "endless simulation",
+            [{"variant": "none", "note": str(error).splitlines()[0]}],
+        )
     fast = CUDNN if jax.default_backend() == "gpu" else Variant("bfloat16", BFLOAT16)
     size, presets = (512, ["tiny"]) if options.quick else (None, list(BATCHES))
     for preset in presets:
@@ -82,23 +94,38 @@ def measured(options: argparse.Namespace, end: float) -> Iterator[tuple[str, str
             work = next(one for one in workloads(what, preset, batch) if one.name == name)
             title = f"{name}, preset {preset}"
             try:
-                rows = speed.measure(work, (BASELINE, fast), rounds=1 if options.quick else 3, with_errors=False,
-                                     peak_size=size, log=log)  # fmt: skip
+                rows = speed.measure(
+                    work,
+                    (BASELINE, fast),
+                    rounds=1 if options.quick else 3,
+                    with_errors=False,
+                    peak_size=size,
+                    log=log,
+                )
                 yield preset, title, [speed.record_of(row) for row in rows]
                 if time.monotonic() < end:
                     rows[1:] = [replace(row, **errors(work, fast)) for row in rows[1:]]
                     rows[0] = replace(rows[0], error_output=0.0, error_loss=0.0, error_gradient=0.0)
                     yield preset, title, [speed.record_of(row) for row in rows]
-            except (UserError, RuntimeError) as error:  # the other workloads are still worth their time
+            except (
+                UserError,
+                RuntimeError,
+            ) as error:  # the other workloads are still worth their time
                 log(f"{title}: {str(error).splitlines()[0]}")
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line `args` and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=4, help="after which nothing is started")
-    parser.add_argument("--quick", action="store_true", help="preset tiny in tiny batches, to see that it works")
-    parser.add_argument("--out", type=Path, default=Path("runs/bench/gpu.jsonl"), help="file of results")
+    parser.add_argument(
+        "--quick", action="store_true", help="preset tiny in tiny batches, to see that it works"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/bench/gpu.jsonl"), help="file of results"
+    )
     options = parser.parse_args(args)
     end = time.monotonic() + 60 * options.minutes
     return with_status(lambda: store(measured(options, end), options) or 0)

@@ -16,8 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-SIZES = {"cpu": 2048, "gpu": 8192, "tpu": 8192}  # of the square matrices whose product is the peak
-VECTORS = {"amx_tile": "AMX", "avx512f": "AVX-512", "avx2": "AVX2"}  # flags of Linux, the widest first
+# of the square matrices whose product is the peak
+SIZES = {"cpu": 2048, "gpu": 8192, "tpu": 8192}
+# flags of Linux, the widest first
+VECTORS = {"amx_tile": "AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,10 @@ class Machine:
     def sentence(self) -> str:
         """One line for a report."""
         processor = f"{self.processor}{' with ' * bool(self.vectors)}{self.vectors}"
-        parts = [f"{self.devices} x {self.device}", f"{processor}, {self.cores} cores, {self.memory_gib:.0f} GiB"]
+        parts = [
+            f"{self.devices} x {self.device}",
+            f"{processor}, {self.cores} cores, {self.memory_gib:.0f} GiB",
+        ]
         parts += [f"Python {self.python}", f"jax {self.jax}", self.system]
         return f"{'; '.join(parts)}; load {self.load:.1f} at the start."
 
@@ -51,12 +56,21 @@ def describe() -> Machine:
     first = jax.devices()[0]
     pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return Machine(
-        device=first.device_kind, devices=jax.device_count(), processor=_cpuinfo("model name") or platform.machine(),
-        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        memory_gib=pages / 2**30, load=os.getloadavg()[0], python=platform.python_version(), jax=jax.__version__,
+        device=first.device_kind,
+        devices=jax.device_count(),
+        processor=_cpuinfo("model name") or platform.machine(),
+        cores=len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1,
+        memory_gib=pages / 2**30,
+        load=os.getloadavg()[0],
+        python=platform.python_version(),
+        jax=jax.__version__,
         system=platform.system(),
-        vectors=next((name for flag, name in VECTORS.items() if flag in _cpuinfo("flags").split()), ""),
-    )  # fmt: skip
+        vectors=next(
+            (name for flag, name in VECTORS.items() if flag in _cpuinfo("flags").split()), ""
+        ),
+    )
 
 
 def _cpuinfo(field: str) -> str:
@@ -81,8 +95,13 @@ def matmul(
     a, b = (jnp.asarray(rng.standard_normal((size, size)), dtype) for _ in range(2))
     own = None if dtype != "float32" else precision
     result = jnp.float32 if jax.default_backend() == "cpu" and a.dtype.itemsize == 2 else None
-    product = jax.jit(partial(jnp.matmul, precision=own, preferred_element_type=result)).lower(a, b).compile()
-    times = 1 if jax.default_backend() == "cpu" else 16  # queued: else an accelerator waits for the host in between
+    product = (
+        jax.jit(partial(jnp.matmul, precision=own, preferred_element_type=result))
+        .lower(a, b)
+        .compile()
+    )
+    # queued: else an accelerator waits for the host in between
+    times = 1 if jax.default_backend() == "cpu" else 16
 
     def run() -> object:
         return jax.block_until_ready([product(a, b) for _ in range(times)])

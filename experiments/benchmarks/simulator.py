@@ -35,15 +35,21 @@ TOUCHED = 0.01  # mm of displacement from which a pixel counts as touched
 
 def parse(args: Sequence[str] | None) -> argparse.Namespace:
     """Return the options."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sensors", nargs="*", default=CAMERAS, choices=CAMERAS)
-    parser.add_argument("--sizes", nargs="*", type=int, default=(112, 224), help="pixels of a picture's side")
+    parser.add_argument(
+        "--sizes", nargs="*", type=int, default=(112, 224), help="pixels of a picture's side"
+    )
     parser.add_argument("--frames", nargs="*", type=int, default=(1, 3), help="frames of a touch")
     parser.add_argument("--batch", type=int, default=16, help="touches a call; a GPU wants 1024")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--objects", type=int, default=40)
     parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
-    parser.add_argument("--out", type=Path, default=Path("runs/bench/simulator.jsonl"), help="file of results")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/bench/simulator.jsonl"), help="file of results"
+    )
     return parser.parse_args(args)
 
 
@@ -56,9 +62,11 @@ def program(world: World, sampling: Sampling, count: int) -> Any:
 def timed(call: Any, rounds: int) -> tuple[float, float]:
     """Return the least seconds of a call by the clock, and the median of processor time."""
     jax.block_until_ready(call())
-    clock, processor = [], []
+    clock = []
+    processor = []
     for _ in range(rounds):
-        start, used = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
+        used = time.process_time()
         jax.block_until_ready(call())
         clock.append(time.perf_counter() - start)
         processor.append(time.process_time() - used)
@@ -71,7 +79,11 @@ def errors(fast: SimulatedTouches, exact: SimulatedTouches) -> dict[str, float]:
     change = np.asarray(fast.fields - exact.fields)[touched]
     mm, kpa = np.sqrt(np.mean(change**2, 0)) if len(change) else (0.0, 0.0)
     levels = np.asarray(fast.clip[:, :, -1], float) - np.asarray(exact.clip[:, :, -1], float)
-    return {"mm": float(mm), "kpa": float(kpa), "levels": float(np.sqrt(np.mean(levels[touched] ** 2)))}
+    return {
+        "mm": float(mm),
+        "kpa": float(kpa),
+        "levels": float(np.sqrt(np.mean(levels[touched] ** 2))),
+    }
 
 
 def peaks(size: int | None) -> tuple[float, float]:
@@ -84,32 +96,51 @@ def peaks(size: int | None) -> tuple[float, float]:
 
 def run(options: argparse.Namespace) -> int:
     """Measure, and store each result at once."""
-    about, (fastest, widest) = plain(machine.describe()), peaks(options.peak_size)
+    about = plain(machine.describe())
+    (fastest, widest) = peaks(options.peak_size)
     things = endless.objects_of(Scenes(objects=options.objects))
     worlds = {name: jax.device_put(endless.make_world(things, (name,))) for name in options.sensors}
-    any_world, key = next(iter(worlds.values())), jax.random.key(3)
+    any_world = next(iter(worlds.values()))
+    key = jax.random.key(3)
     fidelities: tuple[Fidelity, ...] = ("fast", "exact")
     for size in options.sizes:
         for frames in options.frames:
             made: dict[str, Any] = {}
             for fidelity in fidelities:
-                sampling = Sampling(frames=frames, size=size, fields=FIELDS, field_size=size, fidelity=fidelity)
+                sampling = Sampling(
+                    frames=frames, size=size, fields=FIELDS, field_size=size, fidelity=fidelity
+                )
                 start = time.perf_counter()
                 made[fidelity] = program(any_world, sampling, options.batch)
-                print(f"{size}, {frames}, {fidelity}: {time.perf_counter() - start:.0f} s to compile", file=sys.stderr)
+                print(
+                    f"{size}, {frames}, {fidelity}: {time.perf_counter() - start:.0f} s to compile",
+                    file=sys.stderr,
+                )
             for name, world in worlds.items():
                 wrong = errors(*(jax.device_get(made[one](key, world)) for one in fidelities))
                 for fidelity, call in made.items():
-                    count, cost = options.batch * frames, call.cost_analysis()
+                    count = options.batch * frames
+                    cost = call.cost_analysis()
                     seconds, processor = timed(partial(call, key, world), options.rounds)
                     least = max(cost["flops"] / fastest, cost["bytes accessed"] / widest)
                     record = {
-                        "sensor": name, "size": size, "frames": frames, "fidelity": fidelity, "batch": options.batch,
-                        "frames_s": count / seconds, "processor_ms": 1e3 * processor / count,
-                        "mflop": cost["flops"] / count / 1e6, "mbyte": cost["bytes accessed"] / count / 1e6,
-                        "roofline": least / seconds, "machine": about,
-                    } | (wrong if fidelity == "fast" else {})  # fmt: skip
-                    write_record(options.out, f"{about['device']}, {size}, {frames}, {name}, {fidelity}", record)
+                        "sensor": name,
+                        "size": size,
+                        "frames": frames,
+                        "fidelity": fidelity,
+                        "batch": options.batch,
+                        "frames_s": count / seconds,
+                        "processor_ms": 1e3 * processor / count,
+                        "mflop": cost["flops"] / count / 1e6,
+                        "mbyte": cost["bytes accessed"] / count / 1e6,
+                        "roofline": least / seconds,
+                        "machine": about,
+                    } | (wrong if fidelity == "fast" else {})
+                    write_record(
+                        options.out,
+                        f"{about['device']}, {size}, {frames}, {name}, {fidelity}",
+                        record,
+                    )
     return 0
 
 

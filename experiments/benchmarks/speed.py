@@ -21,7 +21,13 @@ from anytouch_jax.evaluate.statistics import plain
 from anytouch_jax.train.step import merge
 from experiments.benchmarks import machine
 from experiments.benchmarks.variants import BASELINE, Program, Variant, cold, compiled, variants_of
-from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of
+from experiments.benchmarks.workloads import (
+    Workload,
+    first_state,
+    make_batch,
+    normalised,
+    values_of,
+)
 
 Tree = Any
 Log = Callable[[str], None]
@@ -90,7 +96,9 @@ def errors(variants: Sequence[Variant], work: Workload, params: Tree) -> list[di
     return found
 
 
-def values_in(variant: Variant, small: Workload, params: Tree, noise: Any) -> dict[str, list[np.ndarray]]:
+def values_in(
+    variant: Variant, small: Workload, params: Tree, noise: Any
+) -> dict[str, list[np.ndarray]]:
     """Return what a workload computes in the types of a variant, in float64 if it asks for that."""
     work = variant.of(small)
     wide = work.config.model.dtype == "float64"
@@ -99,26 +107,37 @@ def values_in(variant: Variant, small: Workload, params: Tree, noise: Any) -> di
         if wide:
             params, batch, noise = jax.tree.map(widened, (params, batch, noise))
         values = jax.jit(values_of(work.config, work.trains))(params, batch, noise)
-        return {name: [np.asarray(x) for x in jax.tree.leaves(value)] for name, value in values.items()}
+        return {
+            name: [np.asarray(x) for x in jax.tree.leaves(value)] for name, value in values.items()
+        }
 
 
 def widened(x: Any) -> np.ndarray:
     """Return a float32 array as float64, and any other unchanged."""
     x = np.asarray(x)
-    return x.astype(np.float64) if x.dtype == np.float32 else x
+    if x.dtype == np.float32:
+        return x.astype(np.float64)
+    return x
 
 
 def relative(found: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> float:
     """||found - exact|| / ||exact|| over all arrays."""
-    wrong = sum(float(np.sum(np.square(a.astype(np.float64) - b))) for a, b in zip(found, exact, strict=True))
+    wrong = sum(
+        float(np.sum(np.square(a.astype(np.float64) - b)))
+        for a, b in zip(found, exact, strict=True)
+    )
     right = sum(float(np.sum(np.square(b.astype(np.float64)))) for b in exact)
-    return (wrong / right) ** 0.5 if right else wrong**0.5
+    if right:
+        return (wrong / right) ** 0.5
+    return wrong**0.5
 
 
 # Timing -------------------------------------------------------------------------------------------------------------
 
 
-def interleaved(calls: Sequence[Callable[[], object]], rounds: int, repeats: Sequence[int] | None = None) -> list[Any]:
+def interleaved(
+    calls: Sequence[Callable[[], object]], rounds: int, repeats: Sequence[int] | None = None
+) -> list[Any]:
     """Seconds (rounds, repeats) of each call. All take turns, each round begins with another; one round warms up."""
     if rounds < 1 or not calls:
         raise UserError("a benchmark needs at least one round and one thing to time")
@@ -153,17 +172,24 @@ def measure(
     variants = variants_of(work, backend) if variants is None else variants
     state = first_state(work.config)
     whole = jax.device_get(merge(state.trainable, state.frozen))
-    programs, failed = [], []
+    programs = []
+    failed = []
     for variant in variants:
         log(f"{work.name}: compiling {variant.name}")
         try:
-            programs.append(compiled(variant, work, state if work.trains else {"touch": whole["touch"]}))
+            programs.append(
+                compiled(variant, work, state if work.trains else {"touch": whole["touch"]})
+            )
         except Exception as error:
             if variant == variants[0]:
-                raise UserError(f"{work.name}, {variant.name} cannot be compiled here: {error}") from error
+                raise UserError(
+                    f"{work.name}, {variant.name} cannot be compiled here: {error}"
+                ) from error
             failed.append((variant, f"{type(error).__name__}: {str(error).splitlines()[0]}"))
     log(f"{work.name}: {rounds} rounds")
-    peaks = {kind: machine.matmul(kind[0], peak_size, kind[1]) for kind in {_FULL, *map(_kind, programs)}}
+    peaks = {
+        kind: machine.matmul(kind[0], peak_size, kind[1]) for kind in {_FULL, *map(_kind, programs)}
+    }
     try:
         times = _timed(programs, work, whole, state, peaks, rounds)
     except RuntimeError:  # most often out of memory, at a first call: which of them can do it?
@@ -173,14 +199,21 @@ def measure(
         failed += broken
         times = _timed(programs, work, whole, first_state(work.config), peaks, rounds)
     gc.collect()
-    best = {d: peaks[d][1] / float(np.median(t)) for d, t in zip(peaks, times[len(programs) :], strict=True)}
+    best = {
+        d: peaks[d][1] / float(np.median(t))
+        for d, t in zip(peaks, times[len(programs) :], strict=True)
+    }
     wrong: list[dict[str, float]] = [{} for _ in programs]
     if with_errors:
         log(f"{work.name}: errors against float64")
         try:
             wrong = errors([program.variant for program in programs], work, whole)
-        except RuntimeError as error:  # most often out of memory: the times are still worth something
-            log(f"{work.name}: no errors, the float64 reference failed: {str(error).splitlines()[0]}")
+        except (
+            RuntimeError
+        ) as error:  # most often out of memory: the times are still worth something
+            log(
+                f"{work.name}: no errors, the float64 reference failed: {str(error).splitlines()[0]}"
+            )
     rows = [_row(p, times[i], times[0], best, wrong[i]) for i, p in enumerate(programs)]
     return rows + [_empty(work, variant, note) for variant, note in failed]
 
@@ -195,10 +228,19 @@ def _kind(program: Program) -> tuple[str, str | None]:
 
 
 def _timed(
-    programs: Sequence[Program], work: Workload, whole: Tree, state: Tree, peaks: Mapping[Any, Any], rounds: int
+    programs: Sequence[Program],
+    work: Workload,
+    whole: Tree,
+    state: Tree,
+    peaks: Mapping[Any, Any],
+    rounds: int,
 ) -> list[Any]:
     """Seconds of every program, then of every peak."""
-    calls = step_calls(programs, state) if work.trains else embed_calls(programs, jax.device_put(whole["touch"]))
+    calls = (
+        step_calls(programs, state)
+        if work.trains
+        else embed_calls(programs, jax.device_put(whole["touch"]))
+    )
     del state
     repeats = [_LATENCY_CALLS if work.samples == 1 else 1] * len(programs) + [1] * len(peaks)
     return interleaved([*calls, *(run for run, _ in peaks.values())], rounds, repeats)
@@ -208,7 +250,8 @@ def _those_that_run(
     programs: Sequence[Program], work: Workload, whole: Tree
 ) -> tuple[list[Program], list[tuple[Variant, str]]]:
     """The programs whose first call succeeds, and the others with the reason. Raises UserError for the baseline."""
-    good, failed = [], []
+    good = []
+    failed = []
     for program in programs:
         try:
             if work.trains:
@@ -219,7 +262,9 @@ def _those_that_run(
         except RuntimeError as error:
             reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
             if program is programs[0]:
-                raise UserError(f"{work.name}, {program.variant.name} cannot be run here: {reason}") from error
+                raise UserError(
+                    f"{work.name}, {program.variant.name} cannot be run here: {reason}"
+                ) from error
             failed.append((program.variant, reason))
         gc.collect()
     return good, failed
@@ -227,7 +272,8 @@ def _those_that_run(
 
 def step_calls(programs: Sequence[Program], state: Tree) -> list[Callable[[], object]]:
     """A call is a step of training that goes on from the state that the call before left, whichever variant it was."""
-    held, key = [state], jax.random.key(0)
+    held = [state]
+    key = jax.random.key(0)
 
     def step(program: Program) -> object:
         held[0], metrics = program.call(held[0], program.batch, key)
@@ -238,23 +284,44 @@ def step_calls(programs: Sequence[Program], state: Tree) -> list[Callable[[], ob
 
 def embed_calls(programs: Sequence[Program], touch: Tree) -> list[Callable[[], object]]:
     """A call takes pixels from the host and brings features back, as a control loop would."""
-    return [partial(lambda p: np.asarray(p.call({"touch": touch}, *p.batch[:2])), program) for program in programs]
+    return [
+        partial(lambda p: np.asarray(p.call({"touch": touch}, *p.batch[:2])), program)
+        for program in programs
+    ]
 
 
-def _row(program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wrong: Mapping[str, float]) -> SpeedRow:
-    mine, theirs = np.median(times, axis=1), np.median(base, axis=1)
-    seconds, ratios = float(np.median(mine)), mine / theirs
+def _row(
+    program: Program, times: Any, base: Any, peaks: Mapping[Any, float], wrong: Mapping[str, float]
+) -> SpeedRow:
+    mine = np.median(times, axis=1)
+    theirs = np.median(base, axis=1)
+    seconds = float(np.median(mine))
+    ratios = mine / theirs
     operations = program.work.operations
     rate = operations / seconds
     return SpeedRow(
-        workload=program.work.name, variant=program.variant.name, samples=program.work.samples, seconds=seconds,
-        seconds_iqr=_iqr(mine), ratio=float(np.median(ratios)), ratio_iqr=_iqr(ratios), operations=operations,
-        peak_share=rate / peaks[_kind(program)], float32_share=rate / peaks[_FULL], p50=float(np.percentile(times, 50)),
-        p99=float(np.percentile(times, 99)), calls=times.size, trace_seconds=program.trace_seconds,
-        compile_seconds=program.compile_seconds, peak_bytes=program.peak_bytes, temp_bytes=program.temp_bytes,
-        copies=program.copies, error_output=wrong.get("output"), error_loss=wrong.get("loss"),
+        workload=program.work.name,
+        variant=program.variant.name,
+        samples=program.work.samples,
+        seconds=seconds,
+        seconds_iqr=_iqr(mine),
+        ratio=float(np.median(ratios)),
+        ratio_iqr=_iqr(ratios),
+        operations=operations,
+        peak_share=rate / peaks[_kind(program)],
+        float32_share=rate / peaks[_FULL],
+        p50=float(np.percentile(times, 50)),
+        p99=float(np.percentile(times, 99)),
+        calls=times.size,
+        trace_seconds=program.trace_seconds,
+        compile_seconds=program.compile_seconds,
+        peak_bytes=program.peak_bytes,
+        temp_bytes=program.temp_bytes,
+        copies=program.copies,
+        error_output=wrong.get("output"),
+        error_loss=wrong.get("loss"),
         error_gradient=wrong.get("gradient"),
-    )  # fmt: skip
+    )
 
 
 def _empty(work: Workload, variant: Variant, note: str) -> SpeedRow:

@@ -33,7 +33,9 @@ class Variant:
 
     def of(self, work: Workload) -> Workload:
         """Return `work` as this variant computes it."""
-        return replace(work, config=replace(work.config, model=replace(work.config.model, **self.model)))
+        return replace(
+            work, config=replace(work.config, model=replace(work.config.model, **self.model))
+        )
 
 
 BASELINE = Variant("float32")
@@ -59,7 +61,9 @@ def variants_of(work: Workload, backend: str = "cpu") -> tuple[Variant, ...]:
             return fast
         remat = BFLOAT16 | {"attention": "cudnn", "remat": True}
         return (*fast, Variant("bfloat16, cuDNN attention, remat", remat, precision=None))
-    return _STEPS if work.trains else _STEPS[:2]
+    if work.trains:
+        return _STEPS
+    return _STEPS[:2]
 
 
 @dataclass
@@ -102,7 +106,8 @@ def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
         args = (state, batch, jax.eval_shape(lambda: jax.random.key(0)))
         batch = jax.device_put(batch)
     else:
-        function, args = jax.jit(embed_of(work.config)), (state, *batch[:2])
+        function = jax.jit(embed_of(work.config))
+        args = (state, *batch[:2])
     with cold(), jax.default_matmul_precision(variant.precision):
         start = time.perf_counter()
         lowered = function.lower(*args)
@@ -112,7 +117,13 @@ def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
     memory: Any = program.memory_analysis()
     sizes = (memory.argument_size_in_bytes, memory.output_size_in_bytes, memory.temp_size_in_bytes)
     return Program(
-        work=work, variant=variant, call=program, batch=batch, trace_seconds=traced - start,
-        compile_seconds=done - traced, peak_bytes=sum(sizes) - memory.alias_size_in_bytes,
-        temp_bytes=memory.temp_size_in_bytes, copies=(program.as_text() or "").count(" copy("),
-    )  # fmt: skip
+        work=work,
+        variant=variant,
+        call=program,
+        batch=batch,
+        trace_seconds=traced - start,
+        compile_seconds=done - traced,
+        peak_bytes=sum(sizes) - memory.alias_size_in_bytes,
+        temp_bytes=memory.temp_size_in_bytes,
+        copies=(program.as_text() or "").count(" copy("),
+    )

@@ -26,8 +26,11 @@ from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step
 
 Tree = Any
-VISION, TEXT = 0.25, 0.5  # shares of a stage-2 batch that have a photograph, a caption
-BATCHES = {"tiny": 16, "small": 16, "base": 8, "large": 4}  # samples a step, where none is asked for
+# shares of a stage-2 batch that have a photograph, a caption
+VISION = 0.25
+TEXT = 0.5
+# samples a step, where none is asked for
+BATCHES = {"tiny": 16, "small": 16, "base": 8, "large": 4}
 _STEPS = 1000
 
 
@@ -59,7 +62,9 @@ def _share(samples: int, share: float) -> int:
     return max(1, round(samples * share))
 
 
-def workloads(what: str, name: str, batch: int | None = None, recipe: Recipe = "release") -> list[Workload]:
+def workloads(
+    what: str, name: str, batch: int | None = None, recipe: Recipe = "release"
+) -> list[Workload]:
     """The workloads of stage1, stage2 (towers from scratch; by `recipe`) or embed for a preset."""
     batch = batch or BATCHES[name]
     one = replace(preset(name), run=replace(preset(name).run, steps=_STEPS))
@@ -68,7 +73,10 @@ def workloads(what: str, name: str, batch: int | None = None, recipe: Recipe = "
     if what == "stage2":
         two = preset(name, stage=2, recipe=recipe, towers="scratch")
         two = replace(two, run=one.run)
-        return [Workload("stage2 align", two, batch, 4), Workload("stage2 match", two, max(2, batch // 2), 3)]
+        return [
+            Workload("stage2 align", two, batch, 4),
+            Workload("stage2 match", two, max(2, batch // 2), 3),
+        ]
     return [Workload("embed one still", one, 1, 1), Workload("embed one clip", one, 1, 3)] + (
         [Workload("embed clips", one, batch, 3)] if batch > 1 else []
     )
@@ -79,7 +87,8 @@ def workloads(what: str, name: str, batch: int | None = None, recipe: Recipe = "
 
 def make_batch(work: Workload, seed: int = 0) -> TouchBatch | Stage2Batch:
     """A made-up uint8 batch of a workload, the same for the same seed: noise, every sensor of the release's table."""
-    rng, side = np.random.default_rng(seed), work.config.model.image_size
+    rng = np.random.default_rng(seed)
+    side = work.config.model.image_size
 
     def touches(frames: int) -> tuple[np.ndarray, np.ndarray]:
         sensor = np.arange(work.samples, dtype=np.int32) % 5
@@ -88,9 +97,12 @@ def make_batch(work: Workload, seed: int = 0) -> TouchBatch | Stage2Batch:
     if work.config.stage == 1 or not work.trains:
         return TouchBatch(*touches(work.frames))
     if work.name.endswith("match"):
-        return Stage2Batch(None, MatchBatch(*touches(work.frames), *touches(work.frames), *touches(work.frames)))
+        return Stage2Batch(
+            None, MatchBatch(*touches(work.frames), *touches(work.frames), *touches(work.frames))
+        )
     part = touches(work.frames)
-    image_row, text_row = _rows(work, VISION, 0), _rows(work, TEXT, 1)
+    image_row = _rows(work, VISION, 0)
+    text_row = _rows(work, TEXT, 1)
     image = rng.integers(0, 256, (len(image_row), side, side, 3), np.uint8)
     text, mask = _captions(rng, work.config.model, len(text_row))
     align = AlignBatch(*part, image, image_row, text, mask, text_row)
@@ -100,13 +112,18 @@ def make_batch(work: Workload, seed: int = 0) -> TouchBatch | Stage2Batch:
 def _rows(work: Workload, share: float, offset: int) -> np.ndarray:
     """Rows of the batch that have a modality, spread evenly."""
     count = _share(work.samples, share)
-    return np.sort((np.arange(count) * work.samples // count + offset) % work.samples).astype(np.int32)
+    return np.sort((np.arange(count) * work.samples // count + offset) % work.samples).astype(
+        np.int32
+    )
 
 
-def _captions(rng: np.random.Generator, model: ModelConfig, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _captions(
+    rng: np.random.Generator, model: ModelConfig, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Token ids (L, S) of eight to twenty words and the end token, and which may be read."""
     assert model.text is not None
-    vocab, length = model.text.vocab, model.text.length
+    vocab = model.text.vocab
+    length = model.text.length
     words = rng.integers(min(8, length // 2), min(20, length - 1) + 1, count)
     ids = rng.integers(1, vocab - 1, (count, length)).astype(np.int32)
     at = np.arange(length)[None]
@@ -141,7 +158,9 @@ def embed_of(config: Config) -> Callable[..., jax.Array]:
     net = build(config.model)
 
     def embed(params: Tree, clip: jax.Array, sensor: jax.Array) -> jax.Array:
-        return net.encode_touch(params, objectives.normalise_touch(clip), sensor).astype(jnp.float32)
+        return net.encode_touch(params, objectives.normalise_touch(clip), sensor).astype(
+            jnp.float32
+        )
 
     return embed
 
@@ -158,11 +177,15 @@ def values_of(config: Config, trains: bool = True) -> Callable[..., dict[str, An
         if not trains:
             return {"output": net.encode_touch(params, batch.clip, batch.sensor)}
         trained = {name: value for name, value in params.items() if name != "decoder"} | {
-            "decoder": {name: value for name, value in params["decoder"].items() if name != "position"}
+            "decoder": {
+                name: value for name, value in params["decoder"].items() if name != "position"
+            }
         }
 
         def loss(trained: Tree) -> tuple[jax.Array, Any]:
-            whole = trained | {"decoder": trained["decoder"] | {"position": params["decoder"]["position"]}}
+            whole = trained | {
+                "decoder": trained["decoder"] | {"position": params["decoder"]["position"]}
+            }
             return _terms(whole, batch, noise, net, config)
 
         (value, output), gradient = jax.value_and_grad(loss, has_aux=True)(trained)
@@ -171,10 +194,16 @@ def values_of(config: Config, trains: bool = True) -> Callable[..., dict[str, An
     return values
 
 
-def _terms(params: Tree, batch: Any, noise: jax.Array, net: Any, config: Config) -> tuple[jax.Array, jax.Array]:
+def _terms(
+    params: Tree, batch: Any, noise: jax.Array, net: Any, config: Config
+) -> tuple[jax.Array, jax.Array]:
     if config.stage == 1:
-        pred, _ = objectives.reconstruct(params, batch.clip, batch.sensor, noise, net=net, config=config)
-        value, _ = objectives.stage1_terms(params, batch.clip, batch.sensor, noise, net=net, config=config)
+        pred, _ = objectives.reconstruct(
+            params, batch.clip, batch.sensor, noise, net=net, config=config
+        )
+        value, _ = objectives.stage1_terms(
+            params, batch.clip, batch.sensor, noise, net=net, config=config
+        )
         return value, pred
     value, _ = objectives.stage2_terms(params, batch, noise, net=net, config=config)
     clip, sensor = (batch.align or batch.match)[:2]
@@ -187,12 +216,15 @@ def normalised(batch: Any) -> Any:
     touch = lambda clip: np.asarray(objectives.normalise_touch(jnp.asarray(clip)))  # noqa: E731
     if isinstance(batch, TouchBatch):
         return batch._replace(clip=touch(batch.clip))
-    align, match = batch.align, batch.match
+    align = batch.align
+    match = batch.match
     if align is not None:
         image = np.asarray(objectives.normalise_image(jnp.asarray(align.image)))
         align = align._replace(clip=touch(align.clip), image=image)
     if match is not None:
-        match = match._replace(**{name: touch(getattr(match, name)) for name in ("clip", "positive", "negative")})
+        match = match._replace(
+            **{name: touch(getattr(match, name)) for name in ("clip", "positive", "negative")}
+        )
     return batch._replace(align=align, match=match)
 
 
@@ -203,14 +235,27 @@ def products(jaxpr: Any) -> float:
     """Return the operations of the matrix products and convolutions of a jaxpr; a loop's body counts for each turn."""
     total = 0.0
     for eqn in jaxpr.eqns:
-        name, params = eqn.primitive.name, eqn.params
+        name = eqn.primitive.name
+        params = eqn.params
         if name == "dot_general":
             (contracted, _), _ = params["dimension_numbers"]
-            total += 2 * eqn.outvars[0].aval.size * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
+            total += (
+                2
+                * eqn.outvars[0].aval.size
+                * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
+            )
         elif name == "conv_general_dilated":
             kernel = eqn.invars[1].aval
-            total += 2 * eqn.outvars[0].aval.size * kernel.size / kernel.shape[params["dimension_numbers"].rhs_spec[0]]
-        inner = [getattr(one, "jaxpr", one) for one in jax.tree.leaves(list(params.values()), is_leaf=_is_jaxpr)]
+            total += (
+                2
+                * eqn.outvars[0].aval.size
+                * kernel.size
+                / kernel.shape[params["dimension_numbers"].rhs_spec[0]]
+            )
+        inner = [
+            getattr(one, "jaxpr", one)
+            for one in jax.tree.leaves(list(params.values()), is_leaf=_is_jaxpr)
+        ]
         total += params.get("length", 1) * sum(products(one) for one in inner if _is_jaxpr(one))
     return total
 
@@ -222,12 +267,15 @@ def _is_jaxpr(value: Any) -> bool:
 def _useful(work: Workload) -> float:
     model = replace(work.config.model, dtype="float32", attention="xla", remat=False)
     config = replace(work.config, model=model)
-    net, params, batch = build(model), build(model).abstract(), normalised(make_batch(work))
+    net = build(model)
+    params = build(model).abstract()
+    batch = normalised(make_batch(work))
     noise = np.zeros((work.samples, model.patches), np.float32)
     if not work.trains:
         run: Callable[..., Any] = lambda p: net.encode_touch(p, batch.clip, batch.sensor)  # noqa: E731
     else:
-        one, two = objectives.stage1_terms, objectives.stage2_terms
+        one = objectives.stage1_terms
+        two = objectives.stage2_terms
         terms: Callable[..., Any] = (
             (lambda p: one(p, batch.clip, batch.sensor, noise, net=net, config=config)[0])
             if config.stage == 1

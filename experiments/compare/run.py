@@ -35,7 +35,8 @@ from experiments.pages.page import markdown
 from experiments.records import read_records, write_record
 
 PROTOCOLS = ("honest", "published")
-RESULTS, YOURS = Path("experiments/results/compare.jsonl"), Path("runs/compare/compare.jsonl")
+RESULTS = Path("experiments/results/compare.jsonl")
+YOURS = Path("runs/compare/compare.jsonl")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class Options:
     encoders: tuple[str, ...] = ()  # NAME=FILE of each encoder whose accuracy is wanted.
     data: tuple[Path, ...] = ()  # Manifests for the accuracy.
     label: str = "material"  # Label column for the accuracy.
-    only: tuple[str, ...] = ()  # Measure only these families (default: all, or none with --encoders).
+    # Measure only these families (default: all, or none with --encoders).
+    only: tuple[str, ...] = ()
     repeats: int = 5  # Timed calls of each family.
     out: Path | None = None  # The file of results. Your encoders have one of their own.
 
@@ -56,52 +58,87 @@ def costs(encoder: Encoder, repeats: int) -> dict[str, Any]:
     frame = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     gel = np.full_like(frame, 90)
     prepared = encoder.preprocess(frame, gel)
-    clip, row = np.repeat(prepared[None, None], frames, axis=1), np.zeros(1, np.int32)
+    clip = np.repeat(prepared[None, None], frames, axis=1)
+    row = np.zeros(1, np.int32)
     run = encoder.traceable()
     operations = products(jax.make_jaxpr(run)(encoder.params, clip, row).jaxpr)
     program = jax.jit(run).lower(encoder.params, clip, row).compile()
-    memory, params = program.memory_analysis(), jax.device_put(encoder.params)
+    memory = program.memory_analysis()
+    params = jax.device_put(encoder.params)
     jax.block_until_ready(program(params, clip, row))
     prepare = _times(lambda: encoder.preprocess(frame, gel), repeats)
     encode = _times(lambda: jax.block_until_ready(program(params, clip, row)), repeats)
     count = sum(int(np.size(leaf)) for leaf in jax.tree.leaves(encoder.params))
     return {
-        "kind": "cost", "parameters": count, "frames": frames, "pixels": list(prepared.shape[:2]),
-        "flops": operations, "repeats": repeats,
-        "memory": int(memory.argument_size_in_bytes + memory.temp_size_in_bytes + memory.output_size_in_bytes),
-        "prepare_ms": prepare[0], "encode_ms": encode[0], "encode_cpu_ms": encode[1],
+        "kind": "cost",
+        "parameters": count,
+        "frames": frames,
+        "pixels": list(prepared.shape[:2]),
+        "flops": operations,
+        "repeats": repeats,
+        "memory": int(
+            memory.argument_size_in_bytes + memory.temp_size_in_bytes + memory.output_size_in_bytes
+        ),
+        "prepare_ms": prepare[0],
+        "encode_ms": encode[0],
+        "encode_cpu_ms": encode[1],
         "machine": dataclasses.asdict(machine.describe()),
-    }  # fmt: skip
+    }
 
 
 def _times(call: Callable[[], object], repeats: int) -> tuple[float, float]:
     """Return the shortest time of a call, and the median processor time of all its threads, in milliseconds."""
-    walls, processor = [], []
+    walls = []
+    processor = []
     for _ in range(repeats):
-        begun, own = time.perf_counter(), time.process_time()
+        begun = time.perf_counter()
+        own = time.process_time()
         call()
         walls.append(1000 * (time.perf_counter() - begun))
         processor.append(1000 * (time.process_time() - own))
     return min(walls), float(np.median(processor))
 
 
-def accuracy(name: str, file: str, data: tuple[Path, ...], label: str, protocol: str) -> dict[str, Any]:
+def accuracy(
+    name: str, file: str, data: tuple[Path, ...], label: str, protocol: str
+) -> dict[str, Any]:
     """Return the accuracy of the linear and kNN probes of an encoder on a label by one protocol."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "probe.json"
-        words = ["probe", "label", "--model", file, "--data", *map(str, data), "--label", label, "--out", str(out)]
+        words = [
+            "probe",
+            "label",
+            "--model",
+            file,
+            "--data",
+            *map(str, data),
+            "--label",
+            label,
+            "--out",
+            str(out),
+        ]
         if main([*words, "--protocol", protocol, "--no-controls"]):
             raise UserError(f"the probe of {name} failed; its message stands above")
         results = json.loads(out.read_text())
-    scores = {row["probe"].rpartition(": ")[2]: row.get("accuracy", row.get("r2")) for row in results}
-    return {"kind": "accuracy", "encoder": name, "label": label, "protocol": protocol, "scores": scores}
+    scores = {
+        row["probe"].rpartition(": ")[2]: row.get("accuracy", row.get("r2")) for row in results
+    }
+    return {
+        "kind": "accuracy",
+        "encoder": name,
+        "label": label,
+        "protocol": protocol,
+        "scores": scores,
+    }
 
 
 def run(options: Options) -> int:
     """Measure, probe, and write the page."""
     wanted = options.only or (() if options.encoders else (*FORMS, *OURS))
     if unknown := [name for name in wanted if name not in {*FORMS, *OURS}]:
-        raise UserError(f"there is no family {unknown[0]!r}; choose from {', '.join((*FORMS, *OURS))}")
+        raise UserError(
+            f"there is no family {unknown[0]!r}; choose from {', '.join((*FORMS, *OURS))}"
+        )
     if options.encoders and not options.data:
         raise UserError("ENCODERS needs the manifest to probe them on; add DATA=manifest.parquet")
     out = options.out or (YOURS if options.encoders else RESULTS)

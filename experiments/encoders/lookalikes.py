@@ -28,25 +28,33 @@ def recall(encoders: dict[str, Encoder], path: Path) -> dict[str, Any]:
     """Return the recall@1 and its interval over objects of each encoder, and of pixels, on the test split."""
     table = manifests.read(path)
     rows = retrieval.deepest_rows(table, table.rows_of("test"))
-    features = {name: embed_rows(one, table, rows, pooling="class", log=silent)[1] for name, one in encoders.items()}
+    features = {
+        name: embed_rows(one, table, rows, pooling="class", log=silent)[1]
+        for name, one in encoders.items()
+    }
     features["pixels"] = background_difference(table, rows)
     found = retrieval.cross_sensor_retrieval(table, features, rows, centre=(True,))
     scores = {
         one.name: {"share": one.top1, "interval": [one.low, one.high]}
-        for one in found if one.query_sensor == retrieval.ALL
-    }  # fmt: skip
+        for one in found
+        if one.query_sensor == retrieval.ALL
+    }
     return {"data": table.content_hash, "touches": len(rows), "scores": scores}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("models", nargs="+")
-    parser.add_argument("--fine", type=Path, help="folder of touches, a dent at the same place for every sensor")
+    parser.add_argument(
+        "--fine", type=Path, help="folder of touches, a dent at the same place for every sensor"
+    )
     parser.add_argument("--coarse", type=Path, help="folder of touches by hand")
     parser.add_argument("--out", type=Path, default=Path("experiments/results/lookalikes.jsonl"))
     options = parser.parse_args()
     encoders = {word.partition("=")[0]: load(word) for word in options.models}
-    marks = {name: one.fingerprint for name, one in encoders.items() if not name.startswith(UNTRAINED)}
+    marks = {
+        name: one.fingerprint for name, one in encoders.items() if not name.startswith(UNTRAINED)
+    }
     for grade in ("fine", "coarse"):
         if folder := getattr(options, grade):
             about = {"encoders": marks, "machine": plain(machine.describe())}

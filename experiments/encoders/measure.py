@@ -44,10 +44,17 @@ from experiments.records import write_record
 
 UNIVERSAL = 0.25  # share of the touches that get the universal tokens
 SETTINGS: dict[str, Any] = {
-    "data.background": "either", "data.batch_size": 24, "optim.learning_rate": 5e-4, "optim.warmup": 40,
-    "optim.grad_clip": 1.0, "optim.weight_decay": 0.0, "run.steps": 100_000, "run.save_every": 0, "run.keep": 1,
+    "data.background": "either",
+    "data.batch_size": 24,
+    "optim.learning_rate": 5e-4,
+    "optim.warmup": 40,
+    "optim.grad_clip": 1.0,
+    "optim.weight_decay": 0.0,
+    "run.steps": 100_000,
+    "run.save_every": 0,
+    "run.keep": 1,
     "run.figure_every": 0,
-}  # fmt: skip
+}
 QUANTITIES = ("depth", "shear", "normal", "tangential", "torque", "slip")
 
 
@@ -65,12 +72,19 @@ def world_of(split: Any, variants: int = 1, sensors: tuple[str, ...] = ()) -> en
 
 
 def batches(
-    world: endless.World, config: Config, count: int, seed: int, number: int = 0, *, moved: bool = False,
+    world: endless.World,
+    config: Config,
+    count: int,
+    seed: int,
+    number: int = 0,
+    *,
+    moved: bool = False,
     **options: float,
-) -> Iterator[FieldBatch]:  # fmt: skip
+) -> Iterator[FieldBatch]:
     """Yield batches with normalised pixels and sensor rows: three of stills, which cost less, then one of clips."""
     rows = np.array(
-        [config.model.sensor_row(name) for name in SimulatedConfig().sensors] + [config.model.universal_row]
+        [config.model.sensor_row(name) for name in SimulatedConfig().sensors]
+        + [config.model.universal_row]
     )
 
     @partial(jax.jit, static_argnums=(2,))
@@ -95,21 +109,28 @@ def calibrate(folder: Path) -> None:
     loaded = load_model(folder)
     errors = collect(loaded.params, subtracted(loaded.config), "val", 24)
     factors = {
-        name: float(np.quantile(np.abs(values["error"]) / values["deviation"], 0.68)) for name, values in errors.items()
+        name: float(np.quantile(np.abs(values["error"]) / values["deviation"], 0.68))
+        for name, values in errors.items()
     }
     log(f"deviations are multiplied by {factors}")
-    rewrite(folder, folder, dataclasses.replace(loaded, metadata={**loaded.metadata, "fields": factors}))
+    rewrite(
+        folder, folder, dataclasses.replace(loaded, metadata={**loaded.metadata, "fields": factors})
+    )
 
 
 def train(model: str, minutes: float, out: Path) -> None:
     """Train the decoder on endless touches and untouched gels that moved a little, and write the encoder to `out`."""
     path = locate(model)
-    loaded, folder = load_model(path), path if path.is_dir() else path.parent
+    loaded = load_model(path)
+    folder = path if path.is_dir() else path.parent
     config, net = loaded.config.with_settings(SETTINGS), build(loaded.config.model)
-    touch, world = jax.device_put(loaded.params["touch"]), world_of("train", 2)
+    touch = jax.device_put(loaded.params["touch"])
+    world = world_of("train", 2)
 
     def stream(start: int, stop: int) -> Iterator[tuple[int, Any, dict[str, Any]]]:
-        source = batches(world, config, config.data.batch_size, 62, start, moved=True, wild=0.2, free=0.15)
+        source = batches(
+            world, config, config.data.batch_size, 62, start, moved=True, wild=0.2, free=0.15
+        )
         for step in range(start, stop):
             yield step, (next(source), touch), {}
 
@@ -118,17 +139,28 @@ def train(model: str, minutes: float, out: Path) -> None:
         return field_terms(params | {"touch": frozen}, touches, net=net)
 
     result = fit(
-        config, params={"fields": loaded.params["fields"]}, loss_fn=loss, batches=stream, run_dir=out.with_name("run"),
-        until=time.monotonic() + 60 * minutes, log=log,
-    )  # fmt: skip
+        config,
+        params={"fields": loaded.params["fields"]},
+        loss_fn=loss,
+        batches=stream,
+        run_dir=out.with_name("run"),
+        until=time.monotonic() + 60 * minutes,
+        log=log,
+    )
     log(f"{result.step} steps of {config.data.batch_size}, {result.metrics}")
-    rewrite(folder, out, dataclasses.replace(loaded, params=loaded.params | jax.device_get(result.params)))
+    rewrite(
+        folder,
+        out,
+        dataclasses.replace(loaded, params=loaded.params | jax.device_get(result.params)),
+    )
 
 
 def rewrite(folder: Path, out: Path, loaded: Any) -> None:
     """Write an encoder with the card of `folder` to `out`."""
     card = parse_json((folder / "config.json").read_text())
-    config = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings({"run.steps": card["steps"]})
+    config = dataclasses.replace(loaded.config, stage=card["stage"]).with_settings(
+        {"run.steps": card["steps"]}
+    )
     notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
     full = dataclasses.replace(loaded, config=config)
     tokenizer = None if out == folder else folder / "tokenizer.json"
@@ -140,11 +172,15 @@ def subtracted(config: Config) -> Config:
     return config.with_settings({"data.background": "subtract"})
 
 
-def collect(params: Any, config: Config, split: str, count: int, size: int = 32) -> dict[str, dict[str, np.ndarray]]:
+def collect(
+    params: Any, config: Config, split: str, count: int, size: int = 32
+) -> dict[str, dict[str, np.ndarray]]:
     """Return errors and deviations of every quantity, in units of the outputs, over new touches of a split."""
     net = build(config.model)
     measure = jax.jit(net.measure)
-    errors: dict[str, dict[str, list[np.ndarray]]] = {name: {"error": [], "deviation": []} for name in QUANTITIES}
+    errors: dict[str, dict[str, list[np.ndarray]]] = {
+        name: {"error": [], "deviation": []} for name in QUANTITIES
+    }
     source = batches(world_of(split), config, size, 7, wild=0.0, free=0.0)
     for _ in range(count):
         batch = next(source)
@@ -155,25 +191,41 @@ def collect(params: Any, config: Config, split: str, count: int, size: int = 32)
         slip = 1 / (1 + np.exp(-out.slip)) - batch.slip
         pairs = {
             "depth": ((out.depth - batch.depth)[touched] / LENGTH, out.depth_log[touched]),
-            "shear": ((out.shear - batch.shear)[touched] / LENGTH, out.shear_log[touched][:, None].repeat(2, 1)),
+            "shear": (
+                (out.shear - batch.shear)[touched] / LENGTH,
+                out.shear_log[touched][:, None].repeat(2, 1),
+            ),
             "normal": (normal, out.force_log[:, 1]),
-            "tangential": ((out.force - batch.force)[:, :2] / FORCE, out.force_log[:, :1].repeat(2, 1)),
-            "torque": ((out.torque - batch.torque) / TORQUE, out.torque_log), "slip": (slip, out.slip_log),
-        }  # fmt: skip
+            "tangential": (
+                (out.force - batch.force)[:, :2] / FORCE,
+                out.force_log[:, :1].repeat(2, 1),
+            ),
+            "torque": ((out.torque - batch.torque) / TORQUE, out.torque_log),
+            "slip": (slip, out.slip_log),
+        }
         for name, (error, log_scale) in pairs.items():
             errors[name]["error"].append(error.ravel())
-            errors[name]["deviation"].append(np.sqrt(2) * np.exp(5 * np.tanh(log_scale / 5)).ravel())
-    return {name: {part: np.concatenate(rows) for part, rows in both.items()} for name, both in errors.items()}
+            errors[name]["deviation"].append(
+                np.sqrt(2) * np.exp(5 * np.tanh(log_scale / 5)).ravel()
+            )
+    return {
+        name: {part: np.concatenate(rows) for part, rows in both.items()}
+        for name, both in errors.items()
+    }
 
 
-def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], touches: int = 192) -> dict[str, float]:
+def scores(
+    params: Any, config: Config, sensor: str, factors: dict[str, float], touches: int = 192
+) -> dict[str, float]:
     """Return the errors of one sensor on new units and objects of the test split, stills and clips together.
 
     `false_contact` and `false_force` are shares of gels that nothing touches, but that moved a little since the picture
     of them: those with a pixel of contact, and those with more than 0.05 N.
     """
     world = world_of("test", sensors=(sensor,))
-    row, size, measure = config.model.sensor_row(sensor), 32, jax.jit(build(config.model).measure)
+    row = config.model.sensor_row(sensor)
+    size = 32
+    measure = jax.jit(build(config.model).measure)
     sample = jax.jit(endless.sample_touches, static_argnums=(2, 3))
 
     def read(number: int, frames: int, free: float) -> tuple[Any, ...]:
@@ -187,36 +239,57 @@ def scores(params: Any, config: Config, sensor: str, factors: dict[str, float], 
     rows: dict[str, list[np.ndarray]] = {}
     for number in range(touches // size):
         fields, batch, touch = read(number, (1, config.model.frames)[number % 2], 0)
-        found = touch_errors(fields, batch, touch.width[:, -1], touch.modulus[:, -1], factors["depth"])
+        found = touch_errors(
+            fields, batch, touch.width[:, -1], touch.modulus[:, -1], factors["depth"]
+        )
         out, _, free = read(1000 + number, 1, 1)
         newton = np.abs(out.force[:, 2]) * free.modulus[:, -1] * free.width[:, -1] ** 2 * 1e-3
         found |= {"false_contact": (out.contact > 0).any((1, 2)), "false_force": newton > 0.05}
         for name, value in (found | dots_errors(fields, batch, touch)).items():
             rows.setdefault(name, []).append(np.asarray(value, np.float64).ravel())
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
-    return {name: float(np.median(v) if name == "force" else v.mean()) for name, v in joined.items() if len(v)}
+    return {
+        name: float(np.median(v) if name == "force" else v.mean())
+        for name, v in joined.items()
+        if len(v)
+    }
 
 
 def dots_errors(out: FieldOutput, batch: FieldBatch, touch: Any) -> dict[str, np.ndarray]:
     """Return where shear and force along gels with dots are within 20 degrees, and within one deviation."""
     found = {name: [np.zeros(0)] for name in ("dots_shear", "dots_inside", "drag", "drag_inside")}
     aspects = np.exp(batch.aspect)
-    for row, (gel, clip, width) in enumerate(zip(touch.background[:, -1], touch.clip[:, -1], touch.width, strict=True)):
+    for row, (gel, clip, width) in enumerate(
+        zip(touch.background[:, -1], touch.clip[:, -1], touch.width, strict=True)
+    ):
         size = 240, max(1, round(240 * float(aspects[row])))
-        gel, frame = (cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in (gel, clip[-1]))
+        gel, frame = (
+            cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in (gel, clip[-1])
+        )
         if not DotFlow(gel):
             continue
-        scale = Scale(float(width[-1]), float(touch.modulus[row, -1]), 0.0, None, dict.fromkeys(QUANTITIES, 1.0))
+        scale = Scale(
+            float(width[-1]),
+            float(touch.modulus[row, -1]),
+            0.0,
+            None,
+            dict.fromkeys(QUANTITIES, 1.0),
+        )
         measure = Measure(scale, "simulated", gel, lambda _: None, 0, "none")
         one = measure(FieldOutput._make(value[row : row + 1] for value in out), [frame])
-        true, touched = batch.shear[row] * scale.width, batch.pressure[row] > TOUCHED
+        true = batch.shear[row] * scale.width
+        touched = batch.pressure[row] > TOUCHED
         moved = touched & (np.linalg.norm(true, axis=-1) > 0.1)
         found["dots_shear"].append((_apart(one.shear[0], true) < 20)[moved])
-        found["dots_inside"].append((np.abs(one.shear[0] - true).mean(-1) < one.shear_std[0])[touched])
+        found["dots_inside"].append(
+            (np.abs(one.shear[0] - true).mean(-1) < one.shear_std[0])[touched]
+        )
         newton = np.array([touch.labels[f"force_{axis}"][row, -1, -1] for axis in "xy"])
         if np.linalg.norm(newton) > 0.1:
             found["drag"].append(_apart(one.force[:, :2], newton) < 20)
-            found["drag_inside"].append((np.abs(one.force[0] - [*newton, 0]) < one.force_std[0])[:2])
+            found["drag_inside"].append(
+                (np.abs(one.force[0] - [*newton, 0]) < one.force_std[0])[:2]
+            )
     return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
@@ -227,7 +300,8 @@ def touch_errors(
 
     A touch that shows fewer than 8 pixels of contact has no error of depth, overlap and force.
     """
-    touched, pixels = batch.pressure > TOUCHED, (slice(None), None, None)
+    touched = batch.pressure > TOUCHED
+    pixels = (slice(None), None, None)
     depth, true = out.depth * width[pixels], batch.depth * width[pixels]
     seen = out.contact > 0
     enough = touched.sum((1, 2)) >= 8
@@ -238,10 +312,12 @@ def touch_errors(
     deviation = np.sqrt(2) * np.exp(5 * np.tanh(out.depth_log / 5)) * LENGTH * factor
     inside = np.abs(out.depth - batch.depth)[touched] < deviation[touched]
     values = {
-        "depth": share[enough], "relative": (share / np.maximum(true.max((1, 2)), 1e-3))[enough],
-        "iou": ((seen & touched).sum((1, 2)) / np.maximum(either, 1))[enough], "inside": inside,
+        "depth": share[enough],
+        "relative": (share / np.maximum(true.max((1, 2)), 1e-3))[enough],
+        "iou": ((seen & touched).sum((1, 2)) / np.maximum(either, 1))[enough],
+        "inside": inside,
         "force": (np.abs(force - real) / np.maximum(real, 0.05))[enough],
-    }  # fmt: skip
+    }
     if batch.clip.shape[1] > 1:
         moved = touched & (np.linalg.norm(batch.shear, axis=-1) * width[pixels] > 0.1)
         values["shear"] = _apart(out.shear, batch.shear)[moved] < 20
@@ -260,11 +336,19 @@ def test(model: Path, out: Path) -> None:
     config = subtracted(loaded.config)
     params = {"touch": loaded.params["touch"], "fields": loaded.params["fields"]}
     stored = loaded.metadata.get("fields", "{}")
-    factors = dict.fromkeys(QUANTITIES, 1.0) | (json.loads(stored) if isinstance(stored, str) else stored)
+    factors = dict.fromkeys(QUANTITIES, 1.0) | (
+        json.loads(stored) if isinstance(stored, str) else stored
+    )
     for sensor in SimulatedConfig().sensors:
-        record = {"machine": dataclasses.asdict(machine.describe())} | scores(params, config, sensor, factors)
+        record = {"machine": dataclasses.asdict(machine.describe())} | scores(
+            params, config, sensor, factors
+        )
         write_record(out, sensor, record)
-        print(sensor, {name: round(value, 3) for name, value in record.items() if isinstance(value, float)}, flush=True)
+        print(
+            sensor,
+            {name: round(value, 3) for name, value in record.items() if isinstance(value, float)},
+            flush=True,
+        )
 
 
 def main() -> None:
@@ -273,10 +357,14 @@ def main() -> None:
     zeroth = commands.add_parser("train", help="train the decoder of an encoder")
     zeroth.add_argument("model", type=Path)
     zeroth.add_argument("--minutes", type=float, default=75.0)
-    zeroth.add_argument("--out", type=Path, required=True, help="folder to write, named as the encoder")
+    zeroth.add_argument(
+        "--out", type=Path, required=True, help="folder to write, named as the encoder"
+    )
     first = commands.add_parser("calibrate", help="scale the deviations of an encoder's folder")
     first.add_argument("model", type=Path)
-    second = commands.add_parser("test", help="measure errors on objects that training never touched")
+    second = commands.add_parser(
+        "test", help="measure errors on objects that training never touched"
+    )
     second.add_argument("model", type=Path)
     second.add_argument("--out", type=Path, default=Path("experiments/results/measure.jsonl"))
     given = parser.parse_args()

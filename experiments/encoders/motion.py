@@ -32,9 +32,13 @@ from experiments.real.run import load
 from experiments.records import write_record
 
 Array = np.ndarray
-TURNS, SLIDES = ("clockwise", "counterclockwise"), ("left", "right", "up", "down")
+TURNS = ("clockwise", "counterclockwise")
+SLIDES = ("left", "right", "up", "down")
 MIRRORED = dict(zip((*TURNS, *SLIDES[:2]), (*TURNS[::-1], *SLIDES[1::-1]), strict=True))
-HIDDEN, EPOCHS, BATCH, RATE = 48, 15, 64, 2e-3
+HIDDEN = 48
+EPOCHS = 15
+BATCH = 64
+RATE = 2e-3
 TOUCHED = 0.08  # mm of the deepest point that count as contact
 
 
@@ -65,9 +69,16 @@ def read(encoder: Encoder, paths: list[Path], most: int) -> Clips:
     three = np.stack([rows[starts], rows[(starts + ends + 1) // 2], rows[ends]], 1)[ends > starts]
     three = three[np.random.default_rng(0).permutation(len(three))[:most]]
     train = np.flatnonzero(columns["split"][three[:, 2]] == "train")
-    last = {name: np.concatenate([columns[name][three[:, 2]], columns[name][three[train, 2]]]) for name in names}
-    last["label.twist"][len(three) :] = [MIRRORED.get(one, one) for one in last["label.twist"][len(three) :]]
-    last["label.slide"][len(three) :] = [MIRRORED.get(one, one) for one in last["label.slide"][len(three) :]]
+    last = {
+        name: np.concatenate([columns[name][three[:, 2]], columns[name][three[train, 2]]])
+        for name in names
+    }
+    last["label.twist"][len(three) :] = [
+        MIRRORED.get(one, one) for one in last["label.twist"][len(three) :]
+    ]
+    last["label.slide"][len(three) :] = [
+        MIRRORED.get(one, one) for one in last["label.slide"][len(three) :]
+    ]
 
     def clip(row: Array) -> Array:
         gel = decode(manifest.file(int(row[0]), "background_path"))
@@ -75,14 +86,17 @@ def read(encoder: Encoder, paths: list[Path], most: int) -> Clips:
 
     def both_ways() -> Iterator[tuple[Array, np.int32]]:
         for number, row in enumerate(np.concatenate([three, three[train]])):
-            frames, sensor = clip(row), np.int32(encoder.sensor_row(columns["sensor"][row[2]]))
+            frames = clip(row)
+            sensor = np.int32(encoder.sensor_row(columns["sensor"][row[2]]))
             frames = frames[:, :, ::-1] if number >= len(three) else frames
             yield from ((frames[::-1], sensor), (frames, sensor))
 
     @jax.jit
     def tokens(params: Any, clips: jax.Array, rows: jax.Array) -> jax.Array:
         states = encoder.net.bind(params).touch.states(normalise_touch(clips), rows, 4)
-        first, last = encoder.net.model.touch.width, 3 * encoder.net.model.touch.width  # after a third and two thirds
+        # after a third and two thirds
+        first = encoder.net.model.touch.width
+        last = 3 * encoder.net.model.touch.width
         return states[:, 1 + encoder.net.model.sensor_tokens :, first:last].astype(jnp.float16)
 
     values = run_in_batches(lambda part: tokens(encoder.params, *part), both_ways(), 64)
@@ -106,14 +120,19 @@ def head(params: dict[str, jax.Array], tokens: jax.Array) -> tuple[jax.Array, ja
 
     Exchanging the pair changes the sign of the turn, and exchanges left and right, up and down.
     """
-    before, after = tokens[:, 0], tokens[:, 1]
-    change, state = after - before, (after + before) / 2
+    before = tokens[:, 0]
+    after = tokens[:, 1]
+    change = after - before
+    state = (after + before) / 2
 
     def vectors(change: jax.Array) -> jax.Array:
-        hidden = jax.nn.gelu(jnp.concatenate([change, state], -1) @ params["first"] + params["bias"][None, None])
+        hidden = jax.nn.gelu(
+            jnp.concatenate([change, state], -1) @ params["first"] + params["bias"][None, None]
+        )
         return jnp.asarray(hidden @ params["second"])
 
-    field = vectors(change) - vectors(-change)  # (B, P, 3): x, y and a turn within the patch
+    # (B, P, 3): x, y and a turn within the patch
+    field = vectors(change) - vectors(-change)
     weight = jax.nn.softmax(state @ params["place"], axis=-1)[..., None]
     side = round(tokens.shape[2] ** 0.5)
     y, x = jnp.mgrid[:side, :side].reshape(2, -1) * (2 / side)
@@ -127,7 +146,8 @@ def head(params: dict[str, jax.Array], tokens: jax.Array) -> tuple[jax.Array, ja
 
 def fit(clips: Clips, train: Array, val: Array) -> dict[str, jax.Array]:
     """Train a head on the clips `train`. The epoch with the least loss on `val` wins."""
-    mean, scale = clips.tokens[train].mean((0, 1, 2), np.float64), clips.tokens[train].std((0, 1, 2), np.float64)
+    mean = clips.tokens[train].mean((0, 1, 2), np.float64)
+    scale = clips.tokens[train].std((0, 1, 2), np.float64)
     x = ((clips.tokens - mean) / (scale + 1e-6)).astype(np.float32)
     turn = np.where(clips.turn == TURNS[0], 1.0, np.where(clips.turn == TURNS[1], 0.0, np.nan))
     slide = np.array([SLIDES.index(one) if one in SLIDES else -1 for one in clips.slide])
@@ -141,7 +161,9 @@ def fit(clips: Clips, train: Array, val: Array) -> dict[str, jax.Array]:
     steps = max(1, len(train) // BATCH)
     optimiser = optax.adamw(optax.cosine_decay_schedule(RATE, steps * EPOCHS), weight_decay=0.05)
     params = init(x.shape[-1])
-    state, rng, best = optimiser.init(params), np.random.default_rng(0), (np.inf, params)
+    state = optimiser.init(params)
+    rng = np.random.default_rng(0)
+    best = (np.inf, params)
 
     @jax.jit
     def step(params: Any, state: Any, *batch: jax.Array) -> tuple[Any, Any]:
@@ -152,7 +174,11 @@ def fit(clips: Clips, train: Array, val: Array) -> dict[str, jax.Array]:
     for _ in range(EPOCHS):
         for rows in np.array_split(rng.permutation(train)[: steps * BATCH], steps):
             params, state = step(params, state, x[rows], turn[rows], slide[rows])
-        best = min(best, (float(check(params, x[val], turn[val], slide[val])), params), key=lambda pair: pair[0])
+        best = min(
+            best,
+            (float(check(params, x[val], turn[val], slide[val])), params),
+            key=lambda pair: pair[0],
+        )
     return best[1] | {"mean": jnp.asarray(mean), "spread": jnp.asarray(scale + 1e-6)}
 
 
@@ -160,13 +186,19 @@ def score(params: dict[str, jax.Array], clips: Clips, rows: Array) -> dict[str, 
     """Return the shares of turns and slides named right on `rows`, with 95 % intervals over touches."""
     x = (clips.tokens[rows] - np.asarray(params["mean"])) / np.asarray(params["spread"])
     logit, logits = jax.jit(head)({name: params[name] for name in init(1)}, x.astype(np.float32))
-    named = {"turn": np.where(np.asarray(logit) > 0, *TURNS), "slide": np.array(SLIDES)[np.argmax(logits, -1)]}
+    named = {
+        "turn": np.where(np.asarray(logit) > 0, *TURNS),
+        "slide": np.array(SLIDES)[np.argmax(logits, -1)],
+    }
     result: dict[str, Any] = {}
     for what, truth in (("turn", clips.turn[rows]), ("slide", clips.slide[rows])):
         known = truth != "none"
         right = (named[what] == truth)[known].astype(float)
-        result[what] = {"clips": int(known.sum()), "share": float(right.mean()) if known.any() else None,
-                        "interval": mean_interval(right, clips.touch[rows][known])}  # fmt: skip
+        result[what] = {
+            "clips": int(known.sum()),
+            "share": float(right.mean()) if known.any() else None,
+            "interval": mean_interval(right, clips.touch[rows][known]),
+        }
     return result
 
 
@@ -192,12 +224,21 @@ def main() -> None:
     for name in options.models:
         clips = read(load(name), options.data, options.most)
         splits = {split: np.flatnonzero(clips.split == split) for split in ("train", "val", "test")}
-        record = {"all sensors": score(fit(clips, splits["train"], splits["val"]), clips, splits["test"])}
-        for sensor in np.unique(clips.sensor):  # the head never saw this sensor
+        record = {
+            "all sensors": score(fit(clips, splits["train"], splits["val"]), clips, splits["test"])
+        }
+        # the head never saw this sensor
+        for sensor in np.unique(clips.sensor):
             parts = {split: rows[(clips.sensor[rows] != sensor)] for split, rows in splits.items()}
             own = splits["test"][clips.sensor[splits["test"]] == sensor]
-            record[f"without {sensor}"] = score(fit(clips, parts["train"], parts["val"]), clips, own)
-        about = {"clips": len(clips.turn), "machine": plain(machine.describe()), "pooled": pooled_score(clips, splits)}
+            record[f"without {sensor}"] = score(
+                fit(clips, parts["train"], parts["val"]), clips, own
+            )
+        about = {
+            "clips": len(clips.turn),
+            "machine": plain(machine.describe()),
+            "pooled": pooled_score(clips, splits),
+        }
         write_record(options.out, name, about | {"scores": record})
         print(name, about["pooled"], record, flush=True)
 

@@ -46,8 +46,12 @@ from experiments.real.features import encoder_features
 from experiments.real.scores import other_finger_score
 from experiments.records import write_record
 
-HIDDEN, REAL = ("digit", "gelslim", "9dtact"), "gelsight_mini"
-PICTURES, PRESSED, BATCHES = 18, 7.0, 8  # to fit a sensor to; their least score of contact; of touches
+HIDDEN = ("digit", "gelslim", "9dtact")
+REAL = "gelsight_mini"
+# to fit a sensor to; their least score of contact; of touches
+PICTURES = 18
+PRESSED = 7.0
+BATCHES = 8
 
 
 @partial(jax.jit, static_argnames="sampling")
@@ -56,19 +60,31 @@ def device_touches(key: Any, world: Any, unit: Any, sampling: Sampling) -> Any:
     drawn = endless.draw_touches(key, world, sampling, COUNT, 0)
     own = jax.tree.map(lambda old, one: old.at[:, 1].set(one), drawn.clip.unit, unit)
     numbers = jax.tree.map(lambda old, one: old.at[:, 1].set(one[0]), drawn.numbers, world.families)
-    return endless.simulate_drawn(drawn._replace(clip=drawn.clip._replace(unit=own), numbers=numbers), sampling)
+    return endless.simulate_drawn(
+        drawn._replace(clip=drawn.clip._replace(unit=own), numbers=numbers), sampling
+    )
 
 
 def adapted_to(
-    encoder: Encoder, pictures: list[np.ndarray], gel: np.ndarray, width_mm: float, name: str, folder: Path,
-    minutes: float, seed: int, ball_mm: float | None = None,
-) -> tuple[Encoder, str, dict[str, Any]]:  # fmt: skip
+    encoder: Encoder,
+    pictures: list[np.ndarray],
+    gel: np.ndarray,
+    width_mm: float,
+    name: str,
+    folder: Path,
+    minutes: float,
+    seed: int,
+    ball_mm: float | None = None,
+) -> tuple[Encoder, str, dict[str, Any]]:
     """Return an encoder with tokens for the sensor of these pictures, the name of the tokens, and how it was fitted.
 
     Tokens that find fewer touches than the universal ones are refused: then the universal ones stay.
     """
-    mine, run = folder / f"my_{name}.sensor", folder / f"run_{name}"
-    fitted = fit_sensor(pictures, f"new_{name.strip('9')}_unit", width_mm, mine, background=gel, ball_mm=ball_mm)
+    mine = folder / f"my_{name}.sensor"
+    run = folder / f"run_{name}"
+    fitted = fit_sensor(
+        pictures, f"new_{name.strip('9')}_unit", width_mm, mine, background=gel, ball_mm=ball_mm
+    )
     about: dict[str, Any] = {"simulated": None}
     known = tuple(other for other in CAMERAS if other != name)
     try:
@@ -89,32 +105,47 @@ def study(
     known = tuple(other for other in CAMERAS if other != name)
     rng = np.random.default_rng([seed, 59])
     device = draw_unit(SENSORS[name], rng)
-    device = device._replace(mirror=np.ones(2, np.float32), base=endless.untouched(SENSORS[name])[0],
-                             offset=np.zeros(2, np.float32), rotation=np.float32(0))  # fmt: skip
+    device = device._replace(
+        mirror=np.ones(2, np.float32),
+        base=endless.untouched(SENSORS[name])[0],
+        offset=np.zeros(2, np.float32),
+        rotation=np.float32(0),
+    )
     sampling = Sampling(takes=2, size=SIZE, fields=FIELDS)
     touches = partial(device_touches, unit=jax.tree.map(jnp.asarray, device), sampling=sampling)
     root = jax.random.key(seed)
     own = partial(own_world, known=known)
-    first = jax.device_get(touches(jax.random.fold_in(root, 1), own(name, "train", ball_mm=ball_mm)))
+    first = jax.device_get(
+        touches(jax.random.fold_in(root, 1), own(name, "train", ball_mm=ball_mm))
+    )
     height, width = (round(SIZE * side / min(SENSORS[name].field)) for side in SENSORS[name].field)
     seen = (first.background[0, 1], *first.clip[:PICTURES, 1, -1])
     gel, *pictures = (cv2.resize(one, (width, height)) for one in seen)
     width_mm = float(SENSORS[name].field[1] * device.zoom)
-    after, own_name, about = adapted_to(encoder, pictures, gel, width_mm, name, folder, minutes, seed, ball_mm)
+    after, own_name, about = adapted_to(
+        encoder, pictures, gel, width_mm, name, folder, minutes, seed, ball_mm
+    )
     rows = {
-        "universal": (encoder, encoder.config.model.universal_row), "adapted": (after, after.sensor_row(own_name)),
+        "universal": (encoder, encoder.config.model.universal_row),
+        "adapted": (after, after.sensor_row(own_name)),
         "own": (encoder, encoder.sensor_row(name)),
-    }  # fmt: skip
-    test, config, parts = own(name, "test"), subtracted(encoder.config), []
+    }
+    test = own(name, "test")
+    config = subtracted(encoder.config)
+    parts = []
     errors = {kind: list[dict[str, np.ndarray]]() for kind in rows}
     for number in range(BATCHES):
         found = touches(key := jax.random.fold_in(root, 100 + number), test)
-        batch = jax.device_get(field_batch(key, found, jnp.zeros((COUNT, 2), jnp.int32), config, COUNT))
+        batch = jax.device_get(
+            field_batch(key, found, jnp.zeros((COUNT, 2), jnp.int32), config, COUNT)
+        )
         found = jax.device_get(found)
         use = found.sensor[:, 0] > 0
         known_clip = prepared(key, found.clip[:, 0], found.background[:, 0], config, jitter=False)
         other = [encoder.sensor_row(known[n - 1]) for n in found.sensor[use][:, 0]]
-        features = {"target": encoder.encode_touch(np.asarray(known_clip)[use], np.array(other, np.int32))}
+        features = {
+            "target": encoder.encode_touch(np.asarray(known_clip)[use], np.array(other, np.int32))
+        }
         for kind, (reader, row) in rows.items():
             numbers = np.full(COUNT, row, np.int32)
             features[kind] = reader.encode_touch(batch.clip, numbers)[use]
@@ -123,24 +154,37 @@ def study(
         parts.append(features | {"object": found.object[use]})
     joined = {kind: np.concatenate([part[kind] for part in parts]) for kind in parts[0]}
     objects = joined.pop("object")
-    unit_norm = {kind: values / np.linalg.norm(values, axis=1, keepdims=True) for kind, values in joined.items()}
+    unit_norm = {
+        kind: values / np.linalg.norm(values, axis=1, keepdims=True)
+        for kind, values in joined.items()
+    }
     target = unit_norm.pop("target")
     right = {kind: (z @ target.T).argmax(1) == np.arange(len(z)) for kind, z in unit_norm.items()}
     return about | {
         "touches": len(target),
-        "scores": {kind: {"share": float(one.mean()), "interval": mean_interval(one.astype(float), objects)}
-                   for kind, one in right.items()},
+        "scores": {
+            kind: {
+                "share": float(one.mean()),
+                "interval": mean_interval(one.astype(float), objects),
+            }
+            for kind, one in right.items()
+        },
         "depth": {kind: _mean(of, "depth") for kind, of in errors.items()},
         "force": {kind: _mean(of, "force") for kind, of in errors.items()},
-    }  # fmt: skip
+    }
 
 
 def _mean(errors: list[dict[str, np.ndarray]], name: str) -> dict[str, Any]:
     values = np.concatenate([one[name] for one in errors], dtype=float)
-    return {"share": float(values.mean()), "interval": mean_interval(values, np.arange(len(values)))}
+    return {
+        "share": float(values.mean()),
+        "interval": mean_interval(values, np.arange(len(values))),
+    }
 
 
-def real_study(encoder: Encoder, pack: Path, folder: Path, minutes: float, seed: int) -> dict[str, Any]:
+def real_study(
+    encoder: Encoder, pack: Path, folder: Path, minutes: float, seed: int
+) -> dict[str, Any]:
     """Return scores on real objects of a GelSight Mini whose look is fitted to its real pictures of training."""
     data = recordings.read(pack)
     score = data.manifest.number_column("label.contact_score")
@@ -150,24 +194,44 @@ def real_study(encoder: Encoder, pack: Path, folder: Path, minutes: float, seed:
     chosen = np.random.default_rng(seed).choice(pressed, PICTURES, replace=False)
     gel = data.gels.shared(lambda picture: picture)(chosen[0])
     assert gel is not None
-    pictures, width_mm = [decode(data.manifest.file(row)) for row in chosen], SENSORS[REAL].field[1]
-    after, own_name, about = adapted_to(encoder, pictures, gel, width_mm, REAL, folder, minutes, seed)
+    pictures = [decode(data.manifest.file(row)) for row in chosen]
+    width_mm = SENSORS[REAL].field[1]
+    after, own_name, about = adapted_to(
+        encoder, pictures, gel, width_mm, REAL, folder, minutes, seed
+    )
     rows = {"universal": (encoder, UNIVERSAL), "adapted": (after, own_name), "own": (encoder, REAL)}
     found = {
         kind: other_finger_score(encoder_features(reader, data, sensor=name), data)
         for kind, (reader, name) in rows.items()
     }
-    return about | {"scores": {kind: {"share": one.share, "interval": one.interval()} for kind, one in found.items()}}
+    return about | {
+        "scores": {
+            kind: {"share": one.share, "interval": one.interval()} for kind, one in found.items()
+        }
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model")
-    parser.add_argument("--sensors", nargs="*", default=(*HIDDEN, "real"), choices=(*HIDDEN, REAL, "real"))
-    parser.add_argument("--title", default="", help="of the encoder in the table, where it is not that of the package")
-    parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"), help="real recordings")
+    parser.add_argument(
+        "--sensors", nargs="*", default=(*HIDDEN, "real"), choices=(*HIDDEN, REAL, "real")
+    )
+    parser.add_argument(
+        "--title",
+        default="",
+        help="of the encoder in the table, where it is not that of the package",
+    )
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=Path("../shared/real_touch2/manifest.csv"),
+        help="real recordings",
+    )
     parser.add_argument("--minutes", type=float, default=8.0)
-    parser.add_argument("--ball-mm", type=float, help="press a ball instead of all kinds of objects")
+    parser.add_argument(
+        "--ball-mm", type=float, help="press a ball instead of all kinds of objects"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, default=Path("runs/new_sensor"))
     parser.add_argument("--out", type=Path, default=Path("experiments/results/new_sensor.jsonl"))
@@ -178,10 +242,14 @@ def main() -> None:
     for name in options.sensors:
         if name == "real":
             key = f"{REAL}, real objects by the other finger"
-            record = real_study(encoder, options.data, options.folder, options.minutes, options.seed)
+            record = real_study(
+                encoder, options.data, options.folder, options.minutes, options.seed
+            )
         else:
             key = f"{name}, {'presses of a ball' if options.ball_mm else 'presses of objects'}"
-            record = study(encoder, name, options.folder, options.minutes, options.seed, options.ball_mm)
+            record = study(
+                encoder, name, options.folder, options.minutes, options.seed, options.ball_mm
+            )
         key += f", {options.title}" * bool(options.title)
         write_record(options.out, key, about | {"minutes": options.minutes} | record)
         print(name, record, flush=True)

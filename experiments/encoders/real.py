@@ -22,10 +22,16 @@ SHORT = 144  # pixels
 TOUCHED = 5.0  # of label.contact_score in the second pack. The rows of the first are all presses.
 
 
-def copy(pack: Path, out: Path, keep: Callable[[Row], bool], contact: Callable[[Row], bool]) -> Path:
+def copy(
+    pack: Path, out: Path, keep: Callable[[Row], bool], contact: Callable[[Row], bool]
+) -> Path:
     """Copy the train rows of a pack that `keep` allows, with their pictures and a label.contact."""
     with (pack / "manifest.csv").open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["split"] == "train" and row["background_path"] and keep(row)]
+        rows = [
+            row
+            for row in csv.DictReader(file)
+            if row["split"] == "train" and row["background_path"] and keep(row)
+        ]
     for row in rows:
         row["label.contact"] = str(int(contact(row)))
         if contact(row) and row.get("grasp_group"):
@@ -46,7 +52,9 @@ def _shrink(source: Path, target: Path) -> None:
     image = cv2.imread(str(source))
     scale = min(1.0, SHORT / min(image.shape[:2]))
     image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(target), image, [cv2.IMWRITE_JPEG_QUALITY, 88] if target.suffix == ".jpg" else [])
+    cv2.imwrite(
+        str(target), image, [cv2.IMWRITE_JPEG_QUALITY, 88] if target.suffix == ".jpg" else []
+    )
 
 
 def main() -> None:
@@ -56,11 +64,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("data/real"))
     options = parser.parse_args()
     print(
-        copy(options.pack2, options.out / "pack2", lambda row: row["sensor"] == "gelsight_mini",
-             lambda row: float(row["label.contact_score"] or 0) > TOUCHED),
-        copy(options.pack1, options.out / "pack1", lambda row: row["dataset"] != SLIP and row["commercial"] != "0",
-             lambda row: True),
-    )  # fmt: skip
+        copy(
+            options.pack2,
+            options.out / "pack2",
+            lambda row: row["sensor"] == "gelsight_mini",
+            lambda row: float(row["label.contact_score"] or 0) > TOUCHED,
+        ),
+        copy(
+            options.pack1,
+            options.out / "pack1",
+            lambda row: row["dataset"] != SLIP and row["commercial"] != "0",
+            lambda row: True,
+        ),
+    )
 
 
 if __name__ == "__main__":

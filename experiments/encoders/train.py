@@ -29,18 +29,35 @@ from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.registry import PARTS, write_encoder
 
 SETTINGS: dict[str, Any] = {
-    "model.embed": 192, "model.fields": 32, "data.background": "either", "data.jitter": (0.0, 0.0, 0.0, 0.0),
-    "data.affine": (10.0, 0.05, 0.15), "run.figure_every": 0, "run.save_every": 2000, "run.keep": 1,
-    "run.steps": 10_000, "optim.warmup": 400, "optim.grad_clip": 10.0, "simulated.wild": 0.25, "simulated.variants": 3,
+    "model.embed": 192,
+    "model.fields": 32,
+    "data.background": "either",
+    "data.jitter": (0.0, 0.0, 0.0, 0.0),
+    "data.affine": (10.0, 0.05, 0.15),
+    "run.figure_every": 0,
+    "run.save_every": 2000,
+    "run.keep": 1,
+    "run.steps": 10_000,
+    "optim.warmup": 400,
+    "optim.grad_clip": 10.0,
+    "simulated.wild": 0.25,
+    "simulated.variants": 3,
     "simulated.vision": 0.0,
-}  # fmt: skip
+}
 STAGES: dict[int, dict[str, Any]] = {
-    1: {"optim.learning_rate": 1e-3, "objective.norm_pix_loss": True, "objective.field_weight": 0.1},
-    2: {
-        "optim.learning_rate": 8e-4, "model.match_head": "cosine", "objective.match_weight": 4.0,
-        "objective.field_weight": 0.2, "data.clip_share": 0.34,
+    1: {
+        "optim.learning_rate": 1e-3,
+        "objective.norm_pix_loss": True,
+        "objective.field_weight": 0.1,
     },
-}  # fmt: skip
+    2: {
+        "optim.learning_rate": 8e-4,
+        "model.match_head": "cosine",
+        "objective.match_weight": 4.0,
+        "objective.field_weight": 0.2,
+        "data.clip_share": 0.34,
+    },
+}
 # Device: touches of a batch of stage 1, pairs of stage 2, share of the patches that matching encodes, more settings.
 DEVICES: dict[str, tuple[int, int, float, dict[str, Any]]] = {
     "gpu": (1024, 640, 0.6, {"model.dtype": "bfloat16"}),
@@ -50,13 +67,20 @@ STATE = "state"
 ALL = (*PARTS, "decoder", "fields")
 
 
-def configure(stage: Literal[1, 2], real: Sequence[str], cycle: int, changes: Mapping[str, Any]) -> Config:
+def configure(
+    stage: Literal[1, 2], real: Sequence[str], cycle: int, changes: Mapping[str, Any]
+) -> Config:
     """Return the configuration of a stage of the recipe on this device."""
     first, second, keep, more = DEVICES["cpu" if jax.default_backend() == "cpu" else "gpu"]
-    settings = SETTINGS | STAGES[stage] | more | {"run.seed": cycle, "data.manifests": (SIMULATED, *real)}
+    settings = (
+        SETTINGS | STAGES[stage] | more | {"run.seed": cycle, "data.manifests": (SIMULATED, *real)}
+    )
     settings["data.batch_size"] = first if stage == 1 else second
     if real:
-        settings |= {"data.contact_only": True, "data.weights": ((SIMULATED, 9.0 if stage == 1 else 6.0),)}
+        settings |= {
+            "data.contact_only": True,
+            "data.weights": ((SIMULATED, 9.0 if stage == 1 else 6.0),),
+        }
     config = preset("tiny", stage=stage)
     if stage == 2:
         assert config.model.text is not None
@@ -67,16 +91,31 @@ def configure(stage: Literal[1, 2], real: Sequence[str], cycle: int, changes: Ma
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--minutes", type=float, default=12.0, help="wall time of this call, compilation included")
+    parser.add_argument(
+        "--minutes", type=float, default=12.0, help="wall time of this call, compilation included"
+    )
     parser.add_argument("--real", nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, default=Path("runs/anytouch-tiny"))
-    parser.add_argument("--stage1-share", type=float, default=0.3, help="of the time of the first call")
-    parser.add_argument("--stages", type=int, nargs="+", default=[1, 2], help="stages to train in a first call")
-    parser.add_argument("--set", nargs="*", default=[], metavar="SECTION.FIELD=VALUE", help="other settings, as JSON")
+    parser.add_argument(
+        "--stage1-share", type=float, default=0.3, help="of the time of the first call"
+    )
+    parser.add_argument(
+        "--stages", type=int, nargs="+", default=[1, 2], help="stages to train in a first call"
+    )
+    parser.add_argument(
+        "--set",
+        nargs="*",
+        default=[],
+        metavar="SECTION.FIELD=VALUE",
+        help="other settings, as JSON",
+    )
     given = parser.parse_args()
-    changes = {name: json.loads(value) for name, _, value in (word.partition("=") for word in given.set)}
+    changes = {
+        name: json.loads(value) for name, _, value in (word.partition("=") for word in given.set)
+    }
     begun = time.monotonic()
-    end, state = begun + 60 * given.minutes, given.out / STATE
+    end = begun + 60 * given.minutes
+    state = given.out / STATE
     enable_compilation_cache()
     cycle = len(list(given.out.glob("cycle-*")))
     init = state if state.exists() else None
@@ -86,7 +125,9 @@ def main() -> None:
         until = end if stage == stages[-1] else begun + 60 * given.minutes * given.stage1_share
         config = configure(stage, given.real, cycle, changes)
         result = pretrain(config, run, init=init, log=log, until=until)
-        log(f"stage {stage}: {result.step} steps of {config.data.batch_size}, loss {result.metrics.get('loss')}")
+        log(
+            f"stage {stage}: {result.step} steps of {config.data.batch_size}, loss {result.metrics.get('loss')}"
+        )
         if result.interrupted:
             raise SystemExit(130)
         loaded = load_model(run)
@@ -95,7 +136,13 @@ def main() -> None:
         shutil.copyfile(run / "metrics.jsonl", given.out / f"cycle-{cycle:02d}-stage{stage}.jsonl")
         if stage == 2:
             notes = Path(__file__).with_name("anytouch-tiny.md").read_text(encoding="utf-8")
-            write_encoder(given.out / "anytouch-tiny", loaded, notes, parts=(*PARTS, "fields"), tokenizer=tokenizer)
+            write_encoder(
+                given.out / "anytouch-tiny",
+                loaded,
+                notes,
+                parts=(*PARTS, "fields"),
+                tokenizer=tokenizer,
+            )
         shutil.rmtree(run / CHECKPOINTS)  # the state is what goes on
         init = state
 

@@ -24,8 +24,12 @@ def notebooks(chosen: list[str]) -> list[Path]:
 def executed(path: Path) -> str:
     """Return a notebook, run from top to bottom, as JSON. Raises CellExecutionError."""
     page = nbformat.read(path, as_version=4)
-    page.metadata = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
-    ExecutePreprocessor(timeout=3600, kernel_name="python3").preprocess(page, {"metadata": {"path": str(ROOT)}})
+    page.metadata = {
+        "kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}
+    }
+    ExecutePreprocessor(timeout=3600, kernel_name="python3").preprocess(
+        page, {"metadata": {"path": str(ROOT)}}
+    )
     for number, cell in enumerate(page.cells):
         cell["id"] = f"cell-{number}"
         cell.metadata.pop("execution", None)
@@ -36,7 +40,9 @@ def executed(path: Path) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("number", nargs="*", help="how the names of the notebooks begin (default: all)")
+    parser.add_argument(
+        "number", nargs="*", help="how the names of the notebooks begin (default: all)"
+    )
     for path in notebooks(parser.parse_args().number):
         text = executed(path)
         path.write_text(text + "\n", encoding="utf-8")

@@ -32,16 +32,27 @@ def scenes() -> at.Manifest:
 
 def small(config: at.Config, steps: int, batch: int) -> at.Config:
     """Return a configuration with a network and a schedule small enough for minutes on a CPU."""
-    tower, model = {"width": 64, "depth": 2, "heads": 4, "mlp": 128}, config.model
-    image, text = model.image, model.text
+    tower = {"width": 64, "depth": 2, "heads": 4, "mlp": 128}
+    model = config.model
+    image = model.image
+    text = model.text
     model = replace(
-        model, image_size=56, touch=replace(model.touch, **tower), decoder=replace(model.decoder, **tower),
-        image=image and replace(image, **tower), text=text and replace(text, stack=replace(text.stack, **tower)),
-    )  # fmt: skip
-    return replace(config, model=model).with_settings({
-        "data.batch_size": batch, "optim.learning_rate": 1e-3, "run.steps": steps, "run.save_every": steps,
-        "run.figure_every": steps,
-    })  # fmt: skip
+        model,
+        image_size=56,
+        touch=replace(model.touch, **tower),
+        decoder=replace(model.decoder, **tower),
+        image=image and replace(image, **tower),
+        text=text and replace(text, stack=replace(text.stack, **tower)),
+    )
+    return replace(config, model=model).with_settings(
+        {
+            "data.batch_size": batch,
+            "optim.learning_rate": 1e-3,
+            "run.steps": steps,
+            "run.save_every": steps,
+            "run.figure_every": steps,
+        }
+    )
 
 
 def deepest(table: at.Manifest, split: str, most: int) -> np.ndarray:
@@ -67,10 +78,14 @@ def small_pictures(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
     return np.stack(changes).reshape(len(rows), -1) / 255
 
 
-def show(pictures: Sequence[np.ndarray], titles: Sequence[str], across: int, size: float = 1.7) -> None:
+def show(
+    pictures: Sequence[np.ndarray], titles: Sequence[str], across: int, size: float = 1.7
+) -> None:
     """Show pictures in rows of `across`, each with a title."""
     down = -(-len(pictures) // across)
-    figure, axes = plt.subplots(down, across, figsize=(size * across, (size + 0.2) * down), squeeze=False)
+    figure, axes = plt.subplots(
+        down, across, figsize=(size * across, (size + 0.2) * down), squeeze=False
+    )
     for axis in axes.flat:
         axis.axis("off")
     for axis, picture, title in zip(axes.flat, pictures, titles, strict=False):

@@ -44,14 +44,19 @@ def pages(folder: Path) -> list[Page]:
     for data, make in PAGES.values():
         name, _, question = data.partition("/")
         records = read_records(folder / name)
-        if records and (not question or any(one.get("question") == question for one in records.values())):
+        if records and (
+            not question or any(one.get("question") == question for one in records.values())
+        ):
             made.append(make(folder))
     return made
 
 
 def index(several: list[Page]) -> str:
     """Return the front page: a row a page."""
-    rows = [(one.record["question"], *page.answer(one), f"[{one.name}]({one.name}.md)") for one in several]
+    rows = [
+        (one.record["question"], *page.answer(one), f"[{one.name}]({one.name}.md)")
+        for one in several
+    ]
     table = page.markdown(Table("", ("question", "answer", "figure", "page"), rows))
     table = re.sub(r"\[(\w+)]\\\(\1\.md\)", r"[\1](\1.md)", table)
     return (
@@ -62,8 +67,10 @@ def index(several: list[Page]) -> str:
 
 def tried(folder: Path) -> str:
     """Return the page of studies that have answered their question."""
-    rows = [(one["question"], one["answer"], one["figure"], f"`{one['commit']}`")
-            for one in read_records(folder / TRIED).values()]  # fmt: skip
+    rows = [
+        (one["question"], one["answer"], one["figure"], f"`{one['commit']}`")
+        for one in read_records(folder / TRIED).values()
+    ]
     table = page.markdown(Table("", ("question", "answer", "figure", "code at"), rows))
     return (
         "# What was tried\n\nThese studies have answered their question, and their code has left. It last ran at the "
@@ -77,7 +84,10 @@ def readme(text: str, several: list[Page]) -> str:
     for one in several:
         for name, value in one.readme.items():
             pattern = re.compile(rf"(?<={re.escape(name)}`) [\d.]+ %")
-            lines = [pattern.sub(f" {value.mean:.1f} %", line) if f"/{one.name}.md" in line else line for line in lines]
+            lines = [
+                pattern.sub(f" {value.mean:.1f} %", line) if f"/{one.name}.md" in line else line
+                for line in lines
+            ]
     return "".join(lines)
 
 

@@ -15,20 +15,27 @@ from experiments.real.scores import HEADS, TASKS, TRAINED, Score
 from experiments.records import Record, check_alike, read_records
 from experiments.values import Value, percent
 
-UNTRAINED, FINGER = "untrained:", "object, other finger"
+UNTRAINED = "untrained:"
+FINGER = "object, other finger"
 
 
 def _score(one: Record, task: str) -> Score | None:
     found = one["tasks"].get(task)
-    return found and Score(np.array(found["correct"], bool), np.array(found["groups"]), found["option"])
+    return found and Score(
+        np.array(found["correct"], bool), np.array(found["groups"]), found["option"]
+    )
 
 
 def _minus(score: Score | None, other: Score | None) -> Value | None:
-    return None if score is None or other is None or score is other else percent(score.minus(other))
+    if score is None or other is None or score is other:
+        return None
+    return percent(score.minus(other))
 
 
 def _share(score: Score | None) -> Value | None:
-    return None if score is None else percent((score.share, *score.interval()))
+    if score is None:
+        return None
+    return percent((score.share, *score.interval()))
 
 
 def real(folder: Path) -> Page:
@@ -40,11 +47,18 @@ def real(folder: Path) -> Page:
     findings: list[Finding] = []
     readme: dict[str, Value] = {}
     for task in (FINGER, *(task for task in TASKS if task != FINGER)):
-        scores = {name: [_score(one, f"{task}, {head}") for head in (*HEADS, TRAINED)] for name, one in records.items()}
+        scores = {
+            name: [_score(one, f"{task}, {head}") for head in (*HEADS, TRAINED)]
+            for name, one in records.items()
+        }
         found = []
         for name, (linear, near, trained) in scores.items():
-            end = name.removeprefix(plain := name.removesuffix(f", {records[name].get('untouched')}"))
-            fresh = scores.get(f"{UNTRAINED}{plain}", scores.get(f"{UNTRAINED}{DEFAULT}", [None]))[0]
+            end = name.removeprefix(
+                plain := name.removesuffix(f", {records[name].get('untouched')}")
+            )
+            fresh = scores.get(f"{UNTRAINED}{plain}", scores.get(f"{UNTRAINED}{DEFAULT}", [None]))[
+                0
+            ]
             learned = UNTRAINED not in name
             pixels = scores.get(f"pixels{end}", [None])[0]
             against = (pixels, None if end else fresh) if learned else (None, None)
@@ -53,22 +67,39 @@ def real(folder: Path) -> Page:
             found.append((task, name, _share(linear or trained), _share(near), *changes))
             if records[name]["kind"] == "encoder" and learned:
                 others = (f"pixels{end}", "an untrained encoder", f"`{plain}` by the rule")
-                findings += [Finding(f"`{name}`", *pair, task) for pair in zip(others, changes, strict=True) if pair[1]]
+                findings += [
+                    Finding(f"`{name}`", *pair, task)
+                    for pair in zip(others, changes, strict=True)
+                    if pair[1]
+                ]
         rows += sorted((row for row in found if row[2] is not None), key=lambda row: -row[2].mean)
-        readme |= {row[1].removesuffix(f":{DEFAULT}"): row[2] for row in found if task == FINGER and row[2] is not None}
+        readme |= {
+            row[1].removesuffix(f":{DEFAULT}"): row[2]
+            for row in found
+            if task == FINGER and row[2] is not None
+        }
     findings.sort(key=lambda one: one.first != f"`{DEFAULT}`")
     return Page("real", [rows], findings, readme=readme)
 
 
 def motion(folder: Path) -> Page:
     """The sign of a turn and the direction of a slide, from frozen tokens."""
-    rows, findings = [], []
+    rows = []
+    findings = []
     for name, record in read_records(folder / "motion.jsonl").items():
         scores = record["scores"]
-        own = [(name, row, *(percent([found[k]["share"], *found[k]["interval"]]) for k in ("turn", "slide")))
-               for row, found in scores.items()]  # fmt: skip
-        findings.append(f"`{name}`: the head names {own[0][2].mean:.0f} % of turns of new objects. A linear probe on "
-                        f"the mean token names {100 * record['pooled']:.0f} %.")  # fmt: skip
+        own = [
+            (
+                name,
+                row,
+                *(percent([found[k]["share"], *found[k]["interval"]]) for k in ("turn", "slide")),
+            )
+            for row, found in scores.items()
+        ]
+        findings.append(
+            f"`{name}`: the head names {own[0][2].mean:.0f} % of turns of new objects. A linear probe on "
+            f"the mean token names {100 * record['pooled']:.0f} %."
+        )
         rows += own
     answer = "A small head on the patch tokens names this share of turns of new objects."
     return Page("motion", [rows], findings, (answer, f"{rows[0][2].shown()} %"))
@@ -77,14 +108,29 @@ def motion(folder: Path) -> Page:
 def measure(folder: Path) -> Page:
     """Errors of depth, shear and force, simulated and on real balls."""
     sensors = read_records(folder / "measure.jsonl")
-    shares = {name: {part: 100 * value for part, value in one.items() if isinstance(value, float)}
-              for name, one in sensors.items()}  # fmt: skip
-    rows = [(name, one["depth"], *map(shares[name].get, ("iou", "force", "inside"))) for name, one in sensors.items()]
+    shares = {
+        name: {part: 100 * value for part, value in one.items() if isinstance(value, float)}
+        for name, one in sensors.items()
+    }
+    rows = [
+        (name, one["depth"], *map(shares[name].get, ("iou", "force", "inside")))
+        for name, one in sensors.items()
+    ]
     others = ("dots_shear", "drag", "shear", "false_contact", "false_force")
     along = [(name, *map(one.get, others)) for name, one in shares.items()]
-    balls = {name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one}
-    real = [(name, *(percent(one["radius"]) if part == "radius" else Value(*one[part]) for part in
-                     ("radius", "centre", "profile"))) for name, one in balls.items()]  # fmt: skip
+    balls = {
+        name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one
+    }
+    real = [
+        (
+            name,
+            *(
+                percent(one["radius"]) if part == "radius" else Value(*one[part])
+                for part in ("radius", "centre", "profile")
+            ),
+        )
+        for name, one in balls.items()
+    ]
     low, high = (bound(row[1] for row in rows) for bound in (min, max))
     findings = [
         f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
@@ -99,28 +145,52 @@ def measure(folder: Path) -> Page:
 
 def lookalikes(folder: Path) -> Page:
     """The same touch by another sensor, among 50 that resemble it."""
-    rows, findings, readme = [], [], dict[str, Value]()
+    rows = []
+    findings = []
+    readme = dict[str, Value]()
     records = read_records(folder / "lookalikes.jsonl")
     curve = records.pop("training", None)
     for key, record in records.items():
         grade = f"{key} alignment"
-        scores = {name: percent([one["share"], *one["interval"]]) for name, one in record["scores"].items()}
+        scores = {
+            name: percent([one["share"], *one["interval"]])
+            for name, one in record["scores"].items()
+        }
         scores = dict(sorted(scores.items(), key=lambda item: -item[1].mean))
         rows += [(grade, name, value) for name, value in scores.items()]
-        parts = ", ".join(f"`{name}` finds {scores[name].mean:.0f} %" for name in scores if name in record["encoders"])
+        parts = ", ".join(
+            f"`{name}` finds {scores[name].mean:.0f} %"
+            for name in scores
+            if name in record["encoders"]
+        )
         findings.append(f"{grade}: {parts}, and pixels {scores['pixels'].mean:.0f} %.")
         readme = scores if key == "fine" else readme
     if not (best := next(iter(readme), "")):
         return Page("lookalikes", [rows], findings)
     answer = f"`{best}` finds this share first of 50, and raw pixels {readme['pixels'].mean:.1f} %."
-    learned = [list(zip(curve["pairs"], (100 * share for share in curve["recall"]), strict=True))] if curve else []
-    return Page("lookalikes", [rows, *learned], findings, (answer, f"{readme[best].shown()} %"), readme=readme)
+    learned = (
+        [list(zip(curve["pairs"], (100 * share for share in curve["recall"]), strict=True))]
+        if curve
+        else []
+    )
+    return Page(
+        "lookalikes",
+        [rows, *learned],
+        findings,
+        (answer, f"{readme[best].shown()} %"),
+        readme=readme,
+    )
 
 
 def new_sensor(folder: Path) -> Page:
     """Look-alikes, real objects, depth and force asked by a known sensor as if it was new."""
-    kinds = {"universal": "universal tokens", "adapted": "adapted by simulation", "own": "its own tokens"}
-    rows, gains = [], []
+    kinds = {
+        "universal": "universal tokens",
+        "adapted": "adapted by simulation",
+        "own": "its own tokens",
+    }
+    rows = []
+    gains = []
 
     def value(record: Record, part: str, kind: str, unit: float) -> Value | None:
         one = record.get(part, {}).get(kind)
@@ -129,12 +199,17 @@ def new_sensor(folder: Path) -> Page:
     for key, record in read_records(folder / "new_sensor.jsonl").items():
         steps = record["simulated"][0] if record["simulated"] else 0
         for kind, words in kinds.items():
-            values = [value(record, part, kind, unit) for part, unit in (("scores", 100), ("depth", 1), ("force", 100))]
+            values = [
+                value(record, part, kind, unit)
+                for part, unit in (("scores", 100), ("depth", 1), ("force", 100))
+            ]
             rows.append((key, words, steps if kind == "adapted" else None, *values))
         found = {kind: value(record, "scores", kind, 100) for kind in kinds}
         refused = "" if steps else " (refused: the universal tokens stay)"
-        gains.append(f"{key}: {found['universal'].mean:.0f} % with universal tokens, {found['adapted'].mean:.0f} % "
-                     f"adapted{refused}, {found['own'].mean:.0f} % with its own.")  # fmt: skip
+        gains.append(
+            f"{key}: {found['universal'].mean:.0f} % with universal tokens, {found['adapted'].mean:.0f} % "
+            f"adapted{refused}, {found['own'].mean:.0f} % with its own."
+        )
     return Page("new_sensor", [rows], gains)
 
 
@@ -144,23 +219,36 @@ def trust(folder: Path) -> Page:
     for key, one in read_records(folder / "trust.jsonl").items():
         by_kind.setdefault(key.partition("/")[0], {})[key.partition("/")[2]] = one
     if lost := {"trust", "health"} - by_kind.keys():
-        raise UserError(f"{folder / 'trust.jsonl'} has no record of {min(lost)}. Run experiments.real.trust first.")
-    rows, findings, units = [], [], by_kind["health"]
+        raise UserError(
+            f"{folder / 'trust.jsonl'} has no record of {min(lost)}. Run experiments.real.trust first."
+        )
+    rows = []
+    findings = []
+    units = by_kind["health"]
     for name, one in by_kind["trust"].items():
         hardest = min((found["auroc"] for found in one["sensors"].values()), default=None)
-        both = (None if value is None else percent(value) for value in (one["never_met"].get("novelty"), hardest))
+        both = (
+            None if value is None else percent(value)
+            for value in (one["never_met"].get("novelty"), hardest)
+        )
         figures = (percent(one[key]) for key in ("accuracy", "ece", "coverage", "decided", "novel"))
         rows.append((name, *figures, one["size"], *both))
         findings.append(
             f"{name}: sets hold the class in {rows[-1][3].mean:.1f} %, and {100 * one['asked']:.0f} % were asked for."
         )
-    counts = {fault: np.sum([one["faults"][fault] for one in units.values()], 0)
-              for fault in next(iter(units.values()))["faults"]}  # fmt: skip
+    counts = {
+        fault: np.sum([one["faults"][fault] for one in units.values()], 0)
+        for fault in next(iter(units.values()))["faults"]
+    }
     faults = [(fault, f"{one[0]} of {one[1]}", f"{one[2]}") for fault, one in counts.items()]
     reported, made = (sum(one[i] for one in counts.values()) for i in (0, 1))
-    alarmed = sum(len({alarm.partition(":")[0] for alarm in one["alarms"]}) for one in units.values())
+    alarmed = sum(
+        len({alarm.partition(":")[0] for alarm in one["alarms"]}) for one in units.values()
+    )
     findings.append(f"{reported} of {made} made faults of sensor units are reported.")
-    findings.append(f"{alarmed} of {sum(one['units'] for one in units.values())} good units raise an alarm.")
+    findings.append(
+        f"{alarmed} of {sum(one['units'] for one in units.values())} good units raise an alarm."
+    )
     answer = f"Of sets that should hold the class in 90 %, this share does. {findings[-2]}"
     return Page(
         "trust",

@@ -60,7 +60,9 @@ class Finding(NamedTuple):
     @property
     def figure(self) -> str:
         """The difference with its interval."""
-        return "" if self.change is None else f"{self.change.shown(f'+{self.form}')}{self.unit}"
+        if self.change is None:
+            return ""
+        return f"{self.change.shown(f'+{self.form}')}{self.unit}"
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,11 @@ def _headed(record: Mapping[str, Any], rows: Sequence[Row]) -> Table:
 def sentences(page: Page) -> list[str]:
     """Return at most MOST findings; the last one counts comparisons without a difference."""
     compared = [one for one in page.findings if isinstance(one, Finding)]
-    shown = [one if isinstance(one, str) else f"{one.words}, {one.figure}." for one in page.findings
-             if isinstance(one, str) or one.differs]  # fmt: skip
+    shown = [
+        one if isinstance(one, str) else f"{one.words}, {one.figure}."
+        for one in page.findings
+        if isinstance(one, str) or one.differs
+    ]
     if alike := sum(not one.differs for one in compared):
         shown = [*shown[: MOST - 1], f"{alike} of {len(compared)} comparisons show no difference."]
     return [one[0].upper() + one[1:] for one in shown[:MOST]]
@@ -111,15 +116,20 @@ def sentences(page: Page) -> list[str]:
 def answer(page: Page) -> tuple[str, str]:
     """Return the answer of a page and its figure."""
     first = page.findings[0]
-    words, figure = page.answer or ((first, "") if isinstance(first, str) else (f"{first.words}.", first.figure))
+    words, figure = page.answer or (
+        (first, "") if isinstance(first, str) else (f"{first.words}.", first.figure)
+    )
     return words[0].upper() + words[1:], figure
 
 
 def text(page: Page) -> str:
     """Return a page as Markdown."""
-    one, about = page.record, without_html(page.record["about"].format(**page.words))
+    one = page.record
+    about = without_html(page.record["about"].format(**page.words))
     found = "\n".join(f"* {without_html(sentence)}" for sentence in sentences(page))
-    tables = "\n".join(f"## {without_html(table.title)}\n\n{markdown(table)}\n" for table in page.whole)
+    tables = "\n".join(
+        f"## {without_html(table.title)}\n\n{markdown(table)}\n" for table in page.whole
+    )
     files = ", ".join(f"[`{name}`]({name})" for name in one["data"])
     return (
         f"# {one['question']}\n\n{about}\n\n## Findings\n\n{found}\n\n{tables}\n"
@@ -138,8 +148,12 @@ def markdown(table: Table) -> str:
 def _cell(column: str | Measure, cell: Any) -> str:
     if isinstance(column, str):
         return cell or ""
-    value = cell if isinstance(cell, Value) else Value(float("nan") if cell is None else float(cell))
-    return "-" if np.isnan(value.mean) else value.shown(column.form)
+    value = (
+        cell if isinstance(cell, Value) else Value(float("nan") if cell is None else float(cell))
+    )
+    if np.isnan(value.mean):
+        return "-"
+    return value.shown(column.form)
 
 
 def draw(page: Page, path: Path) -> None:
@@ -151,10 +165,15 @@ def draw(page: Page, path: Path) -> None:
 
     _, head, rows = page.whole[0]
     texts = [i for i, column in enumerate(head) if isinstance(column, str)]
-    shown = [(i, column) for i, column in enumerate(head)
-             if isinstance(column, Measure) and any(isinstance(row[i], Value) for row in rows)]  # fmt: skip
+    shown = [
+        (i, column)
+        for i, column in enumerate(head)
+        if isinstance(column, Measure) and any(isinstance(row[i], Value) for row in rows)
+    ]
     names = [", ".join(row[i] for i in texts if row[i]) for row in rows]
-    colours = {name: f"C{i % 10}" for i, name in enumerate(dict.fromkeys(row[texts[-1]] for row in rows))}
+    colours = {
+        name: f"C{i % 10}" for i, name in enumerate(dict.fromkeys(row[texts[-1]] for row in rows))
+    }
     width = 2.4 + (3 + 0.05 * max(map(len, names))) / len(shown)
     figure, (axes,) = panels(1, len(shown), width, 0.9 + 0.2 * len(names), sharey=True)
     for axis, (column, measure) in zip(axes, shown, strict=True):

@@ -17,10 +17,15 @@ from experiments.tables.results import Column, Matrix
 from experiments.translation.settings import PIXELS, TRANSLATIONS, TRANSLATORS, TUNES, shared
 from experiments.values import Seeds, over_seeds, shared_difference
 
-NAMES = {[*paper.TABLE1][-1]: "an encoder of all four sensors", "gelsight": "an encoder of GelSight alone"}
+NAMES = {
+    [*paper.TABLE1][-1]: "an encoder of all four sensors",
+    "gelsight": "an encoder of GelSight alone",
+}
 
 
-def finding(of: Matrix, first: str, second: str, columns: Sequence[Column], what: str = "", **form: str) -> Finding:
+def finding(
+    of: Matrix, first: str, second: str, columns: Sequence[Column], what: str = "", **form: str
+) -> Finding:
     """Return what the seeds say of two models, on `what`."""
     names = (NAMES.get(name, title(name)) for name in (first, second))
     return Finding(*names, of.change(first, second, columns), what, **form)
@@ -28,15 +33,23 @@ def finding(of: Matrix, first: str, second: str, columns: Sequence[Column], what
 
 def sensors(folder: Path) -> Page:
     """Table 1."""
-    of, rows, findings = Matrix(folder / "matrix.jsonl", "q1"), [], []
-    one, every = [*paper.TABLE1][1], [*paper.TABLE1][-1]
+    of = Matrix(folder / "matrix.jsonl", "q1")
+    rows = []
+    findings = []
+    one = [*paper.TABLE1][1]
+    every = [*paper.TABLE1][-1]
     theirs = {name: float(np.mean(row[2:])) for name, row in paper.TABLE1.items()}  # type: ignore[arg-type]
     for label, columns in (("material", FOUR[2:]), ("indenter", FORM[2:])):
         for name in paper.TABLE1:
-            paper_change = theirs[name] - theirs[one] if label == "material" and name != one else None
+            paper_change = (
+                theirs[name] - theirs[one] if label == "material" and name != one else None
+            )
             change = of.change(name, one, columns)
             rows.append((label, title(name), of.value(name, columns), change, paper_change))
-        findings += [finding(of, every, one, columns, label), finding(of, one, "no_pretraining", columns, label)]
+        findings += [
+            finding(of, every, one, columns, label),
+            finding(of, one, "no_pretraining", columns, label),
+        ]
     return Page("sensors", [rows], findings)
 
 
@@ -45,50 +58,93 @@ def space(folder: Path) -> Page:
     of = Matrix(folder / "matrix.jsonl", "q2")
     names = ("pixels", "contact", "untrained", "masked", "aligned", "matched", "matched_mlp")
     top = [Column("class token", "top-1", "share")]
-    sensor, thing = ([Column("class token", f"silhouette by {one}", f"silhouette by {one}", 1.0)]
-                     for one in ("sensor", "object"))  # fmt: skip
-    findings = [finding(of, "matched", other, top, "retrieval") for other in ("untrained", "aligned", "pixels")]
-    pairs = (("matched", "aligned", sensor), ("masked", "untrained", sensor), ("aligned", "masked", sensor),
-             ("matched", "aligned", thing))  # fmt: skip
-    findings += [finding(of, a, b, columns, columns[0].task, unit="", form=".3f") for a, b, columns in pairs]
+    sensor, thing = (
+        [Column("class token", f"silhouette by {one}", f"silhouette by {one}", 1.0)]
+        for one in ("sensor", "object")
+    )
+    findings = [
+        finding(of, "matched", other, top, "retrieval")
+        for other in ("untrained", "aligned", "pixels")
+    ]
+    pairs = (
+        ("matched", "aligned", sensor),
+        ("masked", "untrained", sensor),
+        ("aligned", "masked", sensor),
+        ("matched", "aligned", thing),
+    )
+    findings += [
+        finding(of, a, b, columns, columns[0].task, unit="", form=".3f") for a, b, columns in pairs
+    ]
     rows = [(title(name), *(of.value(name, one) for one in (top, sensor, thing))) for name in names]
     return Page("space", [rows], findings, figure=partial(pictures.q2, of.runs))
 
 
 def ablations(folder: Path) -> Page:
     """Table 6, and the models of Tables 2 and 3."""
-    of, whole = Matrix(folder / "matrix.jsonl", "ablations"), paper.TABLE6["anytouch"]
+    of = Matrix(folder / "matrix.jsonl", "ablations")
+    whole = paper.TABLE6["anytouch"]
     rows = [
-        (title(name), of.value(name, FOUR), of.change(name, "anytouch", FOUR), of.change(name, "anytouch", FORM),
-         None if name == "anytouch" else float(np.mean(np.subtract(theirs, whole))))  # type: ignore[arg-type]
+        (
+            title(name),
+            of.value(name, FOUR),
+            of.change(name, "anytouch", FOUR),
+            of.change(name, "anytouch", FORM),
+            None if name == "anytouch" else float(np.mean(np.subtract(theirs, whole))),
+        )  # type: ignore[arg-type]
         for name, theirs in paper.TABLE6.items()
-    ]  # fmt: skip
-    parts = sorted([name for name in paper.TABLE6 if name != "anytouch"], key=lambda name: name != "no_stage2")
+    ]
+    parts = sorted(
+        [name for name in paper.TABLE6 if name != "anytouch"], key=lambda name: name != "no_stage2"
+    )
     labels = (("material", FOUR), ("indenter", FORM))
-    findings = [finding(of, name, "anytouch", columns, label) for name in parts for label, columns in labels]
+    findings = [
+        finding(of, name, "anytouch", columns, label) for name in parts for label, columns in labels
+    ]
     q3 = Matrix(folder / "matrix.jsonl", "q3")
-    names = ("pixels", "untrained", "no_pretraining", "unitouch", "tlv_link", "t3", "static_only", "anytouch")
+    names = (
+        "pixels",
+        "untrained",
+        "no_pretraining",
+        "unitouch",
+        "tlv_link",
+        "t3",
+        "static_only",
+        "anytouch",
+    )
     others = [
-        (title(name), *(cell for columns in (SIX, MOVING)
-                        for cell in (q3.value(name, columns), q3.change("anytouch", name, columns))))
+        (
+            title(name),
+            *(
+                cell
+                for columns in (SIX, MOVING)
+                for cell in (q3.value(name, columns), q3.change("anytouch", name, columns))
+            ),
+        )
         for name in names
-    ]  # fmt: skip
+    ]
     return Page("ablations", [rows, others], findings)
 
 
 def pouring(folder: Path) -> Page:
     """Table 4: pouring by touch alone."""
-    files = zip(RECORDS["pouring"]["data"], ("1000 demonstrations", "200 demonstrations"), strict=True)
+    files = zip(
+        RECORDS["pouring"]["data"], ("1000 demonstrations", "200 demonstrations"), strict=True
+    )
     several = [pours.compared(folder / file, data) for file, data in files]
     return Page(
-        "pouring", [[row for rows, _ in several for row in rows]], [one for _, found in several for one in found]
+        "pouring",
+        [[row for rows, _ in several for row in rows]],
+        [one for _, found in several for one in found],
     )
 
 
 def translation(folder: Path) -> Page:
     """Table 7: one sensor's touch as another would feel it."""
-    rows, findings = [], []
-    for file, steps in zip(RECORDS["translation"]["data"], ("3000 steps", "400 steps"), strict=True):
+    rows = []
+    findings = []
+    for file, steps in zip(
+        RECORDS["translation"]["data"], ("3000 steps", "400 steps"), strict=True
+    ):
         runs = [*read_records(folder / file).values()]
         check_alike(folder / file, [shared(one["settings"]) for one in runs])
         errors: dict[tuple[str, str], dict[str, Seeds]] = {}
@@ -97,12 +153,19 @@ def translation(folder: Path) -> Page:
             tasks = errors.setdefault(
                 (about["name"], "scratch" if about["name"] == PIXELS else about["fit"]["tune"]), {}
             )
-            tasks.setdefault(f"{about['from']}-{about['to']}", {})[about["fit"]["seed"]] = one["error"]
+            tasks.setdefault(f"{about['from']}-{about['to']}", {})[about["fit"]["seed"]] = one[
+                "error"
+            ]
         for (encoder, tune), tasks in sorted(errors.items()):
-            each = (over_seeds([*tasks[task].values()]) if task in tasks else None for task in TRANSLATIONS)
+            each = (
+                over_seeds([*tasks[task].values()]) if task in tasks else None
+                for task in TRANSLATIONS
+            )
             rows.append((steps, TRANSLATORS.get(encoder, encoder), TUNES[tune], *each))
             for task, words in TRANSLATIONS.items() if encoder == "anytouch" else ():
-                change = shared_difference(tasks.get(task, {}), errors.get(("t3", tune), {}).get(task, {}))
+                change = shared_difference(
+                    tasks.get(task, {}), errors.get(("t3", tune), {}).get(task, {})
+                )
                 what = f"error, {words}, {TUNES[tune]}, {steps}"
                 findings.append(Finding("AnyTouch", "T3-style", change, what, "", ".4f"))
     return Page("translation", [rows], findings)

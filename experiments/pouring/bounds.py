@@ -22,7 +22,9 @@ def blind_inputs(actions: Array) -> Array:
     """Time and counts of the own actions so far (S, B, 4), from actions (S, B); nothing of the run itself."""
     chosen = np.eye(len(ACTIONS), dtype=np.float32)[actions]
     before = np.cumsum(chosen, 0) - chosen
-    time = np.broadcast_to(np.arange(len(actions), dtype=np.float32)[:, None, None], (*actions.shape, 1))
+    time = np.broadcast_to(
+        np.arange(len(actions), dtype=np.float32)[:, None, None], (*actions.shape, 1)
+    )
     return np.concatenate([time, before], -1) / 100
 
 
@@ -42,7 +44,10 @@ class Blind:
         """Actions (B,) from the time and the counts of its actions."""
         chosen = policy.log_probabilities(self._head, self._x).argmax(-1)
         chosen = np.where(self._x[:, 0] * 100 < START - 0.5, WAIT, chosen)
-        self._x = self._x + np.concatenate([np.ones((len(chosen), 1)), np.eye(len(ACTIONS))[chosen]], 1) / 100
+        self._x = (
+            self._x
+            + np.concatenate([np.ones((len(chosen), 1)), np.eye(len(ACTIONS))[chosen]], 1) / 100
+        )
         self._x = self._x.astype(np.float32)
         return chosen
 
@@ -82,7 +87,9 @@ class Scales:
     looks = False
 
     def __init__(self, task: Task, setups: Setup, inner: Controller | policy.Head) -> None:
-        self._task, self._setups, self._inner = task, setups, inner
+        self._task = task
+        self._setups = setups
+        self._inner = inner
 
     def begin(self, count: int) -> None:
         """Forget the loads of the last runs."""
@@ -92,7 +99,9 @@ class Scales:
 
     def segments(self) -> Array:
         """The mean loads (S, B, 4) of the last FRAMES moments, from the third moment on."""
-        return np.stack([np.mean(self.loads[i : i + FRAMES], 0) for i in range(len(self.loads) - FRAMES + 1)])
+        return np.stack(
+            [np.mean(self.loads[i : i + FRAMES], 0) for i in range(len(self.loads) - FRAMES + 1)]
+        )
 
     def act(self, frames: Array | None, state: State) -> Array:
         """Actions (B,) of this moment."""
@@ -102,7 +111,9 @@ class Scales:
         if len(self.loads) <= START:
             return np.full(len(state.mass), WAIT)
         z = self.segments()
-        x = policy.inputs(z[-1], z[max(len(z) - 1 - policy.LAG, policy.LIFTED)], z[policy.LIFTED], z[0])
+        x = policy.inputs(
+            z[-1], z[max(len(z) - 1 - policy.LAG, policy.LIFTED)], z[policy.LIFTED], z[0]
+        )
         return policy.log_probabilities(self._inner, x).argmax(-1)
 
 

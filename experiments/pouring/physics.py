@@ -19,16 +19,23 @@ from anytouch_jax.config.parsing import Above0, Count, Range, check
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.sensing.sensors import SENSORS, Unit, draw_unit
 
-POUR, WAIT, RETRACT = 0, 1, 2
+POUR = 0
+WAIT = 1
+RETRACT = 2
 ACTIONS = ("pour", "wait", "retract")
 GRAVITY = 9810.0  # mm / s^2
 GLASS = 2.5e-3  # g / mm^3 of one bead
 SLOTS = 49  # slices of the cylinder across `d`, for volumes and moments
-FLOW, MARGIN = 1.03, 1.4  # constants of the slot law; the margin is in bead diameters
-STAND = 3  # moments in which the gripped cylinder still stands on the table; then it is lifted to its first tilt
+# constants of the slot law; the margin is in bead diameters
+FLOW = 1.03
+MARGIN = 1.4
+# moments in which the gripped cylinder still stands on the table; then it is lifted to its first tilt
+STAND = 3
 EXPOSURE = 1 / 60  # s of one frame: blows shorter than this are averaged
 STEEPEST = math.radians(86)
-SHOCKS, PIXELS = 101, 102  # random streams of a state. Those of `advance` are 0, 1 and 2
+# random streams of a state. Those of `advance` are 0, 1 and 2
+SHOCKS = 101
+PIXELS = 102
 VERSION = 3  # of what a run gives for its seed
 
 
@@ -53,7 +60,9 @@ class Task:
     def __post_init__(self) -> None:
         check(self)
         if self.target >= self.beads:
-            raise UserError(f"the target of {self.target:g} g must be below the {self.beads:g} g in the cylinder")
+            raise UserError(
+                f"the target of {self.target:g} g must be below the {self.beads:g} g in the cylinder"
+            )
 
 
 class Setup(NamedTuple):
@@ -116,28 +125,47 @@ class Load(NamedTuple):
 def draw_setup(task: Task, rng: np.random.Generator) -> Setup:
     """The parameters of a run, from `rng`; its first tilt is 3 to 20 degrees before the beads flow."""
     unit = draw_unit(SENSORS["gelsight_mini"], rng)._replace(marked=np.float32(task.markers))
-    radius, bulk = rng.uniform(22, 28), rng.uniform(1.45e-3, 1.6e-3)
+    radius = rng.uniform(22, 28)
+    bulk = rng.uniform(1.45e-3, 1.6e-3)
     fill = task.beads / bulk / (math.pi * radius**2)
-    height, repose = fill * rng.uniform(1.3, 1.7), math.radians(rng.uniform(21, 31))
-    full = math.atan((height - fill) / radius)  # of the surface that reaches the lip
+    height = fill * rng.uniform(1.3, 1.7)
+    repose = math.radians(rng.uniform(21, 31))
+    # of the surface that reaches the lip
+    full = math.atan((height - fill) / radius)
     values = {
-        "radius": radius, "height": height, "empty": rng.uniform(30, 60), "bead": rng.uniform(2, 6), "bulk": bulk,
-        "repose": repose, "tilt": max(full + repose - math.radians(rng.uniform(3, 20)), 0.0),
-        "mount": math.radians(rng.uniform(20, 40)), "grip_height": fill * rng.uniform(0.6, 0.9),
-        "grip": rng.uniform(5, 10), "relax": rng.uniform(0.02, 0.1), "relax_time": rng.uniform(5, 30),
-        "share": rng.uniform(0.5, 0.65), "friction": rng.uniform(0.5, 0.9), "jolt": rng.uniform(0.002, 0.01),
-        "place": rng.normal(0, 0.6, 2), "yaw": math.radians(rng.normal(0, 3)),
+        "radius": radius,
+        "height": height,
+        "empty": rng.uniform(30, 60),
+        "bead": rng.uniform(2, 6),
+        "bulk": bulk,
+        "repose": repose,
+        "tilt": max(full + repose - math.radians(rng.uniform(3, 20)), 0.0),
+        "mount": math.radians(rng.uniform(20, 40)),
+        "grip_height": fill * rng.uniform(0.6, 0.9),
+        "grip": rng.uniform(5, 10),
+        "relax": rng.uniform(0.02, 0.1),
+        "relax_time": rng.uniform(5, 30),
+        "share": rng.uniform(0.5, 0.65),
+        "friction": rng.uniform(0.5, 0.9),
+        "jolt": rng.uniform(0.002, 0.01),
+        "place": rng.normal(0, 0.6, 2),
+        "yaw": math.radians(rng.normal(0, 3)),
         "lean": math.tan(math.radians(rng.normal(0, 0.7))),
-    }  # fmt: skip
-    return Setup(**{name: np.asarray(value, np.float32) for name, value in values.items()}, unit=unit)
+    }
+    return Setup(
+        **{name: np.asarray(value, np.float32) for name, value in values.items()}, unit=unit
+    )
 
 
 def begin(setup: Setup, task: Task, key: Array) -> State:
     """The full cylinder at its first tilt."""
     key, draw = jax.random.split(key)
-    tilt, zero = jnp.asarray(setup.tilt, jnp.float32), jnp.zeros(())
+    tilt = jnp.asarray(setup.tilt, jnp.float32)
+    zero = jnp.zeros(())
     slope = jnp.maximum(tilt - setup.repose, 0)
-    none, full, steps = jnp.zeros((), bool), jnp.full((), task.beads), jnp.zeros((), jnp.int32)
+    none = jnp.zeros((), bool)
+    full = jnp.full((), task.beads)
+    steps = jnp.zeros((), jnp.int32)
     return State(full, tilt, tilt, slope, _start(draw), none, zero, steps, none, none, key)
 
 
@@ -161,18 +189,34 @@ def advance(state: State, action: Array, setup: Setup, task: Task) -> State:
     loose = state.mass > capacity(tilt - setup.repose - state.start, setup)
     flowing = (state.flowing | loose) & (excess > 0)
     one = GLASS * math.pi / 6 * setup.bead**3
-    expected = jnp.where(flowing, slot_rate(excess, tilt - setup.repose, setup) / task.rate / one, 0)
-    count = jnp.floor(expected + jnp.sqrt(expected) * jax.random.normal(flow_key) + 0.5)  # near Poisson's, and quick
+    expected = jnp.where(
+        flowing, slot_rate(excess, tilt - setup.repose, setup) / task.rate / one, 0
+    )
+    # near Poisson's, and quick
+    count = jnp.floor(expected + jnp.sqrt(expected) * jax.random.normal(flow_key) + 0.5)
     out = jnp.minimum(jnp.maximum(count, 0) * one, jnp.maximum(excess, 0))
     out = jnp.where(flowing, out, 0)
     flowing = flowing & (out > 0)
     start = jnp.where(state.flowing & ~flowing, _start(start_key), state.start)
-    slope = jnp.clip(state.slope, tilt - setup.repose, tilt + setup.repose)  # the surface stays until it is too steep
+    # the surface stays until it is too steep
+    slope = jnp.clip(state.slope, tilt - setup.repose, tilt + setup.repose)
     steps = state.steps + 1
     back = (highest - tilt >= jnp.deg2rad(task.back) - 1e-6) & ~flowing
     done = back | (steps >= task.limit)
     rate = out * task.rate
-    after = State(state.mass - out, tilt, highest, slope, start, flowing, rate, steps, tilt != state.tilt, done, key)
+    after = State(
+        state.mass - out,
+        tilt,
+        highest,
+        slope,
+        start,
+        flowing,
+        rate,
+        steps,
+        tilt != state.tilt,
+        done,
+        key,
+    )
     return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), after, state)
 
 
@@ -184,7 +228,9 @@ def poured(state: State, task: Task) -> Array:
 def _slices(setup: Setup) -> tuple[Array, Array]:
     """Places (SLOTS,) mm along `d` and the areas mm^2 of the cylinder's cross-section there."""
     angle = (jnp.arange(SLOTS) + 0.5) / SLOTS * math.pi
-    return setup.radius * jnp.cos(angle), 2 * (setup.radius * jnp.sin(angle)) ** 2 * (math.pi / SLOTS)
+    return setup.radius * jnp.cos(angle), 2 * (setup.radius * jnp.sin(angle)) ** 2 * (
+        math.pi / SLOTS
+    )
 
 
 def _steepness(slope: Array) -> Array:
@@ -200,7 +246,9 @@ def capacity(slope: Array, setup: Setup) -> Array:
 def _behind(slope: Array, setup: Setup) -> tuple[Array, Array]:
     """The slices' areas mm^2, and the height mm of the beads in each behind a surface of `slope` that meets the lip."""
     place, area = _slices(setup)
-    return area, jnp.clip(setup.height - (setup.radius - place) * _steepness(slope), 0, setup.height)
+    return area, jnp.clip(
+        setup.height - (setup.radius - place) * _steepness(slope), 0, setup.height
+    )
 
 
 def slot_rate(excess: Array, slope: Array, setup: Setup) -> Array:
@@ -217,14 +265,16 @@ def slot_rate(excess: Array, slope: Array, setup: Setup) -> Array:
     depth = jnp.maximum(excess, 0) / setup.bulk / (covered / jnp.cos(inclined))
     sagitta = jnp.minimum(depth / jnp.maximum(jnp.sin(inclined), 1e-3), setup.radius)
     chord = 2 * jnp.sqrt(sagitta * (2 * setup.radius - sagitta))
-    width = jnp.maximum(chord - MARGIN * setup.bead, setup.bead)  # a single file of beads passes
+    # a single file of beads passes
+    width = jnp.maximum(chord - MARGIN * setup.bead, setup.bead)
     return FLOW * setup.bulk * math.sqrt(GRAVITY) * width * depth**1.5
 
 
 def heap(mass: Array, slope: Array, setup: Setup) -> tuple[Array, Array]:
     """Where the middle of `mass` g of beads lies behind a surface of `slope`: mm along `d`, mm above the bottom."""
     place, area = _slices(setup)
-    steep, volume = _steepness(slope), mass / setup.bulk
+    steep = _steepness(slope)
+    volume = mass / setup.bulk
     reach = setup.radius * steep + setup.height
 
     def column(level: Array) -> Array:
@@ -253,9 +303,13 @@ def load(state: State, setup: Setup, task: Task, *, shocks: bool = True) -> Load
     weight = jnp.where(state.steps < STAND, 0, total * GRAVITY * 1e-6)  # N
     arm = state.mass * across / total  # along d
     rise = (state.mass * up + setup.empty * setup.height / 2) / total - setup.grip_height
-    c, s = jnp.cos(state.tilt), jnp.sin(state.tilt)
-    inward, sideward = jnp.sin(setup.mount), jnp.cos(setup.mount)
-    down, side, onto = weight * c, weight * s * sideward, weight * s * inward
+    c = jnp.cos(state.tilt)
+    s = jnp.sin(state.tilt)
+    inward = jnp.sin(setup.mount)
+    sideward = jnp.cos(setup.mount)
+    down = weight * c
+    side = weight * s * sideward
+    onto = weight * s * inward
     couple = (arm * inward * down + rise * onto) / (2 * setup.radius)
     shear = jnp.stack([setup.share * side, setup.share * down + couple])
     twist = setup.share * (arm * sideward * down + rise * side)
@@ -264,7 +318,10 @@ def load(state: State, setup: Setup, task: Task, *, shocks: bool = True) -> Load
     normal = grip + onto / 2
     if not shocks:
         return Load(shear, twist, normal)
-    blow = GLASS * math.pi / 6 * setup.bead**3 * jnp.sqrt(2 * GRAVITY * setup.radius) * 1e-6 / EXPOSURE  # N a bead
+    # N a bead
+    blow = (
+        GLASS * math.pi / 6 * setup.bead**3 * jnp.sqrt(2 * GRAVITY * setup.radius) * 1e-6 / EXPOSURE
+    )
     beads = state.rate * EXPOSURE / (GLASS * math.pi / 6 * setup.bead**3)
     spread = jnp.sqrt(beads * blow**2 + (state.moved * setup.jolt) ** 2)
     draws = spread * jax.random.normal(jax.random.fold_in(state.key, SHOCKS), (4,))

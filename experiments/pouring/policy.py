@@ -32,7 +32,8 @@ VERSION = 5  # of how a policy learns from the same demonstrations
 LATEST = 80  # moments, 20 degrees
 LOOKS = 30  # times that the held-out demonstrations are looked at while a policy learns
 LAG = 3  # moments from the segment before to the last one
-LIFTED = START - FRAMES + 1  # the number of the first segment of the lifted cylinder; number 0 is of the standing one
+# the number of the first segment of the lifted cylinder; number 0 is of the standing one
+LIFTED = START - FRAMES + 1
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,14 @@ def late_hands(seed: int, count: int, late: int = LATEST) -> Array:
 
 
 def demonstrate(
-    task: Task, seed: int, count: int, *, side: int | None, late: int = LATEST, patient: bool = True, chunk: int = 10
+    task: Task,
+    seed: int,
+    count: int,
+    *,
+    side: int | None,
+    late: int = LATEST,
+    patient: bool = True,
+    chunk: int = 10,
 ) -> Trials:
     """`count` runs of the expert, with frames of `side` pixels, or without (None).
 
@@ -101,16 +109,25 @@ def demonstrate(
     for start in range(0, count, chunk):
         part = order[start : start + chunk]
         some: Setup = jax.tree.map(lambda x, part=part: x[part], setups)
-        shown = run(task, some, keys[part], Replay(plain.actions[:, part]), side=side, film=len(part))
+        shown = run(
+            task, some, keys[part], Replay(plain.actions[:, part]), side=side, film=len(part)
+        )
         assert shown.frames is not None
         frames[: len(shown.frames), part] = shown.frames
     return plain._replace(frames=frames)
 
 
 def features(
-    encoder: Encoder, trials: Trials, *, stills: bool, pooling: Pooling = "both", sensor: str = SENSOR, batch: int = 64,
-    sides: Array | None = None, learned: Array | None = None,
-) -> Array:  # fmt: skip
+    encoder: Encoder,
+    trials: Trials,
+    *,
+    stills: bool,
+    pooling: Pooling = "both",
+    sensor: str = SENSOR,
+    batch: int = 64,
+    sides: Array | None = None,
+    learned: Array | None = None,
+) -> Array:
     """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end.
 
     `sides` (B, 2): in which mirrors the runs are shown (`segments`). `learned` (S - START, B): embed the segments of
@@ -146,15 +163,24 @@ def subtracted(encoder: Encoder, frames: Array, first: Array) -> Array:
     return np.clip(frames.astype(np.int16) - first + 128, 0, 255).astype(np.uint8)
 
 
-def segments(encoder: Encoder, frames: Array, where: Array, ahead: int, sides: Array | None = None) -> Array:
+def segments(
+    encoder: Encoder, frames: Array, where: Array, ahead: int, sides: Array | None = None
+) -> Array:
     """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run, as `subtracted`.
 
     A gel in a mirror bears the same load: runs are shown upside down where the first of `sides` (B, 2) is 1, left to
     right where the second is.
     """
-    ends, runs = where[:, 0] + FRAMES - 1, where[:, 1]
+    ends = where[:, 0] + FRAMES - 1
+    runs = where[:, 1]
     first = frames[0, runs]
-    clips = np.stack([subtracted(encoder, frames[ends - back, runs], first) for back in range(ahead - 1, -1, -1)], 1)
+    clips = np.stack(
+        [
+            subtracted(encoder, frames[ends - back, runs], first)
+            for back in range(ahead - 1, -1, -1)
+        ],
+        1,
+    )
     if sides is None:
         return clips
     turns = 1 - 2 * sides[runs]
@@ -206,12 +232,15 @@ def new_head(x: Array, learning: Learning) -> Head:
     """An untrained MLP for the principal components of inputs like `x` (n, d)."""
     mean = x.mean(0)
     spread, axes = np.linalg.eigh(np.cov(x - mean, rowvar=False).reshape(x.shape[1], -1))
-    spread, axes = spread[::-1][: learning.components], axes[:, ::-1][:, : learning.components]
+    spread = spread[::-1][: learning.components]
+    axes = axes[:, ::-1][:, : learning.components]
     basis = axes / np.sqrt(np.maximum(spread, 1e-6 * spread[0] + 1e-12))
     sizes = (basis.shape[1], learning.width, learning.width, len(ACTIONS))
     keys = jax.random.split(jax.random.key(learning.seed), len(sizes) - 1)
     shapes = list(zip(sizes[:-1], sizes[1:], keys, strict=True))
-    layers = tuple((jax.random.normal(key, (a, b)) * (1 / a) ** 0.5, jnp.zeros(b)) for a, b, key in shapes)
+    layers = tuple(
+        (jax.random.normal(key, (a, b)) * (1 / a) ** 0.5, jnp.zeros(b)) for a, b, key in shapes
+    )
     return Head(jnp.asarray(mean, jnp.float32), jnp.asarray(basis, jnp.float32), layers)
 
 
@@ -233,21 +262,33 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
     if known.sum() < 2:
         raise UserError("there is one moment of choice to learn from; record more or longer runs")
     head = new_head(x[known], learning)
-    optimiser = optax.adamw(optax.cosine_decay_schedule(learning.rate, learning.steps), weight_decay=learning.decay)
-    data = tuple((jnp.asarray(x[part], jnp.float32), jnp.asarray(actions[part])) for part in (known, late))
+    optimiser = optax.adamw(
+        optax.cosine_decay_schedule(learning.rate, learning.steps), weight_decay=learning.decay
+    )
+    data = tuple(
+        (jnp.asarray(x[part], jnp.float32), jnp.asarray(actions[part])) for part in (known, late)
+    )
 
     @jax.jit
-    def train(layers: Any, head: Head, data: Any) -> tuple[Any, jax.Array]:  # (constants would be compiled again)
+    def train(
+        layers: Any, head: Head, data: Any
+    ) -> tuple[Any, jax.Array]:  # (constants would be compiled again)
         (x, actions), unseen = data
 
-        def loss(layers: Any, x: jax.Array, actions: jax.Array, key: jax.Array | None = None) -> jax.Array:
-            return imitation_loss(forward(head._replace(layers=layers), x, learning.dropout, key), actions)
+        def loss(
+            layers: Any, x: jax.Array, actions: jax.Array, key: jax.Array | None = None
+        ) -> jax.Array:
+            return imitation_loss(
+                forward(head._replace(layers=layers), x, learning.dropout, key), actions
+            )
 
         def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
             layers, state = carry
             drawn, left_out = jax.random.split(key)
             ids = jax.random.randint(drawn, (learning.batch,), 0, len(x))
-            change, state = optimiser.update(jax.grad(loss)(layers, x[ids], actions[ids], left_out), state, layers)
+            change, state = optimiser.update(
+                jax.grad(loss)(layers, x[ids], actions[ids], left_out), state, layers
+            )
             return (optax.apply_updates(layers, change), state), None
 
         def look(carry: Any, keys: jax.Array) -> tuple[Any, None]:
@@ -258,7 +299,9 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
             return (now, kept, jnp.minimum(value, least)), None
 
         every = max(1, learning.steps // LOOKS)
-        keys = jax.random.split(jax.random.key(learning.seed + 1), (-(-learning.steps // every), every))
+        keys = jax.random.split(
+            jax.random.key(learning.seed + 1), (-(-learning.steps // every), every)
+        )
         begin = ((layers, optimiser.init(layers)), layers, jnp.asarray(jnp.inf))
         (_, layers, least), _ = jax.lax.scan(look, begin, keys)
         return layers, least
@@ -277,11 +320,23 @@ class Touch:
     looks = True
 
     def __init__(
-        self, encoder: Encoder, head: Head, *, stills: bool, pooling: Pooling = "both", sensor: str = SENSOR,
-        votes: int = 1, loss: float = math.nan,
-    ) -> None:  # fmt: skip
-        self.encoder, self.head, self.sensor, self.loss = encoder, head, sensor, loss
-        self.stills, self.pooling, self.votes = stills, pooling, votes
+        self,
+        encoder: Encoder,
+        head: Head,
+        *,
+        stills: bool,
+        pooling: Pooling = "both",
+        sensor: str = SENSOR,
+        votes: int = 1,
+        loss: float = math.nan,
+    ) -> None:
+        self.encoder = encoder
+        self.head = head
+        self.sensor = sensor
+        self.loss = loss
+        self.stills = stills
+        self.pooling = pooling
+        self.votes = votes
 
     def begin(self, count: int) -> None:
         """Forget the frames and features of the last runs."""
@@ -293,7 +348,9 @@ class Touch:
     def act(self, frames: Array | None, state: State | None = None) -> Array:
         """Actions (B,) from the frames u8 (B, h, w, 3) so far; it waits until it has subtracted a segment."""
         assert frames is not None
-        frames = np.stack([touch_evaluation([frame], self.encoder.config.model.image_size)[0] for frame in frames])
+        frames = np.stack(
+            [touch_evaluation([frame], self.encoder.config.model.image_size)[0] for frame in frames]
+        )
         self._first = frames if self._first is None else self._first
         frames = subtracted(self.encoder, frames, self._first)
         self._frames = [*self._frames[-FRAMES + 1 :], frames]
@@ -317,23 +374,42 @@ def moments(trials: Trials, x: Array, learned: Array | None = None) -> tuple[Arr
     return x[taken], trials.choices[START:][taken], np.nonzero(taken)[1]
 
 
-def learn_frozen(encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR) -> Touch:
+def learn_frozen(
+    encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR
+) -> Touch:
     """Return a policy over frozen features of `sensor`, from demonstrations and their mirror images.
 
     It learns from every LAG-th moment of a run: those between resemble them, and cost as much.
     """
-    rng, pooling = np.random.default_rng(learning.seed % 2**63), learning.pooling
+    rng = np.random.default_rng(learning.seed % 2**63)
+    pooling = learning.pooling
     sides = rng.choice(np.array([[0, 1], [1, 0], [1, 1]]), len(trials.steps))
     first = rng.integers(LAG, size=len(trials.steps))
     learned = (np.arange(len(trials.actions) - START)[:, None] - first) % LAG == 0
     views = [
-        features(encoder, trials, stills=stills, pooling=pooling, sensor=sensor, sides=side, learned=learned)
+        features(
+            encoder,
+            trials,
+            stills=stills,
+            pooling=pooling,
+            sensor=sensor,
+            sides=side,
+            learned=learned,
+        )
         for side in (None, sides)
     ]
     result = [moments(trials, input_table(z), learned) for z in views]
     x, actions, runs = (np.concatenate(both) for both in zip(*result, strict=True))
     head, loss = imitate(x, actions, runs, learning)
-    return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=learning.votes, loss=loss)
+    return Touch(
+        encoder,
+        head,
+        stills=stills,
+        pooling=pooling,
+        sensor=sensor,
+        votes=learning.votes,
+        loss=loss,
+    )
 
 
 # Fine-tuning ----------------------------------------------------------------------------------------------------------
@@ -374,15 +450,21 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     The policy's `loss` then is that of its last tenth of steps. Raises UserError when that is not finite.
     """
     assert trials.frames is not None
-    encoder, stills, runs = policy.encoder, policy.stills, learning.tune_runs
+    encoder = policy.encoder
+    stills = policy.stills
+    runs = learning.tune_runs
     step, state, params = _tuner(policy, learning)
     rng = np.random.default_rng(learning.seed % 2**63)
     losses: list[jax.Array] = []
     for _ in range(learning.tune_steps):
         chains = draw_chains(rng, trials.steps, runs, learning.tune_moments)
-        where = np.stack([chains.numbers, np.broadcast_to(chains.runs[:, None], chains.numbers.shape)], -1)
+        where = np.stack(
+            [chains.numbers, np.broadcast_to(chains.runs[:, None], chains.numbers.shape)], -1
+        )
         sides = rng.integers(2, size=(len(trials.steps), 2))
-        clips = segments(encoder, trials.frames, where.reshape(-1, 2), 1 if stills else FRAMES, sides)
+        clips = segments(
+            encoder, trials.frames, where.reshape(-1, 2), 1 if stills else FRAMES, sides
+        )
         clips = clips.reshape(runs, -1, *clips.shape[1:])
         choices = trials.choices[chains.numbers[:, 3:] + FRAMES - 1, chains.runs[:, None]]
         params, state, loss = step(params, state, clips, choices, chains.inside)
@@ -391,15 +473,26 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     head = policy.head._replace(**params["head"])
     late = float(np.mean(jax.device_get(losses[-max(1, learning.tune_steps // 10) :])))
     if not math.isfinite(late):
-        raise UserError(f"fine-tuning went astray (its loss is {late}); lower tune_rate, {learning.tune_rate:g} now")
+        raise UserError(
+            f"fine-tuning went astray (its loss is {late}); lower tune_rate, {learning.tune_rate:g} now"
+        )
     return Touch(
-        tuned, head, stills=stills, pooling=policy.pooling, sensor=policy.sensor, votes=policy.votes, loss=late
+        tuned,
+        head,
+        stills=stills,
+        pooling=policy.pooling,
+        sensor=policy.sensor,
+        votes=policy.votes,
+        loss=late,
     )
 
 
-def _tuner(policy: Touch, learning: Learning) -> tuple[Callable[..., tuple[Params, Any, jax.Array]], Any, Params]:
+def _tuner(
+    policy: Touch, learning: Learning
+) -> tuple[Callable[..., tuple[Params, Any, jax.Array]], Any, Params]:
     """The compiled step of fine-tuning, its optimiser's state and its parameters."""
-    encoder, head = policy.encoder, policy.head
+    encoder = policy.encoder
+    head = policy.head
     params = {"encoder": encoder.params, "head": {"basis": head.basis, "layers": head.layers}}
     steps = learning.tune_steps
 
@@ -415,14 +508,20 @@ def _tuner(policy: Touch, learning: Learning) -> tuple[Callable[..., tuple[Param
         ),
     )
     sensor = encoder.sensor_row(policy.sensor)
-    logits = partial(logits_of, net=encoder.net, pooling=policy.pooling, mean=head.mean, sensor=sensor)
+    logits = partial(
+        logits_of, net=encoder.net, pooling=policy.pooling, mean=head.mean, sensor=sensor
+    )
 
-    def loss_of(params: Params, clips: jax.Array, choices: jax.Array, inside: jax.Array) -> jax.Array:
+    def loss_of(
+        params: Params, clips: jax.Array, choices: jax.Array, inside: jax.Array
+    ) -> jax.Array:
         losses = optax.softmax_cross_entropy_with_integer_labels(logits(params, clips), choices)
         return jnp.sum(losses * inside) / jnp.maximum(jnp.sum(inside), 1)
 
     @jax.jit
-    def step(params: Params, state: Any, clips: jax.Array, choices: jax.Array, inside: jax.Array) -> Any:
+    def step(
+        params: Params, state: Any, clips: jax.Array, choices: jax.Array, inside: jax.Array
+    ) -> Any:
         loss, slope = jax.value_and_grad(loss_of)(params, clips, choices, inside)
         change, state = optimiser.update(slope, state, params)
         return optax.apply_updates(params, change), state, loss
@@ -440,7 +539,10 @@ def logits_of(
     rows = jnp.full(len(flat), sensor, jnp.int32)
     z = touch_features(params["encoder"], flat, rows, net=net, pooling=pooling, join="mean")
     z = z.reshape(runs, count, -1)
-    before, now = z[:, 2:-1], z[:, 3:]
+    before = z[:, 2:-1]
+    now = z[:, 3:]
     standing, lifted = (jnp.broadcast_to(z[:, i : i + 1], now.shape) for i in (0, 1))
     x = inputs(now, before, lifted, standing, jnp)
-    return forward(Head(mean, **params["head"]), x.reshape(-1, x.shape[-1])).reshape(*now.shape[:2], -1)
+    return forward(Head(mean, **params["head"]), x.reshape(-1, x.shape[-1])).reshape(
+        *now.shape[:2], -1
+    )

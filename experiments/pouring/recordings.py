@@ -51,7 +51,9 @@ class Recordings(NamedTuple):
         first = len(self.test) - int(self.test.sum())
         keep = slice(first, None) if test else slice(first)
         over_time = {name: getattr(self.trials, name) for name in Trials._fields[2:]}
-        cut: dict[str, Any] = {name: None if x is None else x[:, keep] for name, x in over_time.items()}
+        cut: dict[str, Any] = {
+            name: None if x is None else x[:, keep] for name, x in over_time.items()
+        }
         return Trials(self.trials.poured[keep], self.trials.steps[keep], **cut)
 
 
@@ -71,16 +73,30 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
     for run, steps in enumerate(trials.steps):
         for moment in range(int(steps)):
             name = f"run_{run:04d}/{moment:04d}.png"
-            png = cv2.imencode(".png", np.ascontiguousarray(trials.frames[moment, run][..., ::-1]))[1]
+            png = cv2.imencode(".png", np.ascontiguousarray(trials.frames[moment, run][..., ::-1]))[
+                1
+            ]
             atomic_write(folder / name, png.tobytes(), sync=False)
-            action, choice = (ACTIONS[int(one[moment, run])] for one in (trials.actions, trials.choices))
+            action, choice = (
+                ACTIONS[int(one[moment, run])] for one in (trials.actions, trials.choices)
+            )
             rows.append(
-                {"path": name, "sensor": SENSOR, "sequence": f"run_{run:04d}", "frame_index": moment,
-                 "split": "test" if run >= first_test else "train", "label.action": action, "label.choice": choice,
-                 "label.mass": float(trials.mass[moment, run]), "dataset": f"pouring {task.target:g} g"}
-            )  # fmt: skip
+                {
+                    "path": name,
+                    "sensor": SENSOR,
+                    "sequence": f"run_{run:04d}",
+                    "frame_index": moment,
+                    "split": "test" if run >= first_test else "train",
+                    "label.action": action,
+                    "label.choice": choice,
+                    "label.mass": float(trials.mass[moment, run]),
+                    "dataset": f"pouring {task.target:g} g",
+                }
+            )
     path = folder / "manifest.parquet"
-    manifests.write(manifests.from_columns({name: [row[name] for row in rows] for name in rows[0]}, path), path)
+    manifests.write(
+        manifests.from_columns({name: [row[name] for row in rows] for name in rows[0]}, path), path
+    )
     return path
 
 
@@ -90,38 +106,49 @@ def read(path: Path, side: int) -> Recordings:
     split = table.text_column("split")
     part = np.isin(split, LEARNING)
     if not table.present("label.action")[part].all():
-        raise UserError(f"{path}: label.action must be {', '.join(ACTIONS)} on every row of {', '.join(LEARNING)}")
+        raise UserError(
+            f"{path}: label.action must be {', '.join(ACTIONS)} on every row of {', '.join(LEARNING)}"
+        )
     sensors = np.unique(table.text_column("sensor")[part])
     if len(sensors) > 1:
         raise UserError(f"{path}: one sensor a policy, not {', '.join(sensors)}")
     runs = sorted(_runs(table, path), key=lambda rows: split[rows[0]] == "test")
     test = np.array([split[rows[0]] == "test" for rows in runs])
     if not test.any() or test.all():
-        raise UserError(f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs")
+        raise UserError(
+            f"{path}: runs to learn from and runs of split test are needed; it has {len(runs)} runs"
+        )
     steps = np.array([len(rows) for rows in runs])
-    padded = [np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs]
+    padded = [
+        np.concatenate([rows, np.repeat(rows[-1:], steps.max() - len(rows))]) for rows in runs
+    ]
     order = np.stack(padded, 1)  # (S, B) row numbers
     actions = _numbers(table, "label.action")
     choices = actions
     if "label.choice" in table.table.column_names:
         choices = np.where(table.present("label.choice"), _numbers(table, "label.choice"), actions)
-    frame = lru_cache(len(runs))(partial(_frame, table, side))  # a run that has ended repeats its last one
+    # a run that has ended repeats its last one
+    frame = lru_cache(len(runs))(partial(_frame, table, side))
     frames = np.stack([np.stack([frame(int(row)) for row in rows]) for rows in order])
     unknown = np.full(order.shape, np.nan)
-    trials = Trials(unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames)
+    trials = Trials(
+        unknown[-1], steps, choices[order], actions[order], unknown, unknown, unknown, frames
+    )
     return Recordings(trials, test, str(sensors[0]), table.content_hash)
 
 
 def _runs(table: Manifest, path: Path) -> list[Array]:
     """The rows of each run in time. Raises UserError for runs that are of two splits or have gaps, and short ones."""
-    split, sequence = table.text_column("split"), table.text_column("sequence")
+    split = table.text_column("split")
+    sequence = table.text_column("sequence")
     number = table.number_column("frame_index")
     rows = np.flatnonzero(np.isin(split, LEARNING))
     if not len(rows):
         raise UserError(f"{path}: no row is of split {', '.join(LEARNING)}")
     runs = group_rows(rows, sequence[rows], number[rows])
     for run in runs:
-        name, sides = f"{path}: run {sequence[run[0]]}", np.unique(split[run])
+        name = f"{path}: run {sequence[run[0]]}"
+        sides = np.unique(split[run])
         if len(sides) > 1:
             raise UserError(f"{name} is in the splits {' and '.join(sides)}; a run is of one")
         stride = np.array([table.value(int(row), "stride") or 1 for row in run[1:]])
@@ -129,7 +156,9 @@ def _runs(table: Manifest, path: Path) -> list[Array]:
             first, second = number[run][gaps[0] : gaps[0] + 2]
             raise UserError(f"{name}: frame {first:g} is followed by {second:g}, a gap or a repeat")
         if len(run) <= START:
-            raise UserError(f"{name} has {len(run)} frames; {STAND} standing ones, and more than {START} in all")
+            raise UserError(
+                f"{name} has {len(run)} frames; {STAND} standing ones, and more than {START} in all"
+            )
     return runs
 
 
@@ -174,12 +203,23 @@ def compare(predicted: Array, trials: Trials, rate: float) -> Agreement:
     taken = trials.taken.copy()
     taken[:START] = False
     same = (predicted == trials.choices) & taken
-    by_action = [same[chosen].mean() for a in range(len(ACTIONS)) if (chosen := taken & (trials.choices == a)).any()]
+    by_action = [
+        same[chosen].mean()
+        for a in range(len(ACTIONS))
+        if (chosen := taken & (trials.choices == a)).any()
+    ]
     back = ACTIONS.index("retract")
     moment = np.arange(len(predicted))[:, None]
-    turns = [np.where((one == back) & taken, moment, trials.steps).min(0) for one in (predicted, trials.choices)]
+    turns = [
+        np.where((one == back) & taken, moment, trials.steps).min(0)
+        for one in (predicted, trials.choices)
+    ]
     late = np.abs(turns[0] - turns[1]) / rate
-    return Agreement(float((same.sum(0) / taken.sum(0)).mean()), float(np.mean(by_action)), float(np.median(late)))
+    return Agreement(
+        float((same.sum(0) / taken.sum(0)).mean()),
+        float(np.mean(by_action)),
+        float(np.median(late)),
+    )
 
 
 def save_policy(folder: Path, policy: Touch) -> None:
@@ -188,7 +228,8 @@ def save_policy(folder: Path, policy: Touch) -> None:
     from anytouch_jax.weights import safetensors
 
     folder.mkdir(parents=True, exist_ok=True)
-    encoder, head = policy.encoder, policy.head
+    encoder = policy.encoder
+    head = policy.head
     about = {
         safetensors.MODEL_KEY: to_json(encoder.config.model),
         safetensors.BACKGROUND_KEY: encoder.config.data.background,
@@ -198,10 +239,21 @@ def save_policy(folder: Path, policy: Touch) -> None:
     safetensors.export_safetensors(folder / WEIGHTS, encoder.params, about)
     layers = {f"w/{i}": np.asarray(weight) for i, (weight, _) in enumerate(head.layers)}
     layers |= {f"b/{i}": np.asarray(bias) for i, (_, bias) in enumerate(head.layers)}
-    metadata = {"stills": policy.stills, "pooling": policy.pooling, "sensor": policy.sensor, "votes": policy.votes}
+    metadata = {
+        "stills": policy.stills,
+        "pooling": policy.pooling,
+        "sensor": policy.sensor,
+        "votes": policy.votes,
+    }
     data = io.BytesIO()
-    arrays: dict[str, Any] = {"mean": np.asarray(head.mean), "basis": np.asarray(head.basis), **layers}
-    np.savez(data, about=np.asarray(json.dumps(metadata | {"encoder": encoder.fingerprint})), **arrays)
+    arrays: dict[str, Any] = {
+        "mean": np.asarray(head.mean),
+        "basis": np.asarray(head.basis),
+        **layers,
+    }
+    np.savez(
+        data, about=np.asarray(json.dumps(metadata | {"encoder": encoder.fingerprint})), **arrays
+    )
     atomic_write(folder / POLICY, data.getvalue())
 
 
@@ -213,13 +265,19 @@ def load_policy(folder: Path | str) -> Touch:
     try:
         arrays = read_arrays(folder / POLICY)
         metadata = dict(parse_json(str(arrays["about"])))
-        stills, sensor, mark = bool(metadata["stills"]), str(metadata["sensor"]), metadata["encoder"]
-        pooling, votes = metadata.get("pooling", "class"), int(metadata.get("votes", 1))  # of earlier policies
+        stills = bool(metadata["stills"])
+        sensor = str(metadata["sensor"])
+        mark = metadata["encoder"]
+        # of earlier policies
+        pooling = metadata.get("pooling", "class")
+        votes = int(metadata.get("votes", 1))
         count = sum(name.startswith("w/") for name in arrays)
         layers = tuple((arrays[f"w/{i}"], arrays[f"b/{i}"]) for i in range(count))
         head = Head(arrays["mean"], arrays["basis"], layers)
         numbers = {name: array for name, array in arrays.items() if name != "about"}
-        if wrong := [name for name, x in numbers.items() if x.dtype.kind != "f" or not np.isfinite(x).all()]:
+        if wrong := [
+            name for name, x in numbers.items() if x.dtype.kind != "f" or not np.isfinite(x).all()
+        ]:
             raise ValueError(f"{wrong[0]} has values that are not finite numbers")
         _check_head(head)
         if pooling not in ("class", "mean", "both") or not 0 < votes < 1 << 20:
@@ -237,7 +295,11 @@ def _check_head(head: Head) -> None:
     """Raise ValueError for arrays of an MLP that do not fit together."""
     width = head.mean.shape
     for weight, bias in ((head.basis, None), *head.layers):
-        if weight.ndim != 2 or weight.shape[:1] != width or (bias is not None and bias.shape != weight.shape[1:]):
+        if (
+            weight.ndim != 2
+            or weight.shape[:1] != width
+            or (bias is not None and bias.shape != weight.shape[1:])
+        ):
             raise ValueError(f"a layer of shape {weight.shape} does not fit the one before")
         width = weight.shape[1:]
     if not head.layers or width != (len(ACTIONS),):

@@ -21,7 +21,8 @@ from anytouch_jax.sim.sensing.sensors import SENSORS, gel_to_object, look, unit_
 from experiments.pouring.physics import Load, Setup
 
 SENSOR = SENSORS["gelsight_mini"]
-ROWS, COLUMNS = 48, 64
+ROWS = 48
+COLUMNS = 64
 PITCH = min(SENSOR.field) / ROWS  # mm
 DOME = 150.0  # mm, radius of the gel's slightly round face: the contact ends within it
 LEVELS = (0.8, 0.95, 1.1)  # of the grip: the forces at which the dent is solved
@@ -44,17 +45,27 @@ def surface(setup: Setup) -> Array:
     """Heights (ROWS, COLUMNS) mm of the cylinder over the round gel, 0 where it is met first."""
     x, y = mechanics.positions((ROWS, COLUMNS), PITCH)
     u, v = gel_to_object(setup.unit, x, y)
-    u, v = u - setup.place[0], v - setup.place[1]
-    c, s = jnp.cos(setup.yaw), jnp.sin(setup.yaw)
+    u = u - setup.place[0]
+    v = v - setup.place[1]
+    c = jnp.cos(setup.yaw)
+    s = jnp.sin(setup.yaw)
     across = jnp.clip(c * u + s * v, -0.99 * setup.radius, 0.99 * setup.radius)
-    z = jnp.sqrt(setup.radius**2 - across**2) - setup.radius + setup.lean * v - (x**2 + y**2) / (2 * DOME)
+    z = (
+        jnp.sqrt(setup.radius**2 - across**2)
+        - setup.radius
+        + setup.lean * v
+        - (x**2 + y**2) / (2 * DOME)
+    )
     return z - jnp.max(z)
 
 
 def hold(setup: Setup, side: int) -> tuple[Grasp, PressResult]:
     """The gel's answers in one run, for pictures of `side` pixels, and the contact under the grip."""
-    gel, z = unit_gel(SENSOR, setup.unit), surface(setup)
-    press = jax.vmap(partial(mechanics.press, gel=gel, pitch=PITCH, iterations=40), in_axes=(None, 0))
+    gel = unit_gel(SENSOR, setup.unit)
+    z = surface(setup)
+    press = jax.vmap(
+        partial(mechanics.press, gel=gel, pitch=PITCH, iterations=40), in_axes=(None, 0)
+    )
     depths = jnp.geomspace(0.05, 2.0, 8)
     tried = press(z, depths).force
     wanted = setup.grip * jnp.asarray(LEVELS)
@@ -73,7 +84,9 @@ def unit_moves(contact: PressResult, gel: Gel) -> Array:
     motions = jnp.diag(jnp.array([0.1, 0.1, 0.02]))
 
     def moved(motion: Array) -> tuple[Array, Array]:
-        done = shear.shear_step(None, contact, motion, gel, PITCH, STICKS, centre=centre, iterations=120)
+        done = shear.shear_step(
+            None, contact, motion, gel, PITCH, STICKS, centre=centre, iterations=120
+        )
         return done.displacement, jnp.append(done.force, done.twist_torque)
 
     fields, loads = jax.vmap(moved)(motions)
@@ -88,22 +101,28 @@ def skin(grasp: Grasp, setup: Setup, load: Load) -> tuple[Array, Array]:
     """
     place = jnp.interp(load.normal, grasp.forces, jnp.arange(len(LEVELS), dtype=jnp.float32))
     weights = jnp.maximum(1 - jnp.abs(place - jnp.arange(len(LEVELS))), 0)
-    turned = setup.unit.rotation + setup.yaw  # of the cylinder's own directions on the gel
-    c, s = jnp.cos(turned), jnp.sin(turned)
+    # of the cylinder's own directions on the gel
+    turned = setup.unit.rotation + setup.yaw
+    c = jnp.cos(turned)
+    s = jnp.sin(turned)
     x, y = load.shear
     acting = jnp.stack([c * x - s * y, s * x + c * y, load.twist])
     drawn = jnp.sqrt(x**2 + y**2 + (load.twist / (2 / 3 * grasp.radius)) ** 2 + 1e-12)
     q = jnp.clip(drawn / (setup.friction * load.normal), 1e-3, 1.0)
     given = 1.5 * (1 - (1 - q) ** (2 / 3)) / q
     held = jnp.minimum(1.0, setup.friction * load.normal / drawn)
-    return jnp.tensordot(weights, grasp.dents, 1), jnp.tensordot(given * held * acting, grasp.moves, 1)
+    return jnp.tensordot(weights, grasp.dents, 1), jnp.tensordot(
+        given * held * acting, grasp.moves, 1
+    )
 
 
 def picture(grasp: Grasp, setup: Setup, load: Load, key: Array | None, side: int) -> Array:
     """The frame u8 (side, side, 3) of the whole field, squeezed to a square as the encoder's own transform does."""
     shape = optics.picture_size(SENSOR, side)
     dent, moved = skin(grasp, setup, load)
-    image = optics.render(dent, moved, PITCH, SENSOR, setup.unit, key, resolution=shape, behind=grasp.behind)
+    image = optics.render(
+        dent, moved, PITCH, SENSOR, setup.unit, key, resolution=shape, behind=grasp.behind
+    )
     small = jax.image.resize(image.astype(jnp.float32), (side, side, 3), "linear")
     return jnp.round(small).astype(jnp.uint8)
 

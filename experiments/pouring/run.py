@@ -64,12 +64,17 @@ def run(options: Pour) -> int:
     if options.record is not None:
         return _record(options, options.record)
     if options.model is None:
-        raise UserError("Give --model, whose features the policy learns from, or --record to write demonstrations.")
+        raise UserError(
+            "Give --model, whose features the policy learns from, or --record to write demonstrations."
+        )
     folder = options.model if options.model.is_dir() else options.model.parent
-    out, encoder = options.out or folder / "pour", load_encoder(options.model)
+    out = options.out or folder / "pour"
+    encoder = load_encoder(options.model)
     about = {"model": str(options.model), "seed": options.seed, "stills": options.stills}
     about |= {"fine_tuned": options.fine_tune, "steps": options.steps}
-    return _recorded(options, encoder, out, about) if options.recordings else _simulated(options, encoder, out, about)
+    if options.recordings:
+        return _recorded(options, encoder, out, about)
+    return _simulated(options, encoder, out, about)
 
 
 def _record(options: Pour, folder: Path) -> int:
@@ -92,8 +97,12 @@ def _learn(
     tune_steps = max(learning.tune_steps, len(demonstrations.steps))
     learning = replace(learning, steps=options.steps or learning.steps, tune_steps=tune_steps)
     log("learning from it")
-    learned = policy.learn_frozen(encoder, demonstrations, learning, stills=options.stills, sensor=sensor)
-    return (policy.fine_tune(learned, demonstrations, learning) if options.fine_tune else learned), learning
+    learned = policy.learn_frozen(
+        encoder, demonstrations, learning, stills=options.stills, sensor=sensor
+    )
+    return (
+        policy.fine_tune(learned, demonstrations, learning) if options.fine_tune else learned
+    ), learning
 
 
 def _recorded(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]) -> int:
@@ -102,16 +111,27 @@ def _recorded(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any])
     data = recordings.read(options.recordings, encoder.config.model.image_size)
     about |= {"recordings": str(options.recordings), "data": data.data}
     _check_unused(out, about)
-    learned_from, test = data.part(False), data.part(True)
-    log(f"{len(learned_from.steps)} runs of {data.sensor} to learn from, {len(test.steps)} of split test")
+    learned_from = data.part(False)
+    test = data.part(True)
+    log(
+        f"{len(learned_from.steps)} runs of {data.sensor} to learn from, {len(test.steps)} of split test"
+    )
     learned, learning = _learn(options, encoder, learned_from, data.sensor)
     rate = Task().rate
     rows = {
         "touch": recordings.agreement(learned, test, rate),
         "blind": recordings.agreement_blind(learned_from, test, learning, rate),
     }
-    head = ("policy", "moments as the hand chose", "mean over actions", "turns back, off by (median)")
-    cells = [(k, f"{100 * a.share:.1f} %", f"{100 * a.balanced:.1f} %", f"{a.turn:.1f} s") for k, a in rows.items()]
+    head = (
+        "policy",
+        "moments as the hand chose",
+        "mean over actions",
+        "turns back, off by (median)",
+    )
+    cells = [
+        (k, f"{100 * a.share:.1f} %", f"{100 * a.balanced:.1f} %", f"{a.turn:.1f} s")
+        for k, a in rows.items()
+    ]
     print(markdown_table(head, cells))
     results = {"sensor": learned.sensor} | {name: one._asdict() for name, one in rows.items()}
     return _write(out, learned, about | results)
@@ -119,7 +139,8 @@ def _recorded(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any])
 
 def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]) -> int:
     """Learn from the expert, and pour."""
-    side, task = encoder.config.model.image_size, Task(markers=options.markers)
+    side = encoder.config.model.image_size
+    task = Task(markers=options.markers)
     about |= {"target": task.target, "demonstrations": options.demos, "markers": options.markers}
     _check_unused(out, about)
     log(f"the expert pours {options.demos} times")
@@ -132,9 +153,13 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
     log(f"the policy pours {options.trials} times")
     setups, keys = trials.draw_runs(task, options.seed + policy.UNSEEN, options.trials)
     tried = trials.run(task, setups, keys, learned, side=side)
-    cells = [(str(i + 1), f"{g:.1f}", f"{abs(g - task.target):.1f}") for i, g in enumerate(tried.poured)]
+    cells = [
+        (str(i + 1), f"{g:.1f}", f"{abs(g - task.target):.1f}") for i, g in enumerate(tried.poured)
+    ]
     print(markdown_table(("trial", "poured, g", "error, g"), cells))
-    results = {"touch": tried} | {k: trials.run(task, setups, keys, rival) for k, rival in rivals.items()}
+    results = {"touch": tried} | {
+        k: trials.run(task, setups, keys, rival) for k, rival in rivals.items()
+    }
     for name, one in results.items():
         result = trials.error(one.poured, task.target)
         interval = "" if result.low is None else f" (95 %: {result.low:.1f} to {result.high:.1f})"
@@ -151,7 +176,9 @@ def _check_unused(out: Path, about: Mapping[str, Any]) -> None:
         return  # no results
     other = sorted(name for name in ("recordings", *about) if before.get(name) != about.get(name))
     if other:
-        raise UserError(f"{out} holds a policy of other settings ({', '.join(other)}). Choose another --out.")
+        raise UserError(
+            f"{out} holds a policy of other settings ({', '.join(other)}). Choose another --out."
+        )
 
 
 def _write(out: Path, learned: policy.Touch, results: Mapping[str, Any]) -> int:

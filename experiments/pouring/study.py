@@ -68,26 +68,37 @@ class Study:
     """The rows of the table, a seed after the other."""
 
     def __init__(self, options: Options) -> None:
-        self.options, self.runs = options, runs_by_name(options.runs, TABLE4)
+        self.options = options
+        self.runs = runs_by_name(options.runs, TABLE4)
         self.tune = options.tune or max(400, options.demos)
         learning = asdict(policy.Learning(tune_steps=self.tune))
         learning.pop("seed")
         self.tuning = {name: value for name, value in learning.items() if name.startswith("tune")}
-        self.settings = {"trials": options.trials, "demonstrations": options.demos, "version": VERSION}
-        self.settings |= {"policy": policy.VERSION} | {k: v for k, v in learning.items() if k not in self.tuning}
+        self.settings = {
+            "trials": options.trials,
+            "demonstrations": options.demos,
+            "version": VERSION,
+        }
+        self.settings |= {"policy": policy.VERSION} | {
+            k: v for k, v in learning.items() if k not in self.tuning
+        }
         self.trained = cache(self._trained)
 
     def _trained(self, seed: int) -> dict[str, Path]:
         """The runs of Tables 2 to 4 by the names of the rows; the image tower of AnyTouch's is the one untouched."""
         size = plan.QUICK if self.options.quick else plan.FULL
-        return Work(self.options.study).runs({k: plan.training(size, r, seed) for k, r in RECIPES.items()}, size)
+        return Work(self.options.study).runs(
+            {k: plan.training(size, r, seed) for k, r in RECIPES.items()}, size
+        )
 
     def path_of(self, name: str, seed: int) -> str | None:
         """The run of a row: one for all seeds, or one each."""
         if not self.runs:
             return str(self.trained(seed)[name])
         paths = self.runs.get(name) or (self.runs.get("anytouch") if name == "static" else None)
-        return paths[seed % len(paths)] if paths else None
+        if paths:
+            return paths[seed % len(paths)]
+        return None
 
     def encoder_of(self, name: str, seed: int) -> tuple[Encoder, str] | None:
         """The encoder of a row with its source and the fingerprint of its weights, None without a run."""
@@ -95,12 +106,19 @@ class Study:
         if path is not None:
             encoder = image_tower_encoder(path) if name == "none" else load_encoder(path)
         elif name == "none":
-            known = next((load_encoder(paths[0]).config for paths in self.runs.values()), preset("tiny"))
+            known = next(
+                (load_encoder(paths[0]).config for paths in self.runs.values()), preset("tiny")
+            )
             encoder = random_encoder(known, seed)
         else:
             return None
-        shown = f", {table.SHOWN}" if self.runs and name == "static" and name not in self.runs else ""
-        return encoder, f"{'untrained' if path is None else Path(path).name} (weights {encoder.fingerprint}{shown})"
+        shown = (
+            f", {table.SHOWN}" if self.runs and name == "static" and name not in self.runs else ""
+        )
+        return (
+            encoder,
+            f"{'untrained' if path is None else Path(path).name} (weights {encoder.fingerprint}{shown})",
+        )
 
     def wanted(self, name: str, mode: str, seed: int, source: str) -> bool:
         """Whether a row has no record of these settings and this encoder."""
@@ -111,23 +129,38 @@ class Study:
         return self.settings | (self.tuning if mode == "fine-tuned" else {})
 
     def write(
-        self, name: str, mode: str, seed: int, tried: trials.Trials, source: str, since: float, **about: float
+        self,
+        name: str,
+        mode: str,
+        seed: int,
+        tried: trials.Trials,
+        source: str,
+        since: float,
+        **about: float,
     ) -> None:
         about |= {"seconds": round(time.time() - since, 1)}
         settings = self.settings_of(mode)
-        record = table.record(tried, TASK, row=name, mode=mode, seed=seed, source=source, settings=settings, **about)
+        record = table.record(
+            tried, TASK, row=name, mode=mode, seed=seed, source=source, settings=settings, **about
+        )
         write_record(self.options.out, f"{name}-{mode}-{seed}", record)
-        print(f"seed {seed}, {name}, {mode}: {record['mean_error']:.1f} g, {about['seconds']:.0f} s", flush=True)
+        print(
+            f"seed {seed}, {name}, {mode}: {record['mean_error']:.1f} g, {about['seconds']:.0f} s",
+            flush=True,
+        )
 
     def run(self, seed: int) -> None:
         """Run the missing rows of a seed."""
-        count, learning = self.options.demos, policy.Learning(seed=seed, tune_steps=self.tune)
+        count = self.options.demos
+        learning = policy.Learning(seed=seed, tune_steps=self.tune)
         setups, keys = trials.draw_runs(TASK, seed + policy.UNSEEN, self.options.trials)
         shown = lru_cache(1)(lambda side: policy.demonstrate(TASK, seed, count, side=side))
         grasps = cache(lambda side: trials.hold(setups, side=side))
         rivals = {
             "blind": lambda: bounds.learn_blind(TASK, seed, count, learning),
-            "load": lambda: bounds.Scales(TASK, setups, bounds.learn_loads(TASK, seed, count, learning)),
+            "load": lambda: bounds.Scales(
+                TASK, setups, bounds.learn_loads(TASK, seed, count, learning)
+            ),
             "expert": lambda: trials.Expert(TASK),
         }
         for name, make in rivals.items():
@@ -140,15 +173,22 @@ class Study:
                 continue
             encoder, source = found
             # fine-tuning goes on from the frozen policy
-            modes = [m for m in ("frozen", "fine-tuned")
-                     if m in self.options.modes and self.wanted(name, m, seed, source)]  # fmt: skip
+            modes = [
+                m
+                for m in ("frozen", "fine-tuned")
+                if m in self.options.modes and self.wanted(name, m, seed, source)
+            ]
             if not modes:
                 continue
-            since, side = time.time(), encoder.config.model.image_size
-            learned = policy.learn_frozen(encoder, shown(side), learning, stills=name not in table.DYNAMIC)
+            since = time.time()
+            side = encoder.config.model.image_size
+            learned = policy.learn_frozen(
+                encoder, shown(side), learning, stills=name not in table.DYNAMIC
+            )
             for mode in modes:
                 if mode == "fine-tuned":
-                    since, learned = time.time(), policy.fine_tune(learned, shown(side), learning)
+                    since = time.time()
+                    learned = policy.fine_tune(learned, shown(side), learning)
                 tried = trials.run(TASK, setups, keys, learned, side=side, grasps=grasps(side))
                 self.write(name, mode, seed, tried, source, since, loss=round(learned.loss, 4))
 
@@ -156,7 +196,11 @@ class Study:
 def run(options: Options) -> int:
     """Run the study."""
     enable_compilation_cache()
-    usual = {name: value for name, value in QUICK.items() if getattr(options, name) == getattr(Options(), name)}
+    usual = {
+        name: value
+        for name, value in QUICK.items()
+        if getattr(options, name) == getattr(Options(), name)
+    }
     study = Study(replace(options, **usual) if options.quick else options)
     for seed in study.options.seeds:
         study.run(seed)

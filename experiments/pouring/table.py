@@ -17,18 +17,27 @@ from experiments.values import Seeds, Value, over_seeds, shared_difference
 
 MODES = ("fine-tuned", "frozen")
 TITLES = {
-    "none": "no tactile pre-training", "t3": "T3-style", "static": "AnyTouch, static only", "anytouch": "AnyTouch",
-    "blind": "blind: time and own actions", "load": "bound: knows the load, sees no picture",
+    "none": "no tactile pre-training",
+    "t3": "T3-style",
+    "static": "AnyTouch, static only",
+    "anytouch": "AnyTouch",
+    "blind": "blind: time and own actions",
+    "load": "bound: knows the load, sees no picture",
     "expert": "expert: sees the scales",
-}  # fmt: skip
-SHOWN = "shown stills"  # of the run `anytouch` in place of one trained on stills: says nothing of such training
+}
+# of the run `anytouch` in place of one trained on stills: says nothing of such training
+SHOWN = "shown stills"
 DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the others see stills
 
 
 def record(trials: Trials, task: Task, **about: Any) -> dict[str, Any]:
     """Return the record of a row's trials with one seed; `about` has its row, mode, seed, source and settings."""
     poured = np.asarray(trials.poured, np.float64)
-    about |= {"target": task.target, "limit": task.limit, "mean_error": round(error(poured, task.target).mean, 3)}
+    about |= {
+        "target": task.target,
+        "limit": task.limit,
+        "mean_error": round(error(poured, task.target).mean, 3),
+    }
     return about | {"poured": poured.round(3).tolist(), "steps": trials.steps.tolist()}
 
 
@@ -41,7 +50,9 @@ def errors_of(path: Path) -> dict[tuple[str, str], Seeds]:
             wrong = np.abs(np.asarray(one["poured"], np.float64) - one["target"])
             result.setdefault((one["row"], one["mode"]), {})[one["seed"]] = float(wrong.mean())
         except KeyError as missing:
-            raise UserError(f"{path}: the record {key} of a pouring row has no {missing}. Remove its line.") from None
+            raise UserError(
+                f"{path}: the record {key} of a pouring row has no {missing}. Remove its line."
+            ) from None
     check_alike(path, [one["settings"] for one in records.values()])
     return result
 
@@ -58,12 +69,25 @@ def compared(path: Path, data: str) -> tuple[list[tuple[Any, ...]], list[Finding
         return shared_difference(found.get(first, {}), found.get(second, {}))
 
     rows: list[tuple[Any, ...]] = []
-    for name, mode in ((name, mode) for name in TITLES for mode in (*MODES, "bound") if (name, mode) in found):
-        row = (data, TITLES[name], mode if name in TABLE4 else "", over_seeds([*found[name, mode].values()]))
+    for name, mode in (
+        (name, mode) for name in TITLES for mode in (*MODES, "bound") if (name, mode) in found
+    ):
+        row = (
+            data,
+            TITLES[name],
+            mode if name in TABLE4 else "",
+            over_seeds([*found[name, mode].values()]),
+        )
         theirs = TABLE4[name][MODES.index(mode)] if name in TABLE4 else None
         rows.append((*row, change((name, mode), "blind") if name in TABLE4 else None, theirs))
     others = [(other, mode) for other in ("blind", "t3", "none", "static") for mode in MODES]
     return rows, [
-        Finding("AnyTouch", TITLES[other], change(("anytouch", mode), other), f"error, {data}, {mode}", " g")
+        Finding(
+            "AnyTouch",
+            TITLES[other],
+            change(("anytouch", mode), other),
+            f"error, {data}, {mode}",
+            " g",
+        )
         for other, mode in others
     ]

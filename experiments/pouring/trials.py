@@ -19,7 +19,8 @@ from experiments.values import Value
 Array = npt.NDArray[Any]
 SENSOR = render.SENSOR.name
 FRAMES = 3  # of a segment
-START = STAND + FRAMES - 1  # the first moment of choice: a segment of the lifted cylinder is complete
+# the first moment of choice: a segment of the lifted cylinder is complete
+START = STAND + FRAMES - 1
 
 
 class Controller(Protocol):
@@ -60,17 +61,22 @@ class Expert:
     looks = False
 
     def __init__(self, task: Task, *, patient: bool = True) -> None:
-        self._task, self._patient = task, patient
+        self._task = task
+        self._patient = patient
 
     def begin(self, count: int) -> None:
         """Nothing to forget."""
 
     def act(self, frames: Array | None, state: State) -> Array:
         """Actions (B,) from the mass, the flow and whether the cylinder has been on its way back."""
-        mass, rate, tilt, highest = jax.device_get((state.mass, state.rate, state.tilt, state.highest))
+        mass, rate, tilt, highest = jax.device_get(
+            (state.mass, state.rate, state.tilt, state.highest)
+        )
         left = self._task.target - (self._task.beads - mass)
         back = (left <= 0.3 + 0.35 * rate) | (highest > tilt + 1e-6)
-        return np.where(back, RETRACT, np.where((rate > 0.8 + 0.2 * left) & self._patient, WAIT, POUR))
+        return np.where(
+            back, RETRACT, np.where((rate > 0.8 + 0.2 * left) & self._patient, WAIT, POUR)
+        )
 
 
 class Replay:
@@ -93,7 +99,10 @@ class Replay:
 
 def draw_runs(task: Task, seed: int, count: int) -> tuple[Setup, jax.Array]:
     """`count` runs drawn from `seed`: their stacked parameters and keys (count,). No run depends on the others."""
-    setups = [physics.draw_setup(task, np.random.default_rng([seed % 2**63, number])) for number in range(count)]
+    setups = [
+        physics.draw_setup(task, np.random.default_rng([seed % 2**63, number]))
+        for number in range(count)
+    ]
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.arange(count))
     return stack_trees(setups), keys
 
@@ -105,7 +114,9 @@ def _begin(setups: Setup, keys: jax.Array, *, task: Task) -> State:
 
 @partial(jax.jit, static_argnames=("task",))
 def _advance(state: State, actions: jax.Array, setups: Setup, *, task: Task) -> State:
-    return jax.vmap(lambda state, action, setup: physics.advance(state, action, setup, task))(state, actions, setups)
+    return jax.vmap(lambda state, action, setup: physics.advance(state, action, setup, task))(
+        state, actions, setups
+    )
 
 
 def hold(setups: Setup, *, side: int) -> render.Grasp:
@@ -131,9 +142,16 @@ def look(state: State, setups: Setup, grasps: render.Grasp, *, task: Task, side:
 
 
 def run(
-    task: Task, setups: Setup, keys: jax.Array, controller: Controller, *, side: int = 112, film: int = 0,
-    late: Array | None = None, grasps: render.Grasp | None = None,
-) -> Trials:  # fmt: skip
+    task: Task,
+    setups: Setup,
+    keys: jax.Array,
+    controller: Controller,
+    *,
+    side: int = 112,
+    film: int = 0,
+    late: Array | None = None,
+    grasps: render.Grasp | None = None,
+) -> Trials:
     """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or to `film` runs.
 
     `film`: of so many runs, the first ones, the frames are kept.
@@ -150,7 +168,8 @@ def run(
     controller.begin(count)
     history: list[tuple[Array, ...]] = []
     frames: list[Array] = []
-    steps, waited = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    steps = np.zeros(count, np.int64)
+    waited = np.zeros(count, np.int64)
     while not np.asarray(state.done).all():
         shown = np.asarray(look(state, setups, grasps, task=task, side=side)) if drawn else None
         choices = np.asarray(controller.act(shown if controller.looks else None, state), np.int32)
@@ -161,14 +180,18 @@ def run(
             choices = np.where(waited > 0, RETRACT, choices)
             waited += choices == RETRACT
             actions = np.where((choices == RETRACT) & (waited <= late), POUR, choices)
-        history.append((choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate))))
+        history.append(
+            (choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate)))
+        )
         steps += ~np.asarray(state.done)
         if shown is not None and film:
             frames.append(shown[:film].copy())
         state = _advance(state, actions, setups, task=task)
     choices, actions, mass, tilt, rate = (np.stack(one) for one in zip(*history, strict=True))
     out = np.asarray(physics.poured(state, task))
-    return Trials(out, steps, choices, actions, mass, tilt, rate, np.stack(frames) if film else None)
+    return Trials(
+        out, steps, choices, actions, mass, tilt, rate, np.stack(frames) if film else None
+    )
 
 
 def error(poured: Array, target: float) -> Value:

@@ -71,24 +71,51 @@ class Unit(NamedTuple):
     name: str
     sensor: str
     gel: str
-    presses: dict[float, str]  # radius of the ball in mm (NaN: unknown), and the pattern of its pictures
+    # radius of the ball in mm (NaN: unknown), and the pattern of its pictures
+    presses: dict[float, str]
     width_mm: float | None
-    radii: tuple[int, int] | None  # pixels of a contact circle at least and at most, or None: it has no sharp rim
-    fitted: float | None = None  # of this ball every second press fitted the colours of the simulated sensor
+    # pixels of a contact circle at least and at most, or None: it has no sharp rim
+    radii: tuple[int, int] | None
+    # of this ball every second press fitted the colours of the simulated sensor
+    fitted: float | None = None
 
 
 # The source's own configuration gives 0.0634 mm a pixel: https://github.com/rpl-cmu/gelslam, config.yaml (ppmm).
 UNITS = (
-    Unit("GelSight Mini", "gelsight_mini", "gelslam-gelsight_mini/background.png",
-         {3.155: "gelslam-gelsight_mini/6.310mm/*.png", 4.75: "gelslam-gelsight_mini/9.500mm/*.png"},
-         320 * 0.0634, (20, 48), 3.155),
-    Unit("9DTact", "9dtact", "9dtact-9dtact/sensor_1/ref.png",
-         {float("nan"): "9dtact-9dtact/sensor_1/ball_press.png"}, None, (40, 200)),
-    Unit("GelSlim, gel a", "gelslim", "nc/mcubelab_gelslim-gelslim3/gel_a_ball/ref.jpg",
-         {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_a_ball/press_*.jpg"}, None, None),
-    Unit("GelSlim, gel b", "gelslim", "nc/mcubelab_gelslim-gelslim3/gel_b_ball/ref.jpg",
-         {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_b_ball/press_*.jpg"}, None, None),
-)  # fmt: skip
+    Unit(
+        "GelSight Mini",
+        "gelsight_mini",
+        "gelslam-gelsight_mini/background.png",
+        {3.155: "gelslam-gelsight_mini/6.310mm/*.png", 4.75: "gelslam-gelsight_mini/9.500mm/*.png"},
+        320 * 0.0634,
+        (20, 48),
+        3.155,
+    ),
+    Unit(
+        "9DTact",
+        "9dtact",
+        "9dtact-9dtact/sensor_1/ref.png",
+        {float("nan"): "9dtact-9dtact/sensor_1/ball_press.png"},
+        None,
+        (40, 200),
+    ),
+    Unit(
+        "GelSlim, gel a",
+        "gelslim",
+        "nc/mcubelab_gelslim-gelslim3/gel_a_ball/ref.jpg",
+        {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_a_ball/press_*.jpg"},
+        None,
+        None,
+    ),
+    Unit(
+        "GelSlim, gel b",
+        "gelslim",
+        "nc/mcubelab_gelslim-gelslim3/gel_b_ball/ref.jpg",
+        {float("nan"): "nc/mcubelab_gelslim-gelslim3/gel_b_ball/press_*.jpg"},
+        None,
+        None,
+    ),
+)
 
 
 class Press(NamedTuple):
@@ -117,7 +144,9 @@ def difference(frame: Array, gel: Array) -> Array:
 def find_disc(change: Array) -> tuple[float, float, float]:
     """Return centre x, y and radius in pixels of the disc whose area and centroid are those of the strongest change."""
     size = cv2.GaussianBlur(np.abs(change).max(2), (0, 0), 3)
-    _, _, stats, centres = cv2.connectedComponentsWithStats((size > 0.35 * float(size.max())).astype(np.uint8))
+    _, _, stats, centres = cv2.connectedComponentsWithStats(
+        (size > 0.35 * float(size.max())).astype(np.uint8)
+    )
     largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     return *map(float, centres[largest]), float(np.sqrt(stats[largest, cv2.CC_STAT_AREA] / np.pi))
 
@@ -131,7 +160,9 @@ def find_circle(change: Array, radii: tuple[float, float] | None) -> tuple[float
     if radii is None:
         return find_disc(change)
     scale = change.shape[1] / _WIDTH
-    change = cv2.resize(change, (_WIDTH, round(change.shape[0] / scale)), interpolation=cv2.INTER_AREA)
+    change = cv2.resize(
+        change, (_WIDTH, round(change.shape[0] / scale)), interpolation=cv2.INTER_AREA
+    )
     height, width = change.shape[:2]
     size = np.abs(change).max(2)
     ys, xs = np.nonzero(size > max(8, 0.3 * float(size.max())))
@@ -151,7 +182,9 @@ def find_circle(change: Array, radii: tuple[float, float] | None) -> tuple[float
 
     low, high = (radius / scale for radius in radii)
     reach = 0.8 * low
-    x, y, r = best(*(m + np.arange(-reach, reach + 1, 3) for m in middle), np.arange(low, high, 2.0))
+    x, y, r = best(
+        *(m + np.arange(-reach, reach + 1, 3) for m in middle), np.arange(low, high, 2.0)
+    )
     for span, step in ((3, 1.0), (1, 0.25)):
         steps = np.arange(-span, span + step / 2, step)
         x, y, r = best(x + steps, y + steps, np.clip(r + steps, low, high))
@@ -160,7 +193,8 @@ def find_circle(change: Array, radii: tuple[float, float] | None) -> tuple[float
 
 def read_presses(unit: Unit, folder: Path) -> tuple[Array, list[Press]]:
     """Return the untouched gel and the presses of a unit. A ball's radii lie within a quarter of their median."""
-    gel, presses = decode(folder / unit.gel), list[Press]()
+    gel = decode(folder / unit.gel)
+    presses = list[Press]()
     for ball, pattern in unit.presses.items():
         files = sorted(file for file in folder.glob(pattern))
         changes = [difference(decode(file), gel) for file in files]
@@ -174,7 +208,9 @@ def read_presses(unit: Unit, folder: Path) -> tuple[Array, list[Press]]:
             for file, circle in zip(files, circles, strict=True)
         ]
     if not presses:
-        raise UserError(f"there are no presses in {folder}. Name the folder of the pack with --data.")
+        raise UserError(
+            f"there are no presses in {folder}. Name the folder of the pack with --data."
+        )
     return gel, presses
 
 
@@ -188,7 +224,9 @@ def true_depth(press: Press, mm: float) -> Array:
     """Return the depth (h, w) in mm above the rim of a ball's contact, NaN outside; `mm` is that of a pixel."""
     _, _, r = distance(press)
     inside = r < press.radius
-    height = np.sqrt(np.maximum(press.ball**2 - (mm * r) ** 2, 0)) - np.sqrt(press.ball**2 - (mm * press.radius) ** 2)
+    height = np.sqrt(np.maximum(press.ball**2 - (mm * r) ** 2, 0)) - np.sqrt(
+        press.ball**2 - (mm * press.radius) ** 2
+    )
     return np.where(inside, height, np.nan)
 
 
@@ -205,20 +243,25 @@ def error_of(depth: Array, press: Press, mm: float) -> Error:
     """Compare a measured depth (h, w) in mm with that of a ball."""
     _, _, r = distance(press)
     wanted = true_depth(press, mm)
-    near = (r > 0.85 * press.radius) & (r < press.radius - 1)  # the zero is that of the rim, from its inside
+    # the zero is that of the rim, from its inside
+    near = (r > 0.85 * press.radius) & (r < press.radius - 1)
     own = depth - float(np.median((depth - wanted)[near]))
     inside = r < press.radius
     centre = float(np.mean(own[r < 3])) - float(np.nanmean(wanted[r < 3]))
     profile = float(np.nanmean(np.abs(own - wanted)[inside]))
-    return Error(sphere(depth, press, mm) / press.ball - 1, centre, profile, float(np.nanmax(wanted)))
+    return Error(
+        sphere(depth, press, mm) / press.ball - 1, centre, profile, float(np.nanmax(wanted))
+    )
 
 
 def sphere(depth: Array, press: Press, mm: float) -> float:
     """Return the radius mm of the sphere that fits a measured depth (h, w) in mm inside the circle."""
     x, y, r = distance(press)
     inside = r < _INNER * press.radius
-    z, at = depth[inside], np.stack([x[inside], y[inside]]) * mm
-    flat = np.column_stack([np.ones(len(z)), *at, np.square(at).sum(0)])  # a paraboloid to start from
+    z = depth[inside]
+    at = np.stack([x[inside], y[inside]]) * mm
+    # a paraboloid to start from
+    flat = np.column_stack([np.ones(len(z)), *at, np.square(at).sum(0)])
     bend = float(np.linalg.lstsq(flat, z, rcond=None)[0][3])
     start = np.clip(-0.5 / bend if bend < 0 else 100.0, 1.2 * press.radius * mm, 100.0)
 
@@ -226,9 +269,13 @@ def sphere(depth: Array, press: Press, mm: float) -> float:
         height, x0, y0, log_radius = given
         square = np.square(at[0] - x0) + np.square(at[1] - y0)
         radius = np.exp(log_radius)
-        return np.asarray(height - square / (radius + np.sqrt(np.maximum(radius**2 - square, 0))) - z)
+        return np.asarray(
+            height - square / (radius + np.sqrt(np.maximum(radius**2 - square, 0))) - z
+        )
 
-    fit = least_squares(off, [float(z.max()), 0.0, 0.0, np.log(start)], loss="soft_l1", f_scale=0.05)
+    fit = least_squares(
+        off, [float(z.max()), 0.0, 0.0, np.log(start)], loss="soft_l1", f_scale=0.05
+    )
     return float(np.exp(fit.x[3]))
 
 
@@ -246,16 +293,20 @@ def slopes(press: Press, mm: float) -> tuple[Array, Array]:
     """Return slopes (h * w, 2) of the ball along x and y, 0 far outside of it, and where they are known (h * w,)."""
     x, y, r = distance(press)
     height = np.sqrt(np.maximum(press.ball**2 - (mm * r) ** 2, 1e-6))
-    inside, outside = r < press.radius - 1, r > 1.7 * press.radius
+    inside = r < press.radius - 1
+    outside = r > 1.7 * press.radius
     given = np.where(inside[..., None], -mm * np.stack([x, y], -1) / height[..., None], 0.0)
     return given.reshape(-1, 2), (inside | outside).ravel()
 
 
 def calibrate(kind: str, presses: Sequence[Press], gel: Array, mm: float) -> Any:
     """Return the regression of slopes on colours and places. The outside of a press counts as much as its inside."""
-    rng, xs, ys = np.random.default_rng(0), [], []
+    rng = np.random.default_rng(0)
+    xs = []
+    ys = []
     for press in presses:
-        x, (y, known) = inputs(press, gel), slopes(press, mm)
+        x = inputs(press, gel)
+        (y, known) = slopes(press, mm)
         inside = np.flatnonzero(known & np.any(y != 0, axis=1))
         inside = rng.permutation(inside)[:_PIXELS]
         outside = rng.choice(np.flatnonzero(known & np.all(y == 0, axis=1)), len(inside))
@@ -275,7 +326,8 @@ def integrate(slope: Array) -> Array:
     """Return the surface (h, w) whose slopes (h, w, 2) a pixel along x and y fit best (Poisson, free edges)."""
     height, width = slope.shape[:2]
     divergence = np.zeros((height, width))
-    across, down = (slope[:, 1:, 0] + slope[:, :-1, 0]) / 2, (slope[1:, :, 1] + slope[:-1, :, 1]) / 2
+    across = (slope[:, 1:, 0] + slope[:, :-1, 0]) / 2
+    down = (slope[1:, :, 1] + slope[:-1, :, 1]) / 2
     divergence[:, :-1] += across
     divergence[:, 1:] -= across
     divergence[:-1] += down
@@ -293,7 +345,9 @@ def calibrated_depths(kind: str, gel: Array, presses: Sequence[Press], mm: float
     """Return the depth (h, w) mm of every press, by a calibration on the other half of the presses."""
     depths: list[Array] = [np.zeros(0)] * len(presses)
     for half in (0, 1):
-        model = calibrate(kind, [press for n, press in enumerate(presses) if n % 2 != half], gel, mm)
+        model = calibrate(
+            kind, [press for n, press in enumerate(presses) if n % 2 != half], gel, mm
+        )
         for number, press in enumerate(presses):
             if number % 2 == half:
                 slope = model.predict(inputs(press, gel)).reshape(*gel.shape[:2], 2)
@@ -305,9 +359,13 @@ def measured_depths(
     encoder: Encoder, unit: Unit, gel: Array, presses: Sequence[Press]
 ) -> tuple[list[Array], Array, Array]:
     """Return depths (h, w) in mm, their deviations at the centre, and areas of contact in mm2, of every press."""
-    depths, deviations, areas = list[Array](), list[float](), list[float]()
+    depths = list[Array]()
+    deviations = list[float]()
+    areas = list[float]()
     for press in presses:
-        fields = encoder.measure(press.frame, gel, unit.sensor, width_mm=unit.width_mm).at(*gel.shape[:2])
+        fields = encoder.measure(press.frame, gel, unit.sensor, width_mm=unit.width_mm).at(
+            *gel.shape[:2]
+        )
         depths.append(fields.depth[0])
         deviations.append(float(fields.depth_std[0, round(press.y), round(press.x)]))
         areas.append(float(fields.area[0]))
@@ -331,7 +389,10 @@ def record_of(depths: Sequence[Array], presses: Sequence[Press], mm: float) -> d
         record[name] = interval(np.abs(values))
         record[f"{name}_bias"] = round(float(np.median(values)), 4)
     record["true_centre"] = round(float(np.median([error.true_centre for error in errors])), 4)
-    record["each"] = {presses[n].name: [round(x, 4) for x in error[:3]] for n, error in zip(whole, errors, strict=True)}
+    record["each"] = {
+        presses[n].name: [round(x, 4) for x in error[:3]]
+        for n, error in zip(whole, errors, strict=True)
+    }
     return record
 
 
@@ -339,28 +400,53 @@ def unknown_record(depths: Sequence[Array], presses: Sequence[Press], mm: float)
     """Return what can be said without the size of the ball: do all presses give one radius?"""
     whole = [n for n, press in enumerate(presses) if press.is_whole]
     fitted = np.array([sphere(depths[n], presses[n], mm) for n in whole])
-    spread = float(np.subtract(*np.percentile(fitted, (75, 25))) / np.median(fitted)) if len(fitted) > 3 else None
-    return {"presses": len(whole), "fitted_radius_mm": interval(fitted), "quartiles_over_median": spread}
+    spread = (
+        float(np.subtract(*np.percentile(fitted, (75, 25))) / np.median(fitted))
+        if len(fitted) > 3
+        else None
+    )
+    return {
+        "presses": len(whole),
+        "fitted_radius_mm": interval(fitted),
+        "quartiles_over_median": spread,
+    }
 
 
 def draw_colours(path: Path, unit: Unit, gel: Array, presses: Sequence[Press]) -> None:
     """Draw differences of presses above simulated ones of the same balls and circles, and their strength by slope."""
-    mm, kind = (unit.width_mm or 0.0) / gel.shape[1], SENSORS[unit.sensor]
+    mm = (unit.width_mm or 0.0) / gel.shape[1]
+    kind = SENSORS[unit.sensor]
     device = identity_unit(kind)._replace(gain=np.full(3, kind.contrast, np.float32))
     simulate = jax.jit(partial(simulate_touch, sensor=unit.sensor, size=len(gel), unit=device))
     figure, axes = panels(2, _SHOWN + 1, 2.6, 2.0)
     inside: dict[str, list[tuple[Array, Array]]] = {"real": [], "simulated": []}
     for column, press in enumerate(presses[_SHOWN :: len(presses) // _SHOWN]):
-        depth = 0.57 * (mm * press.radius) ** 2 / press.ball  # of a layer, whose contact is wider than a half-space's
-        place = (mm * (side / 2 - at) for side, at in zip(gel.shape[1::-1], (press.x, press.y), strict=True))
+        # of a layer, whose contact is wider than a half-space's
+        depth = 0.57 * (mm * press.radius) ** 2 / press.ball
+        place = (
+            mm * (side / 2 - at)
+            for side, at in zip(gel.shape[1::-1], (press.x, press.y), strict=True)
+        )
         made = simulate(ball_map(2 * press.ball, 400), np.array([[*place, 0.0, depth]]))
         image, behind, dent, pressure = (np.asarray(one[0]) for one in (*made[:3], made.pressure))
-        slope, away = np.hypot(*np.gradient(dent, kind.field[1] / dent.shape[1])), distance(press)[2]
+        slope = np.hypot(*np.gradient(dent, kind.field[1] / dent.shape[1]))
+        away = distance(press)[2]
         for axis, name, change, sine, touched in (
-            (axes[0][column], "real", difference(press.frame, gel), mm * away / press.ball, away < press.radius - 1),
-            (axes[1][column], "simulated", difference(image, behind), slope / np.hypot(slope, 1),
-             pressure > 0.05 * pressure.max()),
-        ):  # fmt: skip
+            (
+                axes[0][column],
+                "real",
+                difference(press.frame, gel),
+                mm * away / press.ball,
+                away < press.radius - 1,
+            ),
+            (
+                axes[1][column],
+                "simulated",
+                difference(image, behind),
+                slope / np.hypot(slope, 1),
+                pressure > 0.05 * pressure.max(),
+            ),
+        ):
             axis.imshow(np.clip(change + 128, 0, 255).astype(np.uint8))
             axis.set_axis_off()
             axis.set_title(f"{name}, {2 * press.ball:g} mm", fontsize=8)
@@ -388,15 +474,26 @@ def run(options: BallOptions) -> int:
         records = dict[str, dict[str, Any]]()
         if known and options.calibration:
             for kind in ("polynomial", "network"):
-                records[f"calibration, {kind}"] = record_of(calibrated_depths(kind, gel, presses, mm), presses, mm)
-        fresh = [number for number, press in enumerate(presses) if number % 2 or press.ball != unit.fitted]
+                records[f"calibration, {kind}"] = record_of(
+                    calibrated_depths(kind, gel, presses, mm), presses, mm
+                )
+        fresh = [
+            number
+            for number, press in enumerate(presses)
+            if number % 2 or press.ball != unit.fitted
+        ]
         for name, encoder in encoders.items():
             depths, deviations, areas = measured_depths(encoder, unit, gel, presses)
-            width = encoder.measure(presses[0].frame, gel, unit.sensor, width_mm=unit.width_mm).width_mm
+            width = encoder.measure(
+                presses[0].frame, gel, unit.sensor, width_mm=unit.width_mm
+            ).width_mm
             mm = (width or 1.0) / gel.shape[1]
             circles = np.array([np.pi * (mm * press.radius) ** 2 for press in presses])
             record = (record_of if known else unknown_record)(depths, presses, mm)
-            record |= {"area_over_circle": interval(areas / circles), "centre_std": interval(deviations)}
+            record |= {
+                "area_over_circle": interval(areas / circles),
+                "centre_std": interval(deviations),
+            }
             records[name] = record
             if unit.fitted is not None:
                 some = record_of([depths[n] for n in fresh], [presses[n] for n in fresh], mm)

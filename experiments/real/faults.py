@@ -14,9 +14,14 @@ from anytouch_jax.encoder.health import UnitFrames
 Fault = Callable[[UnitFrames, UnitFrames | None, np.random.Generator], UnitFrames]
 
 
-def each(unit: UnitFrames, change: Callable[[np.ndarray], np.ndarray], *, background: bool = True) -> UnitFrames:
+def each(
+    unit: UnitFrames, change: Callable[[np.ndarray], np.ndarray], *, background: bool = True
+) -> UnitFrames:
     """Return the unit with every picture changed, that of the untouched gel too if `background`."""
-    recordings = [[np.ascontiguousarray(change(frame)) for frame in recording] for recording in unit.recordings]
+    recordings = [
+        [np.ascontiguousarray(change(frame)) for frame in recording]
+        for recording in unit.recordings
+    ]
     gel = unit.background
     if background and gel is not None:
         gel = np.ascontiguousarray(change(gel))
@@ -30,18 +35,24 @@ def _tint(unit: UnitFrames, other: Any, rng: np.random.Generator) -> UnitFrames:
     def tinted(frame: np.ndarray, place: int) -> np.ndarray:
         return np.clip(frame * np.array([1 + 0.5 * place / count, 1, 1]), 0, 255).astype(np.uint8)
 
-    return replace(unit, recordings=[[tinted(f, i) for f in r] for i, r in enumerate(unit.recordings)])
+    return replace(
+        unit, recordings=[[tinted(f, i) for f in r] for i, r in enumerate(unit.recordings)]
+    )
 
 
 def _scratch(unit: UnitFrames, other: Any, rng: np.random.Generator) -> UnitFrames:
     """Three bright lines that the background does not have."""
     height, width = unit.frames[0].shape[:2]
     ends = rng.uniform(0.1, 0.9, (3, 2, 2)) * (width, height)
-    ends[:, 1] = ends[:, 0] + (0.4 * width, 0.1 * height) * np.sign((width / 2, height / 2) - ends[:, 0])
+    ends[:, 1] = ends[:, 0] + (0.4 * width, 0.1 * height) * np.sign(
+        (width / 2, height / 2) - ends[:, 0]
+    )
 
     def scratched(frame: np.ndarray) -> np.ndarray:
         for start, end in ends.astype(int).tolist():
-            frame = cv2.line(frame.copy(), start, end, (235, 235, 235), max(2, width // 110), cv2.LINE_AA)
+            frame = cv2.line(
+                frame.copy(), start, end, (235, 235, 235), max(2, width // 110), cv2.LINE_AA
+            )
         return frame
 
     return each(unit, scratched, background=False)
@@ -74,16 +85,25 @@ def _held(unit: UnitFrames, other: Any, rng: np.random.Generator) -> UnitFrames:
     """One touch that never ends: every frame is one frame of contact with a little noise."""
     frame = _press(unit, other, rng).background
     assert frame is not None
-    noisy = [[np.clip(frame + rng.normal(0, 2, frame.shape), 0, 255).astype(np.uint8) for _ in r]
-             for r in unit.recordings]  # fmt: skip
+    noisy = [
+        [np.clip(frame + rng.normal(0, 2, frame.shape), 0, 255).astype(np.uint8) for _ in r]
+        for r in unit.recordings
+    ]
     return replace(unit, recordings=noisy)
 
 
 def _mixed(unit: UnitFrames, other: UnitFrames | None, rng: np.random.Generator) -> UnitFrames:
     """A third of the recordings are of the other unit."""
     assert other is not None
-    return replace(unit, recordings=[(other if i % 3 == 2 else unit).recordings[i % len(other.recordings)]
-                                     if i % 3 == 2 else r for i, r in enumerate(unit.recordings)])  # fmt: skip
+    return replace(
+        unit,
+        recordings=[
+            (other if i % 3 == 2 else unit).recordings[i % len(other.recordings)]
+            if i % 3 == 2
+            else r
+            for i, r in enumerate(unit.recordings)
+        ],
+    )
 
 
 def _of(change: Callable[[np.ndarray], np.ndarray]) -> Fault:
@@ -102,26 +122,45 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "mirrored left to right": (LAYOUT, _of(lambda frame: frame[:, ::-1])),
     "mirrored top to bottom": (LAYOUT, _of(lambda frame: frame[::-1])),
     "red and blue exchanged": (LAYOUT, _of(lambda frame: frame[..., ::-1])),
-    "blurred": ("focus", _of(lambda frame: cv2.GaussianBlur(frame, (0, 0), max(frame.shape) / 130))),
+    "blurred": (
+        "focus",
+        _of(lambda frame: cv2.GaussianBlur(frame, (0, 0), max(frame.shape) / 130)),
+    ),
     "too bright": ("exposure", _gain(3.5)),
     "too dark": ("exposure", _gain(0.12)),
-    "frozen": ("frozen frames", lambda unit, other, rng: replace(
-        unit, recordings=[[r[0]] * len(r) if i % 3 == 0 else r for i, r in enumerate(unit.recordings)])),
-    "dropped": ("dropped frames", lambda unit, other, rng: replace(
-        unit, steps=np.where(rng.random(len(unit.steps)) < 0.08, 2.0, unit.steps))),
+    "frozen": (
+        "frozen frames",
+        lambda unit, other, rng: replace(
+            unit,
+            recordings=[
+                [r[0]] * len(r) if i % 3 == 0 else r for i, r in enumerate(unit.recordings)
+            ],
+        ),
+    ),
+    "dropped": (
+        "dropped frames",
+        lambda unit, other, rng: replace(
+            unit, steps=np.where(rng.random(len(unit.steps)) < 0.08, 2.0, unit.steps)
+        ),
+    ),
     "tint drifts": ("tint drift", _tint),
     "dead pixels": ("dead pixels", _dead),
     "scratched": ("worn gel", _scratch),
     "background pressed": ("background", _press),
     "touch never ends": ("contact", _held),
     "two units mixed": ("one unit", _mixed),
-}  # fmt: skip
+}
 
 
 def most_different(unit: UnitFrames, units: Sequence[UnitFrames]) -> UnitFrames | None:
     """Return the other unit of the same sensor and size whose usual picture differs most, None without one."""
     rivals = [
-        other for other in units
-        if other is not unit and other.sensor == unit.sensor and other.frames[0].shape == unit.frames[0].shape
-    ]  # fmt: skip
-    return max(rivals, key=lambda other: float(cv2.absdiff(other.usual, unit.usual).mean()), default=None)
+        other
+        for other in units
+        if other is not unit
+        and other.sensor == unit.sensor
+        and other.frames[0].shape == unit.frames[0].shape
+    ]
+    return max(
+        rivals, key=lambda other: float(cv2.absdiff(other.usual, unit.usual).mean()), default=None
+    )

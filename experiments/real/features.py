@@ -18,8 +18,11 @@ def encoder_features(encoder: Encoder, data: Recordings, sensor: str | None = No
 
     With `sensor` all frames get the tokens of that sensor.
     """
-    rows, row = np.arange(len(data.manifest)), None if sensor is None else encoder.sensor_row(sensor)
-    x = embed_rows(encoder, data.manifest, rows, pooling="both", sensor_row=row, gels=data.gels, log=silent)[1]
+    rows = np.arange(len(data.manifest))
+    row = None if sensor is None else encoder.sensor_row(sensor)
+    x = embed_rows(
+        encoder, data.manifest, rows, pooling="both", sensor_row=row, gels=data.gels, log=silent
+    )[1]
     fit = x[data.split == "train"]
     return np.asarray((x - fit.mean(0)) / (fit.std(0) + 1e-6), np.float32)
 
@@ -31,12 +34,16 @@ def pixel_values(data: Recordings) -> np.ndarray:
         return cv2.resize(picture, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
     pairs = ((small(frame), small(gel)) for frame, gel in data.pairs())
-    return components([np.concatenate([frame, frame - gel], -1).ravel() for frame, gel in pairs], data)
+    return components(
+        [np.concatenate([frame, frame - gel], -1).ravel() for frame, gel in pairs], data
+    )
 
 
 def components(values: list[np.ndarray], data: Recordings, count: int = 200) -> np.ndarray:
     """Return the first principal components (n, count) of values (n, d), fitted on train."""
-    return principal_components(np.array(values, np.float32), data.split == "train", count, "randomized")
+    return principal_components(
+        np.array(values, np.float32), data.split == "train", count, "randomized"
+    )
 
 
 def classical_values(data: Recordings) -> np.ndarray:
@@ -44,7 +51,9 @@ def classical_values(data: Recordings) -> np.ndarray:
     hog = cv2.HOGDescriptor((96, 96), (32, 32), (32, 32), (16, 16), 9)
     values = []
     for frame, gel in data.pairs():
-        small = cv2.resize(subtract_background([frame], gel)[0], (96, 96), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(
+            subtract_background([frame], gel)[0], (96, 96), interpolation=cv2.INTER_AREA
+        )
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         values.append(np.concatenate([hog.compute(grey).ravel(), _binary_patterns(grey)]))
     return components(values, data)
@@ -58,8 +67,12 @@ def _binary_patterns(grey: np.ndarray, cells: int = 4) -> np.ndarray:
     for bit, (down, right) in enumerate(steps):
         neighbour = grey[1 + down : grey.shape[0] - 1 + down, 1 + right : grey.shape[1] - 1 + right]
         code |= (neighbour >= centre).astype(np.uint8) << bit
-    parts = [np.array_split(row, cells, axis=1) for row in np.array_split(_UNIFORM[code], cells, axis=0)]
-    return np.concatenate([np.bincount(part.ravel(), minlength=59) / part.size for row in parts for part in row])
+    parts = [
+        np.array_split(row, cells, axis=1) for row in np.array_split(_UNIFORM[code], cells, axis=0)
+    ]
+    return np.concatenate(
+        [np.bincount(part.ravel(), minlength=59) / part.size for row in parts for part in row]
+    )
 
 
 # The number of each code among the 58 codes with at most two changes, 58 for all others.

@@ -61,11 +61,18 @@ def read(path: str | Path, untouched: Untouched = "rule") -> Recordings:
     rows = (whole.text_column("dataset") == SET) & (whole.text_column("split") != "background")
     manifest = select_rows(whole, np.flatnonzero(rows))
     if untouched != "rule":
-        files, sequence = manifest.text_column("path"), manifest.codes("sequence", own=True)
+        files = manifest.text_column("path")
+        sequence = manifest.codes("sequence", own=True)
         order = np.lexsort((manifest.number_column("frame_index"), sequence))
         first = files[order[np.searchsorted(sequence[order], sequence)]].tolist()
-        manifest = replace_column(manifest, "background_path", first if untouched != "median" else [None] * len(first))
-    recording, unit, split, thing = map(manifest.text_column, ("recording", "unit", "split", "label.object"))
-    fold, slip = (manifest.number_column(name).astype(int) for name in ("object_fold", "label.slip"))
+        manifest = replace_column(
+            manifest, "background_path", first if untouched != "median" else [None] * len(first)
+        )
+    recording, unit, split, thing = map(
+        manifest.text_column, ("recording", "unit", "split", "label.object")
+    )
+    fold, slip = (
+        manifest.number_column(name).astype(int) for name in ("object_fold", "label.slip")
+    )
     finger = np.array([name[:4] for name in unit])
     return Recordings(manifest, recording, finger, split, fold, thing, slip, whole.content_hash)

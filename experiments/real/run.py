@@ -19,7 +19,8 @@ from experiments.benchmarks import machine
 from experiments.real import features, recordings, scores, training
 from experiments.records import write_record
 
-UNTRAINED, CNN = "untrained:", "small CNN from scratch"
+UNTRAINED = "untrained:"
+CNN = "small CNN from scratch"
 
 
 def load(name: str) -> Encoder:
@@ -33,16 +34,23 @@ def load(name: str) -> Encoder:
 def task_record(score: scores.Score) -> dict[str, Any]:
     """Return a score as it stands in a record."""
     return {
-        "share": score.share, "interval": score.interval(), "option": score.option,
-        "correct": score.correct.astype(int).tolist(), "groups": score.groups.tolist(),
-    }  # fmt: skip
+        "share": score.share,
+        "interval": score.interval(),
+        "option": score.option,
+        "correct": score.correct.astype(int).tolist(),
+        "groups": score.groups.tolist(),
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("models", nargs="*")
     parser.add_argument("--data", type=Path, default=Path("../shared/real_touch2/manifest.csv"))
-    parser.add_argument("--out", type=Path, default=Path("experiments/results"), help="folder of the records")
+    parser.add_argument(
+        "--out", type=Path, default=Path("experiments/results"), help="folder of the records"
+    )
     parser.add_argument("--untouched", choices=get_args(recordings.Untouched), default="rule")
     parser.add_argument("--trained", action="store_true", help="train a small CNN with labels too")
     options = parser.parse_args()
@@ -50,22 +58,34 @@ def main() -> None:
     end = "" if options.untouched == "rule" else f", {options.untouched}"
 
     def write(name: str, found: dict[str, scores.Score], **about: Any) -> None:
-        about |= {"data": data.data, "untouched": options.untouched, "machine": plain(machine.describe())}
+        about |= {
+            "data": data.data,
+            "untouched": options.untouched,
+            "machine": plain(machine.describe()),
+        }
         tasks = {task: task_record(score) for task, score in found.items()}
         write_record(options.out / "real.jsonl", name + end, about | {"tasks": tasks})
-        print(name + end, {task: round(score.share, 3) for task, score in found.items()}, flush=True)
+        print(
+            name + end, {task: round(score.share, 3) for task, score in found.items()}, flush=True
+        )
 
     write("pixels", scores.table(features.pixel_values(data), data), kind="baseline")
     if not end:
-        write("HOG and local binary patterns", scores.table(features.classical_values(data), data), kind="baseline")
+        write(
+            "HOG and local binary patterns",
+            scores.table(features.classical_values(data), data),
+            kind="baseline",
+        )
     for word in options.models:
         encoder = load(word)
         found = scores.table(features.encoder_features(encoder, data), data)
         write(word.partition("=")[0], found, kind="encoder", fingerprint=encoder.fingerprint)
     if options.trained:
         pictures = training.cnn_pictures(data)
-        found = {f"{task}, {scores.TRAINED}": score(pictures, data, training.cnn_scores)
-                 for task, score in scores.TASKS.items()}  # fmt: skip
+        found = {
+            f"{task}, {scores.TRAINED}": score(pictures, data, training.cnn_scores)
+            for task, score in scores.TASKS.items()
+        }
         write(CNN, found, kind="baseline")
 
 

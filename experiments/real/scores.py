@@ -42,14 +42,17 @@ class Score(NamedTuple):
         return float(change.mean()), *statistics.mean_interval(change, self.groups)
 
 
-def linear_scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) -> list[tuple[float, Array]]:
+def linear_scores(
+    x: Array, y: Array, classes: int, fit: Array, weights: Array
+) -> list[tuple[float, Array]]:
     """Return (penalty, probabilities (n, classes)) of logistic regression on the rows `fit` for every penalty.
 
     All columns are divided by one number, which keeps the ranking of principal components.
     """
     mean, scale = x[fit].mean(0), np.sqrt(x[fit].var(0).mean())
     scaled = ((x - mean) / scale).astype(np.float32)
-    path, results = heads.logistic_path(scaled[fit], y[fit], classes, PENALTIES, None, weights), []
+    path = heads.logistic_path(scaled[fit], y[fit], classes, PENALTIES, None, weights)
+    results = []
     for penalty, model in zip(PENALTIES, path, strict=True):
         logits = scaled @ model.weights + model.bias
         if logits.shape[1] == 1:
@@ -58,14 +61,17 @@ def linear_scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) 
     return results
 
 
-def neighbour_scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) -> list[tuple[float, Array]]:
+def neighbour_scores(
+    x: Array, y: Array, classes: int, fit: Array, weights: Array
+) -> list[tuple[float, Array]]:
     """Return (k, shares of the classes among the k nearest train frames (n, classes))."""
     centred = x - x[fit].mean(0)
     unit = centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-12)
     near, cosine = nearest(unit[fit], unit, max(NEIGHBOURS))
     results = []
     for k in NEIGHBOURS:
-        votes, some = np.zeros((len(x), classes)), y[fit][near[:, :k]]
+        votes = np.zeros((len(x), classes))
+        some = y[fit][near[:, :k]]
         np.add.at(votes, (np.arange(len(x))[:, None], some), np.exp(cosine[:, :k] / 0.1))
         results.append((float(k), votes / votes.sum(1, keepdims=True)))
     return results
@@ -78,9 +84,13 @@ def _share_weights(groups: Array) -> Array:
 
 
 def recording_score(
-    x: Array, y: Array, groups: Array, split: Array, classes: int,
+    x: Array,
+    y: Array,
+    groups: Array,
+    split: Array,
+    classes: int,
     score: Callable[..., list[tuple[float, Array]]] = linear_scores,
-) -> Score:  # fmt: skip
+) -> Score:
     """Fit on train, choose on val, and score each recording of test. x (n, d), y class numbers (n,)."""
     fit = np.flatnonzero(split == "train")
     options = score(x, y, classes, fit, _share_weights(groups[fit]))
@@ -103,11 +113,16 @@ def object_score(x: Array, data: Recordings, score: Callable[..., Any] = linear_
     return recording_score(x, y, data.recording, data.split, len(data.names), score)
 
 
-def other_finger_score(x: Array, data: Recordings, score: Callable[..., Any] = linear_scores) -> Score:
+def other_finger_score(
+    x: Array, data: Recordings, score: Callable[..., Any] = linear_scores
+) -> Score:
     """Which object is it, on test recordings of the finger whose camera the head never saw? Both directions."""
-    y, parts = np.searchsorted(data.names, data.object), []
+    y = np.searchsorted(data.names, data.object)
+    parts = []
     for trained, tested in (("cam0", "cam2"), ("cam2", "cam0")):
-        split = np.where(data.finger == np.where(data.split == "test", tested, trained), data.split, "unused")
+        split = np.where(
+            data.finger == np.where(data.split == "test", tested, trained), data.split, "unused"
+        )
         parts.append(recording_score(x, y, data.recording, split, len(data.names), score))
     groups = np.concatenate([part.groups for part in parts])
     return Score(np.concatenate([part.correct for part in parts]), groups, parts[0].option)
@@ -117,18 +132,29 @@ def slip_score(x: Array, data: Recordings, score: Callable[..., Any] = linear_sc
     """Did it slip? Objects are left out by five folds; the next fold is for validation."""
     parts = []
     for fold in range(5):
-        split = np.where(data.fold == fold, "test", np.where(data.fold == (fold + 1) % 5, "val", "train"))
+        split = np.where(
+            data.fold == fold, "test", np.where(data.fold == (fold + 1) % 5, "val", "train")
+        )
         parts.append(recording_score(x, data.slip, data.recording, split, 2, score))
     return Score(
-        np.concatenate([part.correct for part in parts]), np.concatenate([part.groups for part in parts]),
+        np.concatenate([part.correct for part in parts]),
+        np.concatenate([part.groups for part in parts]),
         float(np.median([part.option for part in parts])),
-    )  # fmt: skip
+    )
 
 
-TASKS = {"object": object_score, "object, other finger": other_finger_score, "slip, objects left out": slip_score}
+TASKS = {
+    "object": object_score,
+    "object, other finger": other_finger_score,
+    "slip, objects left out": slip_score,
+}
 HEADS = {"linear": linear_scores, "kNN": neighbour_scores}
 
 
 def table(x: Array, data: Recordings) -> dict[str, Score]:
     """Return {task and head: score} of features (n, d)."""
-    return {f"{task}, {head}": of(x, data, score) for task, of in TASKS.items() for head, score in HEADS.items()}
+    return {
+        f"{task}, {head}": of(x, data, score)
+        for task, of in TASKS.items()
+        for head, score in HEADS.items()
+    }

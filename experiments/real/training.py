@@ -18,21 +18,30 @@ from anytouch_jax.encoder.embed import run_in_batches
 from experiments.real.recordings import Recordings
 
 Array = np.ndarray
-SIDE, EPOCHS, BATCH, RATE = 64, (4, 8, 16), 32, 1e-3  # pixels; passes over the frames; frames
+# pixels; passes over the frames; frames
+SIDE = 64
+EPOCHS = (4, 8, 16)
+BATCH = 32
+RATE = 1e-3
 SHIFT = 0.06  # of a side
 
 
 class SmallCnn(nnx.Module):
     """Four convolutions of stride 2, each with a layer norm, their mean over the picture, and a linear head."""
 
-    def __init__(self, classes: int, seed: int = 0, channels: Sequence[int] = (32, 64, 128, 128)) -> None:
-        rngs, before = nnx.Rngs(seed), 6
-        convolutions, norms = [], []
+    def __init__(
+        self, classes: int, seed: int = 0, channels: Sequence[int] = (32, 64, 128, 128)
+    ) -> None:
+        rngs = nnx.Rngs(seed)
+        before = 6
+        convolutions = []
+        norms = []
         for after in channels:
             convolutions.append(nnx.Conv(before, after, (3, 3), strides=2, rngs=rngs))
             norms.append(nnx.LayerNorm(after, rngs=rngs))
             before = after
-        self.convolutions, self.norms = nnx.List(convolutions), nnx.List(norms)
+        self.convolutions = nnx.List(convolutions)
+        self.norms = nnx.List(norms)
         self.head = nnx.Linear(before, classes, rngs=rngs)
 
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -44,11 +53,16 @@ class SmallCnn(nnx.Module):
 
 def cnn_pictures(data: Recordings) -> Array:
     """Return frames and their differences from the untouched gel, u8 (n, SIDE, SIDE, 6)."""
-    both = (np.concatenate([frame, subtract_background([frame], gel)[0]], -1) for frame, gel in data.pairs())
+    both = (
+        np.concatenate([frame, subtract_background([frame], gel)[0]], -1)
+        for frame, gel in data.pairs()
+    )
     return np.stack([cv2.resize(pair, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for pair in both])
 
 
-def cnn_scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) -> list[tuple[float, Array]]:
+def cnn_scores(
+    x: Array, y: Array, classes: int, fit: Array, weights: Array
+) -> list[tuple[float, Array]]:
     """Train a `SmallCnn` on the rows `fit` of `cnn_pictures`, drawn by `weights`.
 
     Return (epochs, probabilities (n, classes)) after each number of EPOCHS.
@@ -64,13 +78,17 @@ def cnn_scores(x: Array, y: Array, classes: int, fit: Array, weights: Array) -> 
     @jax.jit
     def step(params: Any, state: Any, pictures: jax.Array, labels: jax.Array) -> tuple[Any, Any]:
         def loss(params: Any) -> jax.Array:
-            return optax.softmax_cross_entropy_with_integer_labels(logits(params, pictures), labels).mean()
+            return optax.softmax_cross_entropy_with_integer_labels(
+                logits(params, pictures), labels
+            ).mean()
 
         updates, state = optimiser.update(jax.grad(loss)(params), state, params)
         return optax.apply_updates(params, updates), state
 
     predict = jax.jit(lambda params, pictures: jax.nn.softmax(logits(params, pictures)))
-    state, rng, results = optimiser.init(params), np.random.default_rng(0), []
+    state = optimiser.init(params)
+    rng = np.random.default_rng(0)
+    results = []
     for epoch in range(1, EPOCHS[-1] + 1):
         for _ in range(steps):
             rows = rng.choice(fit, BATCH, p=weights / weights.sum())

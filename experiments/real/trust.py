@@ -44,17 +44,21 @@ class TrustOptions:
     name: str  # Of the record.
     data: Path  # Manifest.
     features: Path | None = None  # Its features, by anytouch embed.
-    strange: Path | None = None  # Features of another manifest by the same encoder, for sensors never met.
+    # Features of another manifest by the same encoder, for sensors never met.
+    strange: Path | None = None
     label: str = "object"  # Label column.
     group: str = ""  # Column of groups that no split cuts.
     penalty: float = 0.1  # Of the heads.
     coverage: float = 0.9
     false_alarms: float = 0.05
-    repeats: int = 100  # Random splits. With 20 of them the coverage of 36 groups is uncertain by 2 points.
+    # Random splits. With 20 of them the coverage of 36 groups is uncertain by 2 points.
+    repeats: int = 100
     held_out: int = 5  # Folds of classes that are left out in turn, for classes never met.
     health: bool = False  # Check the units, and made faults of them.
-    package: bool = False  # With --health, compare with the real gels in the package too, for sensors of one unit.
-    skip_units: tuple[str, ...] = ("unknown",)  # Units whose name contains one of these are not in good order.
+    # With --health, compare with the real gels in the package too, for sensors of one unit.
+    package: bool = False
+    # Units whose name contains one of these are not in good order.
+    skip_units: tuple[str, ...] = ("unknown",)
     out: Path = Path("experiments/results/trust.jsonl")  # JSON lines.
 
 
@@ -70,7 +74,8 @@ class Touches:
 
 def read_touches(options: TrustOptions) -> Touches:
     """Return the labelled rows of the manifest that have features. Raises UserError."""
-    table, arrays = manifests.read(options.data), read_arrays(options.features or "")
+    table = manifests.read(options.data)
+    arrays = read_arrays(options.features or "")
     rows, _ = probing.label_rows(table, options.label, group=options.group)
     rows = rows.take(np.flatnonzero(np.isin(rows.rows[:, 0], arrays["rows"])))
     place = np.argsort(arrays["rows"])
@@ -98,10 +103,12 @@ def calibration_error(p: Array, correct: Array, bins: int = 15) -> float:
 
 def over_groups(value: Callable[[Array], float], groups: Array) -> list[float]:
     """Return a figure of row numbers, and the ends of its interval under a bootstrap over groups."""
-    rng, names = np.random.default_rng(0), np.unique(groups)
+    rng = np.random.default_rng(0)
+    names = np.unique(groups)
     members = [np.flatnonzero(groups == name) for name in names]
     draws = [
-        value(np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])) for _ in range(DRAWS)
+        value(np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))]))
+        for _ in range(DRAWS)
     ]
     return [value(np.arange(len(groups))), *map(float, np.nanpercentile(draws, [2.5, 97.5]))]
 
@@ -120,8 +127,19 @@ def fitted(data: Touches, fit: Array, val: Array, options: TrustOptions) -> Line
     (model,) = heads.linear_path(data.x[rows], numbers[rows], (options.penalty,))
     head = heads.linear_head(model, names, label="", pooling="class", frames=1, fingerprint="")
     folds = splits.group_folds(rows, data.groups, numbers, splits.FOLDS)
-    return heads.calibrate(head, data.x, data.y, data.groups, data.sensors, rows, np.flatnonzero(val), folds,
-                           options.penalty, coverage=options.coverage, false_alarms=options.false_alarms)  # fmt: skip
+    return heads.calibrate(
+        head,
+        data.x,
+        data.y,
+        data.groups,
+        data.sensors,
+        rows,
+        np.flatnonzero(val),
+        folds,
+        options.penalty,
+        coverage=options.coverage,
+        false_alarms=options.false_alarms,
+    )
 
 
 def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
@@ -134,69 +152,106 @@ def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
         assert head.calibration is not None
         counts.append(head.calibration.recordings)
         rows = np.flatnonzero(test & np.isin(data.y, head.classes))
-        seen, y = head.assess(data.x[rows]), data.y[rows]
+        seen = head.assess(data.x[rows])
+        y = data.y[rows]
         several = {
-            "groups": data.groups[rows], "right": seen.label == y, "p": seen.p.max(1), "novel": seen.novel,
-            "size": seen.in_set.sum(1), "sure": ~seen.abstains,
+            "groups": data.groups[rows],
+            "right": seen.label == y,
+            "p": seen.p.max(1),
+            "novel": seen.novel,
+            "size": seen.in_set.sum(1),
+            "sure": ~seen.abstains,
             "covered": seen.in_set[np.arange(len(rows)), np.searchsorted(head.classes, y)],
-        }  # fmt: skip
+        }
         for name, values in several.items():
             columns[name].append(values)
     whole = {name: np.concatenate(values) for name, values in columns.items()}
-    groups, right, error = whole["groups"], whole["right"], calibration_error
-    weights = 1 / np.unique(groups, return_counts=True)[1][np.unique(groups, return_inverse=True)[1]]
+    groups = whole["groups"]
+    right = whole["right"]
+    error = calibration_error
+    weights = (
+        1 / np.unique(groups, return_counts=True)[1][np.unique(groups, return_inverse=True)[1]]
+    )
 
-    def share(name: str) -> list[float]:  # a recording has the same weight, however many frames it has
+    def share(
+        name: str,
+    ) -> list[float]:  # a recording has the same weight, however many frames it has
         return over_groups(lambda i: float(np.average(whole[name][i], weights=weights[i])), groups)
 
     return {
-        "accuracy": share("right"), "coverage": share("covered"), "novel": share("novel"), "decided": share("sure"),
+        "accuracy": share("right"),
+        "coverage": share("covered"),
+        "novel": share("novel"),
+        "decided": share("sure"),
         "ece": over_groups(lambda i: error(whole["p"][i], right[i]), groups),
-        "size": float(whole["size"].mean()), "classes": len(np.unique(data.y)), "groups": len(np.unique(data.groups)),
+        "size": float(whole["size"].mean()),
+        "classes": len(np.unique(data.y)),
+        "groups": len(np.unique(data.groups)),
         "calibration_groups": float(np.mean(counts)),
-    }  # fmt: skip
+    }
 
 
 def classes_never_met(data: Touches, options: TrustOptions) -> dict[str, list[float]]:
     """Return the AUROC of the novelty, and of a low probability, for classes that are left out of the fit in turn."""
-    classes, parts = np.random.default_rng(0).permutation(np.unique(data.y)), []
+    classes = np.random.default_rng(0).permutation(np.unique(data.y))
+    parts = []
     for fold in range(options.held_out):
-        out, (fit, val, test) = np.isin(data.y, classes[fold :: options.held_out]), random_split(data.groups, fold)
+        out = np.isin(data.y, classes[fold :: options.held_out])
+        (fit, val, test) = random_split(data.groups, fold)
         head = fitted(data, fit & ~out, val & ~out, options)
-        seen, rows = head.assess(data.x), np.flatnonzero(test | out)
+        seen = head.assess(data.x)
+        rows = np.flatnonzero(test | out)
         parts.append((rows, out[rows], seen.novelty[rows], 1 - seen.p.max(1)[rows]))
 
     def area(column: int) -> Callable[[Array], float]:
         def mean(chosen: Array) -> float:
-            counts, areas = np.bincount(chosen, minlength=len(data.y)), []
+            counts = np.bincount(chosen, minlength=len(data.y))
+            areas = []
             for rows, new, *scores in parts:
-                times, score = counts[rows], scores[column]
+                times = counts[rows]
+                score = scores[column]
                 if times[new].any() and times[~new].any():
-                    areas.append(auroc(np.repeat(score[~new], times[~new]), np.repeat(score[new], times[new])))
+                    areas.append(
+                        auroc(
+                            np.repeat(score[~new], times[~new]), np.repeat(score[new], times[new])
+                        )
+                    )
             return float(np.mean(areas))
 
         return mean
 
-    return {name: over_groups(area(i), data.groups) for i, name in enumerate(("novelty", "low probability"))}
+    return {
+        name: over_groups(area(i), data.groups)
+        for i, name in enumerate(("novelty", "low probability"))
+    }
 
 
 def sensors_never_met(data: Touches, options: TrustOptions) -> dict[str, dict[str, Any]]:
     """Return the AUROC and the share called novel of each sensor that the head never met."""
     fit, val, test = random_split(data.groups, 0)
-    head, other, result = fitted(data, fit, val, options), read_arrays(options.strange or ""), {}
+    head = fitted(data, fit, val, options)
+    other = read_arrays(options.strange or "")
+    result = {}
     assert head.calibration is not None
     known = head.assess(data.x[test]).novelty
     for name in np.setdiff1d(other["key/sensor"], data.sensors):
         of_sensor = other["key/sensor"] == name
         score = head.calibration.novelty(head.scaled(other["features"][of_sensor]))
-        both, groups = np.concatenate([known, score]), [*data.groups[test], *other["key/sequence"][of_sensor]]
+        both = np.concatenate([known, score])
+        groups = [*data.groups[test], *other["key/sequence"][of_sensor]]
 
         def area(i: Array, both: Array = both) -> float:
             old, new = (both[i[(i < len(known)) == is_known]] for is_known in (True, False))
-            return auroc(old, new) if len(old) and len(new) else np.nan
+            if len(old) and len(new):
+                return auroc(old, new)
+            return np.nan
 
         novel = float((score > head.calibration.novelty_limit).mean())
-        result[str(name)] = {"auroc": over_groups(area, np.array(groups)), "novel": novel, "frames": len(score)}
+        result[str(name)] = {
+            "auroc": over_groups(area, np.array(groups)),
+            "novel": novel,
+            "frames": len(score),
+        }
     return result
 
 
@@ -206,15 +261,18 @@ def thinned(unit: health.UnitFrames) -> health.UnitFrames:
     return replace(unit, recordings=[recording[:3:2] for recording in unit.recordings[::step]])
 
 
-def health_record(units: Sequence[health.UnitFrames], gels: Mapping[str, list[Array]]) -> dict[str, Any]:
+def health_record(
+    units: Sequence[health.UnitFrames], gels: Mapping[str, list[Array]]
+) -> dict[str, Any]:
     """Return false alarms on the units, and {fault: [reported, made, undecided]} of faults made from each.
 
     `gels` are pictures of more untouched gels by sensor.
     """
     alarms = [
         f"{result.sensor} {result.unit}: {check.name} ({check.value})"
-        for result in health.check_units(units, gels) for check in result.faults
-    ]  # fmt: skip
+        for result in health.check_units(units, gels)
+        for check in result.faults
+    ]
     units = [thinned(unit) for unit in units]
     counts = {fault: [0, 0, 0] for fault in FAULTS}
     for unit in units:
@@ -236,18 +294,26 @@ def health_record(units: Sequence[health.UnitFrames], gels: Mapping[str, list[Ar
 def run(options: TrustOptions) -> int:
     """Measure, store and print a record."""
     if options.health:
-        units = [unit for unit in health.read_units(manifests.read(options.data))
-                 if not any(word in unit.unit for word in options.skip_units)]  # fmt: skip
+        units = [
+            unit
+            for unit in health.read_units(manifests.read(options.data))
+            if not any(word in unit.unit for word in options.skip_units)
+        ]
         real = [sensor for sensor in SENSORS.values() if options.package and sensor.real]
         gels = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
-        kind, record = "health", health_record(units, gels)
+        kind = "health"
+        record = health_record(units, gels)
     elif options.features is not None:
         data = read_touches(options)
-        kind, record = "trust", calibration_record(data, options) | {
-            "asked": options.coverage, "false_alarms": options.false_alarms, "repeats": options.repeats,
-            "label": options.label, "never_met": classes_never_met(data, options) if options.held_out else {},
+        kind = "trust"
+        record = calibration_record(data, options) | {
+            "asked": options.coverage,
+            "false_alarms": options.false_alarms,
+            "repeats": options.repeats,
+            "label": options.label,
+            "never_met": classes_never_met(data, options) if options.held_out else {},
             "sensors": {} if options.strange is None else sensors_never_met(data, options),
-        }  # fmt: skip
+        }
     else:
         raise UserError("Give --features, by anytouch embed, or --health.")
     write_record(options.out, f"{kind}/{options.name}", record)

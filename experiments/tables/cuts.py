@@ -14,11 +14,18 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.prepare.contact import contact_scores, mark_contact
 from anytouch_jax.evaluate.retrieval import deepest_rows
 
-MADE, WHOLE, STATIC = "manifest.parquet", "contact.parquet", "static.parquet"
+MADE = "manifest.parquet"
+WHOLE = "contact.parquet"
+STATIC = "static.parquet"
 SPLITS = ("train", "val", "test")
 
 
-def cut(table: Manifest, rows: np.ndarray, path: Path, change: Callable[[pa.Table], pa.Table] | None = None) -> Path:
+def cut(
+    table: Manifest,
+    rows: np.ndarray,
+    path: Path,
+    change: Callable[[pa.Table], pa.Table] | None = None,
+) -> Path:
     """Write `rows` of a manifest, changed, as another manifest next to it."""
     part = table.table.take(pa.array(np.sort(rows)))
     columns = (change(part) if change else part).to_pydict()
@@ -35,7 +42,8 @@ def mark(folder: Path, share: float) -> None:
 def cut_all(folder: Path) -> None:
     """The cuts of a data set: <sensor>.parquet to train on, static.parquet."""
     table = manifests.read(folder / WHOLE)
-    sensors, splits = table.text_column("sensor"), table.text_column("split")
+    sensors = table.text_column("sensor")
+    splits = table.text_column("split")
     for sensor in np.unique(sensors):
         rows = np.flatnonzero((sensors == sensor) & np.isin(splits, SPLITS))
         cut(table, rows, folder / f"{sensor}.parquet", lock)
@@ -56,4 +64,6 @@ def _content_hash(path: Path, changed: int) -> str:
 
 def lock(part: pa.Table) -> pa.Table:
     """Return the rows without `touch`: no touch is shared with another sensor."""
-    return part.set_column(part.column_names.index("touch"), "touch", pa.nulls(part.num_rows, pa.string()))
+    return part.set_column(
+        part.column_names.index("touch"), "touch", pa.nulls(part.num_rows, pa.string())
+    )

@@ -40,14 +40,17 @@ def check_results(leaves: Sequence[Leaf], out: Path) -> None:
     """Raise UserError where `out` has results of these questions by another simulator or other settings."""
     if not leaves:
         return
-    size, questions = leaves[0].size, {leaf.question for leaf in leaves}
+    size = leaves[0].size
+    questions = {leaf.question for leaf in leaves}
     ours = {"simulator": plan.simulator(), "settings": plan.settings(size)}
     for theirs in read_records(out).values():
         if theirs.get("question") not in questions:
             continue
         if simulated(theirs) != ours["simulator"]:
             what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"
-        elif wrong := differences(compared([theirs, ours | {"scoring": plan.scoring(theirs["question"])}])):
+        elif wrong := differences(
+            compared([theirs, ours | {"scoring": plan.scoring(theirs["question"])}])
+        ):
             what = f"other settings than these runs ({wrong})"
         else:
             continue
@@ -58,13 +61,19 @@ def check_results(leaves: Sequence[Leaf], out: Path) -> None:
 
 
 def execute(
-    leaves: Sequence[Leaf], work: Work, out: Path, *, log: Callable[[str], None] = print,
+    leaves: Sequence[Leaf],
+    work: Work,
+    out: Path,
+    *,
+    log: Callable[[str], None] = print,
     pause: Callable[[float], None] = time.sleep,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """Make the missing runs in order, a record each. A run that fails is logged, and the others go on."""
-    result, waiting = Outcome([], [], {}), list(leaves)
+    result = Outcome([], [], {})
+    waiting = list(leaves)
     while waiting:
-        later: list[Leaf] = []  # another process works on these, or on what they need
+        # another process works on these, or on what they need
+        later: list[Leaf] = []
         for leaf in waiting:
             if is_done(leaf, out):
                 result.kept.append(leaf.key)
@@ -73,7 +82,11 @@ def execute(
                 try:
                     done = mine and (is_done(leaf, out) or _make(leaf, work, out, log))
                 except (UserError, RuntimeError, MemoryError) as error:  # XLA's are RuntimeErrors
-                    what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+                    what = (
+                        str(error)
+                        if isinstance(error, UserError)
+                        else f"{type(error).__name__}: {error}"
+                    )
                     log(f"{leaf.key} failed: {what}")
                     result.failed[leaf.key] = what
                     continue
@@ -110,6 +123,10 @@ def _make(leaf: Leaf, work: Work, out: Path, log: Callable[[str], None]) -> bool
                 work.train(training)
     log(leaf.key)
     about: dict[str, Any] = {"question": leaf.question, "name": leaf.name, "seed": leaf.seed}
-    about |= {"identity": leaf.identity, "simulator": plan.simulator(), "scoring": plan.scoring(leaf.question)}
+    about |= {
+        "identity": leaf.identity,
+        "simulator": plan.simulator(),
+        "scoring": plan.scoring(leaf.question),
+    }
     write_record(out, leaf.key, about | work.score(leaf))
     return True

@@ -13,7 +13,12 @@ TABLE1: dict[str, Row] = {
     "gelsight+gelslim+digit+gelsight_mini": (79.70, 79.40, 48.75, 75.66),
 }
 # Table 4, pouring: mean error with the encoder fine-tuned and frozen; less is better.
-TABLE4: dict[str, Row] = {"none": (5.22, 49.1), "t3": (2.33, 9.74), "static": (2.45, 9.60), "anytouch": (1.56, 8.22)}
+TABLE4: dict[str, Row] = {
+    "none": (5.22, 49.1),
+    "t3": (2.33, 9.74),
+    "static": (2.45, 9.60),
+    "anytouch": (1.56, 8.22),
+}
 # Table 6; columns of Table 1.
 TABLE6: dict[str, Row] = {
     "anytouch": (80.82, 80.53, 49.62, 76.02),

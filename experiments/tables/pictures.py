@@ -33,7 +33,8 @@ def q2(runs: Sequence[Run], path: Path) -> None:
     sensors = sorted({point["sensor"] for name, _ in stages for point in of[name]})
     touches = sorted({point["touch"] for name, _ in stages for point in of[name]})
     colours = {
-        touch: f"C{i}" if i < 10 else ("#222222", "#b5b35c")[i - 10] for i, touch in enumerate(touches[:COLOURED])
+        touch: f"C{i}" if i < 10 else ("#222222", "#b5b35c")[i - 10]
+        for i, touch in enumerate(touches[:COLOURED])
     }
     for axis, (name, text) in zip(axes, stages, strict=True):
         for touch in touches:
@@ -43,12 +44,26 @@ def q2(runs: Sequence[Run], path: Path) -> None:
             colour = colours.get(touch, "#c8c8c8")
             ring = [*mine, mine[0]]
             if touch in colours:
-                axis.plot([p["x"] for p in ring], [p["y"] for p in ring], "--", color=colour, linewidth=0.7, zorder=1)
+                axis.plot(
+                    [p["x"] for p in ring],
+                    [p["y"] for p in ring],
+                    "--",
+                    color=colour,
+                    linewidth=0.7,
+                    zorder=1,
+                )
             for point in mine:
-                style = {"color": colour, "marker": MARKS[sensors.index(point["sensor"])], "linewidths": 0}
+                style = {
+                    "color": colour,
+                    "marker": MARKS[sensors.index(point["sensor"])],
+                    "linewidths": 0,
+                }
                 axis.scatter(point["x"], point["y"], s=26, zorder=2 + (touch in colours), **style)
         axis.set(title=text, xticks=[], yticks=[])
-    marks = [axes[-1].scatter([], [], s=30, color="#555555", marker=MARKS[i]) for i in range(len(sensors))]
+    marks = [
+        axes[-1].scatter([], [], s=30, color="#555555", marker=MARKS[i])
+        for i in range(len(sensors))
+    ]
     legend = {"ncols": len(sensors), "frameon": False, "title": f"seed {min(seeds)}"}
     figure.legend(marks, sensors, loc="outside lower center", **legend)
     write_figure(path, figure)

@@ -22,10 +22,12 @@ from typing import Any, Literal
 from anytouch_jax.config import UNIVERSAL, Config, Stack, preset, presets
 from anytouch_jax.config.parsing import Count
 
-SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")  # in the order in which Table 1 adds them
+# in the order in which Table 1 adds them
+SENSORS = ("gelsight", "gelslim", "digit", "gelsight_mini")
 UNSEEN = "duragel"
 ALIGNED = ("fine", "coarse")
-STACK, DECODER = Stack(128, 2, 4, 512), Stack(128, 2, 4, 512)
+STACK = Stack(128, 2, 4, 512)
+DECODER = Stack(128, 2, 4, 512)
 LABELS = ("name", "seeds")  # fields of a size that no single run hangs on
 # Versions of how a question is scored, 1 where it is not named. 2: contact frames are those with force.
 SCORING = dict.fromkeys(("q1", "q3", "ablations"), 2)
@@ -81,9 +83,25 @@ class Size:
 
 FULL = Size()
 QUICK = Size(
-    "quick", own=48, fine=24, coarse=24, other=36, objects=24, pixels=64, image=56, steps1=6, batch1=16, steps2=4,
-    batch2=8, seeds=(0,), refits=2, max_rows=300, embed=32, stack=Stack(32, 2, 2, 64), decoder=Stack(16, 1, 2, 32),
-)  # fmt: skip
+    "quick",
+    own=48,
+    fine=24,
+    coarse=24,
+    other=36,
+    objects=24,
+    pixels=64,
+    image=56,
+    steps1=6,
+    batch1=16,
+    steps2=4,
+    batch2=8,
+    seeds=(0,),
+    refits=2,
+    max_rows=300,
+    embed=32,
+    stack=Stack(32, 2, 2, 64),
+    decoder=Stack(16, 1, 2, 32),
+)
 
 
 @dataclass(frozen=True)
@@ -145,7 +163,9 @@ class Leaf:
     @property
     def trainings(self) -> tuple[Training, ...]:
         """In the order in which they must be done."""
-        return self.model.chain if self.model else ()
+        if self.model:
+            return self.model.chain
+        return ()
 
     @cached_property
     def identity(self) -> str:
@@ -177,8 +197,12 @@ def chosen(config: Any) -> Any:
     """The settings of a configuration that are not the default: a later version's new default is no other training."""
     if not dataclasses.is_dataclass(config):
         return config
-    fields = {field.name: (getattr(config, field.name), field) for field in dataclasses.fields(config)}
-    return {name: chosen(value) for name, (value, field) in fields.items() if value != field.default}
+    fields = {
+        field.name: (getattr(config, field.name), field) for field in dataclasses.fields(config)
+    }
+    return {
+        name: chosen(value) for name, (value, field) in fields.items() if value != field.default
+    }
 
 
 def scenes(size: Size) -> tuple[Scenes, ...]:
@@ -193,7 +217,7 @@ def scenes(size: Size) -> tuple[Scenes, ...]:
 
 def training(
     size: Size, recipe: str, seed: int, *, sensors: Sequence[str] = SENSORS, aligned: bool = True
-) -> Training:  # fmt: skip
+) -> Training:
     """Return the last stage of a recipe (`anytouch_jax.config.presets`) on the data of `sensors`.
 
     `aligned` adds the touches that several sensors share.
@@ -208,28 +232,51 @@ def training(
     return last
 
 
-def _config(size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests: tuple[str, ...]) -> Config:
+def _config(
+    size: Size, stage: Any, seed: int, sensors: Sequence[str], manifests: tuple[str, ...]
+) -> Config:
     config = preset("tiny", stage=stage)
     steps, batch, rate = (
-        (size.steps1, size.batch1, size.rate1) if stage == 1 else (size.steps2, size.batch2, size.rate2)
+        (size.steps1, size.batch1, size.rate1)
+        if stage == 1
+        else (size.steps2, size.batch2, size.rate2)
     )
     model = replace(
-        config.model, sensors=(*sensors, UNIVERSAL), image_size=size.image, embed=size.embed, touch=size.stack,
+        config.model,
+        sensors=(*sensors, UNIVERSAL),
+        image_size=size.image,
+        embed=size.embed,
+        touch=size.stack,
         decoder=size.decoder,
-    )  # fmt: skip
+    )
     objective = config.objective
     if stage == 2:
         text = model.text and replace(model.text, stack=size.stack)
-        model = replace(model, text=text, image=size.stack, temperature=size.temperature, match_head=size.match_head)
+        model = replace(
+            model,
+            text=text,
+            image=size.stack,
+            temperature=size.temperature,
+            match_head=size.match_head,
+        )
         objective = replace(objective, match_weight=size.match_weight, match_keep=size.match_keep)
     data = replace(
-        config.data, manifests=manifests, batch_size=batch, background=size.background, jitter=(0, 0, 0, 0),
-        contact_only=True, negatives=size.negatives if stage == 2 else "any",
-    )  # fmt: skip
+        config.data,
+        manifests=manifests,
+        batch_size=batch,
+        background=size.background,
+        jitter=(0, 0, 0, 0),
+        contact_only=True,
+        negatives=size.negatives if stage == 2 else "any",
+    )
     return replace(
-        config, model=model, objective=objective, data=data, optim=replace(config.optim, learning_rate=rate),
+        config,
+        model=model,
+        objective=objective,
+        data=data,
+        optim=replace(config.optim, learning_rate=rate),
         run=replace(config.run, seed=seed, steps=steps, save_every=100, keep=1, figure_every=0),
-    )  # fmt: skip
+    )
 
 
 def leaves(size: Size) -> list[Leaf]:
@@ -241,14 +288,20 @@ def leaves(size: Size) -> list[Leaf]:
     ]
 
 
-def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, Training | None, bool]]:
+def _of_seed(
+    size: Size, seed: int, *, first: bool
+) -> Iterator[tuple[str, str, Training | None, bool]]:
     """(question, name, model, tower) of one seed; what makes no claim is run with the first seed alone."""
 
     def own(recipe: str, **settings: Any) -> Training:
         return training(size, recipe, seed, **settings)
 
     whole = own("anytouch")
-    for name, recipe in (("masked", "no_stage2"), ("aligned", "no_matching"), ("matched", "anytouch")):
+    for name, recipe in (
+        ("masked", "no_stage2"),
+        ("aligned", "no_matching"),
+        ("matched", "anytouch"),
+    ):
         yield "q2", name, own(recipe), False
     for name in ("unitouch", "tlv_link", "t3", "static_only", "anytouch"):
         yield "q3", name, own(name), False
@@ -266,10 +319,18 @@ def _of_seed(size: Size, seed: int, *, first: bool) -> Iterator[tuple[str, str, 
         name = "+".join(SENSORS[:count])
         yield "q1", name, own("no_matching", sensors=SENSORS[:count], aligned=False), False
     if first:
-        paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0, negatives="any")  # the paper's
+        # the paper's
+        paired = replace(size, match_head="mlp", match_weight=1.0, match_keep=1.0, negatives="any")
         yield "q2", "matched_mlp", training(paired, "anytouch", seed), False
 
 
 ABLATIONS = (
-    "no_text", "no_vision", "no_text_aligned", "no_stage1", "no_stage2", "no_matching", "no_dynamic", "no_universal",
-)  # fmt: skip
+    "no_text",
+    "no_vision",
+    "no_text_aligned",
+    "no_stage1",
+    "no_stage2",
+    "no_matching",
+    "no_dynamic",
+    "no_universal",
+)

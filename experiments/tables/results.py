@@ -32,7 +32,10 @@ class Run:
         """The row of a column, if it was measured."""
         for one in self.about["rows"]:
             key = one["view"], one["task"], one["metric"], one["protocol"]
-            if key == (column.view, column.task, column.metric, protocol) and one["mean"] is not None:
+            if (
+                key == (column.view, column.task, column.metric, protocol)
+                and one["mean"] is not None
+            ):
                 return one  # type: ignore[no-any-return]
         return None
 
@@ -53,7 +56,9 @@ def read(path: Path) -> list[Run]:
         try:
             runs.append(Run(about["question"], about["name"], int(about["seed"]), about))
         except (ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{path}: {key} is no run of the matrix ({error!r}). Remove its line.") from None
+            raise UserError(
+                f"{path}: {key} is no run of the matrix ({error!r}). Remove its line."
+            ) from None
     return runs
 
 
@@ -63,7 +68,9 @@ def noted(path: Path) -> dict[str, Any]:
         result = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return result if isinstance(result, dict) else {}
+    if isinstance(result, dict):
+        return result
+    return {}
 
 
 def simulated(about: Mapping[str, Any]) -> int:
@@ -81,7 +88,10 @@ def compared(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [
         {"simulator version": simulated(about), "scoring version": about.get("scoring", 1)}
         | {name: about["settings"].get(name, NOT_NOTED) for name in names}
-        | {f"data set {name} of seed {about.get('seed')}": value[:8] for name, value in about.get("data", {}).items()}
+        | {
+            f"data set {name} of seed {about.get('seed')}": value[:8]
+            for name, value in about.get("data", {}).items()
+        }
         for about in records
     ]
 
@@ -95,9 +105,14 @@ class Matrix:
 
     def seeds(self, name: str, columns: Sequence[Column]) -> Seeds:
         """Return {seed: mean over columns of one unit}, for seeds that have all of them."""
-        found = {run.seed: [run.row(column) for column in columns] for run in self.runs if run.name == name}
+        found = {
+            run.seed: [run.row(column) for column in columns]
+            for run in self.runs
+            if run.name == name
+        }
         return {
-            seed: columns[0].factor * float(np.mean([row["mean"] for row in rows if row is not None]))
+            seed: columns[0].factor
+            * float(np.mean([row["mean"] for row in rows if row is not None]))
             for seed, rows in sorted(found.items())
             if None not in rows
         }
@@ -105,10 +120,15 @@ class Matrix:
     def value(self, name: str, columns: Sequence[Column]) -> Value | None:
         """Return the score of a model; what is not trained has one value and no interval."""
         several = [*self.seeds(name, columns).values()]
-        return (Value(several[0]) if name in UNSEEDED else over_seeds(several)) if several else None
+        if several:
+            return Value(several[0]) if name in UNSEEDED else over_seeds(several)
+        return None
 
     def change(self, first: str, second: str, columns: Sequence[Column]) -> Value | None:
         """Return the score of `first` minus that of `second`, seed by seed."""
-        a, b = self.seeds(first, columns), self.seeds(second, columns)
+        a = self.seeds(first, columns)
+        b = self.seeds(second, columns)
         b = dict.fromkeys(a, next(iter(b.values()))) if second in UNSEEDED and b else b
-        return shared_difference(a, b) if first != second else None
+        if first != second:
+            return shared_difference(a, b)
+        return None

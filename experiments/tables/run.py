@@ -29,12 +29,22 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def options(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--plan", action="store_true", help="print every run and stop")
-    parser.add_argument("--render", action="store_true", help="only make the pages from matrix.jsonl")
+    parser.add_argument(
+        "--render", action="store_true", help="only make the pages from matrix.jsonl"
+    )
     parser.add_argument("--quick", action="store_true", help="toy sizes: does it work?")
     parser.add_argument("--only", nargs="+", help="only these questions")
-    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=N", help="sizes: steps1=400 own=600 seeds=[0,1]")
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        default=[],
+        metavar="NAME=N",
+        help="sizes: steps1=400 own=600 seeds=[0,1]",
+    )
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
     about = "folder of the pages and of matrix.jsonl (default: experiments/results; with --quick or --set in --work)"
     parser.add_argument("--out", type=Path, help=about)
@@ -54,7 +64,9 @@ def size_of(quick: bool, changes: Sequence[str]) -> plan.Size:
     size = read_value(plan.Size, values, "--set")
     check(size, "--set ")
     same = quick or plan.settings(size) == plan.settings(plan.FULL)
-    return size if same else dataclasses.replace(size, name="changed")
+    if same:
+        return size
+    return dataclasses.replace(size, name="changed")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -66,7 +78,9 @@ def run(asked: argparse.Namespace) -> int:
     """Do what the command line asks for. Raises UserError for what is not there."""
     leaves = plan.leaves(size_of(asked.quick, asked.set))
     folder = asked.work or ROOT / "runs" / ("matrix-quick" if asked.quick else "matrix")
-    out = asked.out or (folder / "results" if asked.quick or asked.set else ROOT / "experiments" / "results")
+    out = asked.out or (
+        folder / "results" if asked.quick or asked.set else ROOT / "experiments" / "results"
+    )
     known = list(dict.fromkeys(leaf.question for leaf in leaves))
     if wrong := sorted(set(asked.only or ()) - set(known)):
         raise UserError(f"there is no question {wrong[0]!r}; choose among {', '.join(known)}")
@@ -90,10 +104,13 @@ def run(asked: argparse.Namespace) -> int:
         for name, error in failed.items():
             print(f"failed: {name}: {error}", file=sys.stderr)
     print(*pages.write(out), sep="\n")
-    return 1 if failed else 0
+    if failed:
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
     if "--quick" in sys.argv:
-        jax.config.update("jax_disable_most_optimizations", True)  # a toy compiles for longer than it runs
+        # a toy compiles for longer than it runs
+        jax.config.update("jax_disable_most_optimizations", True)
     sys.exit(main())

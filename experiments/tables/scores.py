@@ -36,7 +36,8 @@ STATIC = ("material", "roughness", "hardness")
 FORM = "indenter"  # no caption names it
 DYNAMIC = ("slip", "force", "twist", "slide")
 BOTH = "published"  # reports both protocols
-PIXELS, CONTACT = "pixels", "contact"
+PIXELS = "pixels"
+CONTACT = "contact"
 SHOWN = ("gelsight", "digit", "gelsight_mini")  # of the t-SNE, as the paper shows three
 TOUCHES = 30
 
@@ -51,7 +52,9 @@ def encoder_of(leaf: Leaf, work: Work) -> Encoder:
     if leaf.model is None:
         return random_encoder(untrained(leaf), leaf.seed)
     run = work.run_of(leaf.model)
-    return image_tower_encoder(run) if leaf.tower else load_encoder(run)
+    if leaf.tower:
+        return image_tower_encoder(run)
+    return load_encoder(run)
 
 
 def untrained(leaf: Leaf) -> Config:
@@ -64,7 +67,13 @@ def quiet(_: str) -> None:
 
 
 def _probes(
-    leaf: Leaf, work: Work, name: str, tasks: Sequence[str], view: str, encoder: Encoder | None, **options: Any
+    leaf: Leaf,
+    work: Work,
+    name: str,
+    tasks: Sequence[str],
+    view: str,
+    encoder: Encoder | None,
+    **options: Any,
 ) -> list[Row]:
     """Results of `probe_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
     dataset, _, file = name.partition("/")
@@ -76,10 +85,15 @@ def _probes(
     else:
         source = FeatureSource("encoder", encoder_features(encoder, table, folder=cache), encoder)
     results = probe_tasks([source], table, tasks, controls=False, log=quiet, **shared)["results"]
-    return [{"view": view} | {key: value for key, value in one.items() if key != "features"} for one in results]
+    return [
+        {"view": view} | {key: value for key, value in one.items() if key != "features"}
+        for one in results
+    ]
 
 
-def _four_columns(leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)) -> list[Row]:
+def _four_columns(
+    leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)
+) -> list[Row]:
     """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor (OF 1.0, OF 2.0).
 
     Of each the material and the form of the indenter; of the first also `tasks`.
@@ -114,7 +128,12 @@ def _ablations(leaf: Leaf, work: Work) -> dict[str, Any]:
 def _dynamic(leaf: Leaf, work: Work) -> list[Row]:
     """The dynamic tasks, from clips."""
     encoder = None if leaf.name == PIXELS else encoder_of(leaf, work)
-    options = {"train_sensors": plan.SENSORS, "test_sensors": plan.SENSORS, "protocol": BOTH, "frames": 3}
+    options = {
+        "train_sensors": plan.SENSORS,
+        "test_sensors": plan.SENSORS,
+        "protocol": BOTH,
+        "frames": 3,
+    }
     return _probes(leaf, work, f"own/{cuts.WHOLE}", DYNAMIC, "clips", encoder, **options)
 
 
@@ -132,46 +151,84 @@ def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
         encoder = encoder_of(leaf, work)
         found = {"class token": embed_rows(encoder, table, rows, log=quiet)[1]}
     metric: retrieval.Metric = "euclidean" if leaf.name == CONTACT else "cosine"
-    results = [row for view, values in found.items() for row in _space(table, rows, values, view, metric)]
-    return {"rows": results, "points": _points(table, rows, found["class token"], leaf.seed), "data": ["own"]}
+    results = [
+        row for view, values in found.items() for row in _space(table, rows, values, view, metric)
+    ]
+    return {
+        "rows": results,
+        "points": _points(table, rows, found["class token"], leaf.seed),
+        "data": ["own"],
+    }
 
 
-def _space(table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: retrieval.Metric) -> list[Row]:
-    sensors, touch = table.text_column("sensor")[rows], table.codes("touch", own=True)[rows]
+def _space(
+    table: Any, rows: np.ndarray, values: np.ndarray, view: str, metric: retrieval.Metric
+) -> list[Row]:
+    sensors = table.text_column("sensor")[rows]
+    touch = table.codes("touch", own=True)[rows]
     about = plots.describe(values, sensors, table.text_column("object")[rows], touch)
     fewest = min(len(np.unique(touch[sensors == one])) for one in np.unique(sensors))
     pooled = retrieval.cross_sensor_retrieval(
-        table, {view: values}, rows, gallery_size=min(retrieval.GALLERY, fewest), centre=(False,),
+        table,
+        {view: values},
+        rows,
+        gallery_size=min(retrieval.GALLERY, fewest),
+        centre=(False,),
         metrics={view: metric},
-    )[-1]  # fmt: skip
+    )[-1]
     plain = {
-        "alignment": about.alignment, "uniformity": about.uniformity,
-        "silhouette by sensor": about.silhouette_sensor, "silhouette by object": about.silhouette_object,
-    }  # fmt: skip
+        "alignment": about.alignment,
+        "uniformity": about.uniformity,
+        "silhouette by sensor": about.silhouette_sensor,
+        "silhouette by object": about.silhouette_object,
+    }
     shared = {"view": view, "protocol": "honest", "test": len(rows)}
-    found = [shared | {"task": name, "metric": name, "mean": value} for name, value in plain.items()]
+    found = [
+        shared | {"task": name, "metric": name, "mean": value} for name, value in plain.items()
+    ]
     for name, mean, low, high, chance in (
         ("top-1", pooled.top1, pooled.low, pooled.high, pooled.chance1),
         ("top-5", pooled.top5, pooled.top5_low, pooled.top5_high, pooled.chance5),
     ):
-        about_it = {"task": name, "metric": "share", "mean": mean, "low": low, "high": high, "chance": chance}
-        found.append(shared | about_it | {"gallery": pooled.gallery, "of": fewest, "nearness": pooled.nearness})
+        about_it = {
+            "task": name,
+            "metric": "share",
+            "mean": mean,
+            "low": low,
+            "high": high,
+            "chance": chance,
+        }
+        found.append(
+            shared
+            | about_it
+            | {"gallery": pooled.gallery, "of": fewest, "nearness": pooled.nearness}
+        )
     return found
 
 
 def _points(table: Any, rows: np.ndarray, values: np.ndarray, seed: int) -> list[Row]:
     """The t-SNE of some touches by three sensors: {x, y, sensor, touch} of each."""
-    sensors, touch = table.text_column("sensor")[rows], table.codes("touch", own=True)[rows]
+    sensors = table.text_column("sensor")[rows]
+    touch = table.codes("touch", own=True)[rows]
     names = np.unique(touch)
-    some = np.random.default_rng(0).permutation(names)[:TOUCHES]  # the same touches for all
+    # the same touches for all
+    some = np.random.default_rng(0).permutation(names)[:TOUCHES]
     keep = np.isin(sensors, SHOWN) & np.isin(touch, some)
     places = plots.tsne(values[keep], seed=seed)
     return [
-        {"x": round(float(x), 3), "y": round(float(y), 3), "sensor": str(sensor), "touch": int(code)}
+        {
+            "x": round(float(x), 3),
+            "y": round(float(y), 3),
+            "sensor": str(sensor),
+            "touch": int(code),
+        }
         for (x, y), sensor, code in zip(places, sensors[keep], touch[keep], strict=True)
     ]
 
 
 _OF: Mapping[str, Callable[[Leaf, Work], dict[str, Any]]] = {
-    "q1": _q1, "q2": _q2, "q3": _q3, "ablations": _ablations,
-}  # fmt: skip
+    "q1": _q1,
+    "q2": _q2,
+    "q3": _q3,
+    "ablations": _ablations,
+}

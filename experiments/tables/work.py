@@ -34,14 +34,16 @@ from experiments.tables.plan import Leaf, Scenes, Size, Training
 from experiments.tables.results import noted
 
 Log = Callable[[str], None]
-DONE, BEGUN = "done.json", "begun.json"
+DONE = "done.json"
+BEGUN = "begun.json"
 
 
 class Work:
     """Data sets and runs in `folder`."""
 
     def __init__(self, folder: Path, *, log: Log = print) -> None:
-        self.folder, self.log = folder, log
+        self.folder = folder
+        self.log = log
 
     def ready(self, leaf: Leaf) -> set[str]:
         """Return names of the finished data sets and keys of the finished trainings."""
@@ -65,11 +67,14 @@ class Work:
 
     def make(self, one: Scenes, size: Size) -> None:
         check_objects(size)
-        start, folder = time.perf_counter(), self.folder / one.name
+        start = time.perf_counter()
+        folder = self.folder / one.name
         simulate(_simulated(one, size), folder)
         cuts.mark(folder, size.contact)
         cuts.cut_all(folder)
-        self._finish(folder, {"seconds": round(time.perf_counter() - start, 1), "of": _of(one, size)})
+        self._finish(
+            folder, {"seconds": round(time.perf_counter() - start, 1), "of": _of(one, size)}
+        )
 
     def made(self, one: Scenes, size: Size) -> bool:
         """Whether a data set is there, and of this size and this simulator."""
@@ -86,13 +91,19 @@ class Work:
         return {name: content_hash(self.manifest(name)) for name in one.manifests}
 
     def train(self, one: Training) -> None:
-        start, run, of = time.perf_counter(), self.run_of(one), self._contents(one)
+        start = time.perf_counter()
+        run = self.run_of(one)
+        of = self._contents(one)
         before = noted(run / BEGUN) or noted(run / DONE)
         if before.get("of", of) != of:
             self.log(f"  {run.name} was trained on other data: it starts again")
             shutil.rmtree(run)
             before = {}
-        about = {"of": of, "parts": before.get("parts", 0) + 1, "seconds": before.get("seconds", 0.0)}
+        about = {
+            "of": of,
+            "parts": before.get("parts", 0) + 1,
+            "seconds": before.get("seconds", 0.0),
+        }
         run.mkdir(parents=True, exist_ok=True)
         atomic_write(run / BEGUN, json.dumps(about) + "\n")
         init = self.run_of(one.init) if one.init else None
@@ -132,18 +143,30 @@ class Work:
         start = time.perf_counter()
         outcome = scores.score(leaf, self)
         self._forget()
-        trained, data = [], {name: content_hash(self.manifest(name)) for name in outcome.pop("data")}
+        trained = []
+        data = {name: content_hash(self.manifest(name)) for name in outcome.pop("data")}
         for one in leaf.trainings:
             about = noted(self.run_of(one) / DONE)
-            data |= about.pop("of")  # what it learned from, whatever is there now
-            of = {"key": one.key, "stage": one.config.stage, "config": json.loads(to_json(one.config))}
+            # what it learned from, whatever is there now
+            data |= about.pop("of")
+            of = {
+                "key": one.key,
+                "stage": one.config.stage,
+                "config": json.loads(to_json(one.config)),
+            }
             trained.append(of | about)
         return {
-            "size": leaf.size.name, "settings": dataclasses.asdict(leaf.size), "trained": trained,
-            "untrained": None if trained or leaf.name == scores.PIXELS else json.loads(to_json(scores.untrained(leaf))),
-            "data": dict(sorted(data.items())), "version": anytouch_jax.__version__,
-            "machine": machine.describe().sentence(), "seconds": round(time.perf_counter() - start, 1),
-        } | outcome  # fmt: skip
+            "size": leaf.size.name,
+            "settings": dataclasses.asdict(leaf.size),
+            "trained": trained,
+            "untrained": None
+            if trained or leaf.name == scores.PIXELS
+            else json.loads(to_json(scores.untrained(leaf))),
+            "data": dict(sorted(data.items())),
+            "version": anytouch_jax.__version__,
+            "machine": machine.describe().sentence(),
+            "seconds": round(time.perf_counter() - start, 1),
+        } | outcome
 
     def _finish(self, folder: Path, about: dict[str, Any]) -> None:
         atomic_write(folder / DONE, json.dumps(about) + "\n")
@@ -176,9 +199,16 @@ def check_objects(size: Size) -> None:
 
 def _simulated(one: Scenes, size: Size) -> Simulated:
     return Simulated(
-        touches=one.touches, sensors=one.sensors, seed=one.seed, grade=one.grade, frames=size.frames,
-        objects=min(size.objects, one.touches), held_out=one.held_out, size=size.pixels, first=one.first,
-    )  # fmt: skip
+        touches=one.touches,
+        sensors=one.sensors,
+        seed=one.seed,
+        grade=one.grade,
+        frames=size.frames,
+        objects=min(size.objects, one.touches),
+        held_out=one.held_out,
+        size=size.pixels,
+        first=one.first,
+    )
 
 
 def _of(one: Scenes, size: Size) -> str:

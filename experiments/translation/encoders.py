@@ -34,7 +34,10 @@ def trainings(size: Size, seed: int) -> dict[str, Training]:
     """Return AnyTouch, its stage 1, and T3-style, by name."""
     whole, t3 = (plan.training(size, recipe, seed) for recipe in ("anytouch", "t3"))
     assert whole.init is not None
-    return {name: reduced(one) for name, one in (("anytouch", whole), ("stage1", whole.init), ("t3", t3))}
+    return {
+        name: reduced(one)
+        for name, one in (("anytouch", whole), ("stage1", whole.init), ("t3", t3))
+    }
 
 
 def reduced(one: Training) -> Training:

@@ -35,12 +35,13 @@ from experiments.translation.networks import (
     UNet,
     halved,
     thumbnail_side,
-)  # fmt: skip
+)
 
 GENERATOR = "generator.safetensors"
 
 Params = dict[str, Any]
-_GREY = (0, 128, 255)  # least, middle and most of a touch less its gel (`data.transforms.subtract_background`)
+# least, middle and most of a touch less its gel (`data.transforms.subtract_background`)
+_GREY = (0, 128, 255)
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,9 @@ def features(design: Design, encoder: Params | None, images: Array) -> Array:
     if encoder is None:
         side = pixels.shape[1]
         times = side // thumbnail_side(side)
-        return halved(pixels, times).reshape(len(pixels), -1) if design.shape.field else pixels
+        if design.shape.field:
+            return halved(pixels, times).reshape(len(pixels), -1)
+        return pixels
     return encoded(design, encoder, pixels, design.source, design.shape.states)
 
 
@@ -121,7 +124,9 @@ def judged(design: Design, encoder: Params, pixels: Array, gel: Array | None) ->
     `gel`: the target's untouched gel, alike, which is taken off for an encoder that `subtracts`.
     """
     if gel is not None:
-        grey = (np.array(_GREY)[:, None, None, None, None] / 255 - np.array(IMAGENET_MEAN)) / np.array(IMAGENET_STD)
+        grey = (
+            np.array(_GREY)[:, None, None, None, None] / 255 - np.array(IMAGENET_MEAN)
+        ) / np.array(IMAGENET_STD)
         low, middle, high = grey.astype(np.float32)  # (1, 1, 1, 3)
         pixels = jnp.clip(pixels - gel[None] + middle, low, high)
     hidden = encoded(design, encoder, pixels, design.target)
@@ -141,7 +146,9 @@ def predict(design: Design, params: Params, x: Array) -> Array:
 def units(design: Design, fixed: Params) -> tuple[np.ndarray, np.ndarray]:
     """Mean and scale (channels,) by which targets are normalised: ImageNet's on 0..255, or the training fields' own."""
     if not design.shape.field:
-        return 255 * np.asarray(IMAGENET_MEAN, np.float32), 255 * np.asarray(IMAGENET_STD, np.float32)
+        return 255 * np.asarray(IMAGENET_MEAN, np.float32), 255 * np.asarray(
+            IMAGENET_STD, np.float32
+        )
     return np.asarray(fixed["unit_mean"]), np.asarray(fixed["unit_scale"])
 
 
@@ -156,7 +163,9 @@ class Generator:
     def __call__(self, images: np.ndarray) -> np.ndarray:
         mean, scale = units(self.design, self.params["fixed"])
         out = self.normalised(images) * scale + mean
-        return out if self.design.shape.field else np.rint(np.clip(out, 0, 255)).astype(np.uint8)
+        if self.design.shape.field:
+            return out
+        return np.rint(np.clip(out, 0, 255)).astype(np.uint8)
 
     def normalised(self, images: np.ndarray) -> np.ndarray:
         """The prediction f32 in the normalised units of the error. Raises UserError for images of another shape."""
@@ -176,7 +185,12 @@ class Generator:
 def nameless(design: Design) -> Design:
     """The design without what does not change its programs, so that these are compiled once."""
     name = None if design.encoder is None else "encoder"
-    return replace(design, encoder=name, fit=Fit(tune=design.fit.tune, adversarial=float(design.has_critic)), pairs=0)
+    return replace(
+        design,
+        encoder=name,
+        fit=Fit(tune=design.fit.tune, adversarial=float(design.has_critic)),
+        pairs=0,
+    )
 
 
 @lru_cache(maxsize=8)
@@ -214,5 +228,7 @@ def load(folder: str | Path) -> Generator:
     try:
         design: Design = from_json(about["generator"], Design)
     except (KeyError, ConfigError) as error:
-        raise UserError(f"{path} holds no generator that this version can read ({error}); train it again") from None
+        raise UserError(
+            f"{path} holds no generator that this version can read ({error}); train it again"
+        ) from None
     return Generator(design, nest(arrays))

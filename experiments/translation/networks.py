@@ -13,11 +13,21 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig, Stack
-from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, run_blocks, stacked_blocks, stored, table
+from anytouch_jax.nn.layers import (
+    Dense,
+    LayerNorm,
+    Mlp,
+    gelu,
+    run_blocks,
+    stacked_blocks,
+    stored,
+    table,
+)
 from anytouch_jax.ops import tokens
 
 DECODER = Stack(128, 2, 4, 512)
-STATES = 5  # hidden states of an encoder that are read: the embedded patches, and as many blocks as DPT reads
+# hidden states of an encoder that are read: the embedded patches, and as many blocks as DPT reads
+STATES = 5
 
 
 @dataclass(frozen=True)
@@ -53,13 +63,17 @@ class Painter(nnx.Module):
     """
 
     def __init__(self, options: Translation) -> None:
-        model, width = options.model, options.decoder.width
+        model = options.model
+        width = options.decoder.width
         self.embed = Dense(options.read, width, model)
         self.position = table(options.special + model.patches, width)
         self.blocks = stacked_blocks(options.decoder, model, model.norm_eps, gelu)
         self.norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.head = Dense(width, model.patch**2 * 3, model)
-        self.special, self.patch, self.side, self.remat = options.special, model.patch, model.image_size, model.remat
+        self.special = options.special
+        self.patch = model.patch
+        self.side = model.image_size
+        self.remat = model.remat
 
     def __call__(self, x: Array) -> Array:
         x = self.embed(x)
@@ -72,7 +86,9 @@ class FieldHead(nnx.Module):
     """MLP (B, inputs) -> a field (B, *field)."""
 
     def __init__(self, options: Translation, inputs: int) -> None:
-        self.mlp = Mlp(inputs, options.hidden, options.model, gelu, outputs=math.prod(options.field))
+        self.mlp = Mlp(
+            inputs, options.hidden, options.model, gelu, outputs=math.prod(options.field)
+        )
         self.field = options.field
 
     def __call__(self, x: Array) -> Array:
@@ -114,7 +130,8 @@ class Conv(nnx.Module):
     """A 3 x 3 convolution with zero padding, its kernel stored as a matrix (9 * inputs, outputs)."""
 
     def __init__(self, inputs: int, outputs: int, model: ModelConfig) -> None:
-        self.kernel, self.bias = table(9 * inputs, outputs), table(outputs)
+        self.kernel = table(9 * inputs, outputs)
+        self.bias = table(outputs)
         self.dtype = stored(model.dtype)
 
     def __call__(self, x: Array) -> Array:
@@ -134,7 +151,10 @@ class UNet(nnx.Module):
         while levels < len(options.channels) - 1 and side % 2 ** (levels + 1) == 0:
             levels += 1
         wide = options.channels[: levels + 1]
-        down = {f"down{i}": Conv(a, b, model) for i, (a, b) in enumerate(zip((3, *wide), wide, strict=False))}
+        down = {
+            f"down{i}": Conv(a, b, model)
+            for i, (a, b) in enumerate(zip((3, *wide), wide, strict=False))
+        }
         up = {f"up{i}": Conv(wide[i + 1] + wide[i], wide[i], model) for i in range(levels)}
         self.convs = nnx.Dict(down | up | {"middle": Conv(wide[-1], wide[-1], model)})
         self.head = Dense(wide[0], 3, model)

@@ -43,8 +43,12 @@ def find_pairs(manifest: Manifest, source: str, target: str) -> Split:
     if source == target:
         raise UserError(f"{source} is both sensors; name two")
     if source in FIELD_SENSORS:
-        raise UserError(f"{source} measures a field and has no images to translate from; name it as the target")
-    train, val, test = (_pairs(manifest, source, target, split) for split in ("train", "val", "test"))
+        raise UserError(
+            f"{source} measures a field and has no images to translate from; name it as the target"
+        )
+    train, val, test = (
+        _pairs(manifest, source, target, split) for split in ("train", "val", "test")
+    )
     for name, part in (("train", train), ("val", val)):
         both = sorted(_objects(manifest, part.source) & _objects(manifest, test.source))
         if both:
@@ -68,13 +72,17 @@ def _pairs(manifest: Manifest, source: str, target: str, split: str) -> Pairs:
 
 def _frames(manifest: Manifest, sensor: str, split: str) -> dict[tuple[int, int], int]:
     """(touch, frame index) -> row of a sensor."""
-    names, touch = manifest.text_column("sensor"), manifest.codes("touch", own=True)
+    names = manifest.text_column("sensor")
+    touch = manifest.codes("touch", own=True)
     if sensor not in names:
-        raise UserError(f"the manifest has no rows of sensor {sensor!r}; it has {', '.join(np.unique(names))}")
+        raise UserError(
+            f"the manifest has no rows of sensor {sensor!r}; it has {', '.join(np.unique(names))}"
+        )
     usable = (names == sensor) & (manifest.text_column("split") == split) & (touch >= 0)
     if "grade" in manifest.table.column_names:
         usable &= np.isin(manifest.text_column("grade"), ("", "fine"))
-    frame, result = np.asarray(manifest.column("frame_index")), dict[tuple[int, int], int]()
+    frame = np.asarray(manifest.column("frame_index"))
+    result = dict[tuple[int, int], int]()
     for row in np.flatnonzero(usable).tolist():
         key = (int(touch[row]), int(frame[row]))
         if key in result:
@@ -90,7 +98,9 @@ def _objects(manifest: Manifest, rows: np.ndarray) -> set[str]:
     result = {manifest.value(int(row), "object") for row in rows}
     if None in result:
         row = next(int(row) for row in rows if manifest.value(int(row), "object") is None)
-        raise UserError(f"{manifest.where(row)} has no object; test pairs must be of objects never seen")
+        raise UserError(
+            f"{manifest.where(row)} has no object; test pairs must be of objects never seen"
+        )
     return result
 
 
@@ -103,25 +113,35 @@ def without_objects(manifest: Manifest, pairs: Manifest) -> Manifest:
     names = manifest.text_column("object")
     kept = ~np.isin(names, list(set(pairs.text_column("object")) - {""}))
     if not (manifest.text_column("split")[kept] == "train").any():
-        raise UserError("every object to train on is in the pairs too; simulate pairs of fewer or other objects")
+        raise UserError(
+            "every object to train on is in the pairs too; simulate pairs of fewer or other objects"
+        )
     return select_rows(manifest, np.flatnonzero(kept))
 
 
-def read_pairs(manifest: Manifest, pairs: Pairs, size: int, *, subtract: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def read_pairs(
+    manifest: Manifest, pairs: Pairs, size: int, *, subtract: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Source images u8 (n, size, size, 3), and the targets: images alike, or fields f32 (n, 20, 20, 6).
 
     `subtract`: source images less their backgrounds, for an encoder that `subtracts`.
     """
     field = len(pairs.target) and manifest.value(int(pairs.target[0]), "sensor") in FIELD_SENSORS
-    targets = read_fields(manifest, pairs.target) if field else read_pixels(manifest, pairs.target, size)
+    targets = (
+        read_fields(manifest, pairs.target) if field else read_pixels(manifest, pairs.target, size)
+    )
     return read_pixels(manifest, pairs.source, size, subtract=subtract), targets
 
 
-def read_pixels(manifest: Manifest, rows: np.ndarray, size: int, *, subtract: bool = False) -> np.ndarray:
+def read_pixels(
+    manifest: Manifest, rows: np.ndarray, size: int, *, subtract: bool = False
+) -> np.ndarray:
     """Return images u8 (n, size, size, 3) of manifest rows, background-subtracted or not. Raises UserError."""
     out = np.empty((len(rows), size, size, 3), np.uint8)
     model = replace(preset("tiny").model, image_size=size)
-    reader = SampleReader(manifest, Config(model, data=DataConfig(background="subtract" if subtract else "keep")))
+    reader = SampleReader(
+        manifest, Config(model, data=DataConfig(background="subtract" if subtract else "keep"))
+    )
 
     def one(k: int) -> None:
         reader.touch(rows[k : k + 1], None, out[k : k + 1])
@@ -136,14 +156,20 @@ def read_fields(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
     def one(k: int) -> None:
         row = int(rows[k])
         if manifest.value(row, "field_path") is None:
-            raise UserError(f"{manifest.where(row)} has no field_path; regression needs its field (.npy)")
+            raise UserError(
+                f"{manifest.where(row)} has no field_path; regression needs its field (.npy)"
+            )
         file = manifest.file(row, "field_path")
         try:
             field = unpack_npy(read_file(file))
         except (OSError, ValueError) as error:
-            raise UserError(f"{manifest.where(row)}, column 'field_path': {file} cannot be read: {error}") from None
+            raise UserError(
+                f"{manifest.where(row)}, column 'field_path': {file} cannot be read: {error}"
+            ) from None
         if field.shape != FIELD or not np.isfinite(field).all():
-            raise UserError(f"{manifest.where(row)}: {file} is {field.shape}; a field is {FIELD} of finite numbers")
+            raise UserError(
+                f"{manifest.where(row)}: {file} is {field.shape}; a field is {FIELD} of finite numbers"
+            )
         out[k] = field
 
     return _each(one, out)

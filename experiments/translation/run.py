@@ -73,7 +73,9 @@ def run(options: Translate) -> int:
     enable_compilation_cache()
     if options.fit and options.images:
         raise UserError("--fit takes its images from --data. Translate in a second call.")
-    return _fit(options) if options.fit else _translate(options)
+    if options.fit:
+        return _fit(options)
+    return _translate(options)
 
 
 def _home(options: Translate, folder: Path | None) -> Path:
@@ -81,7 +83,9 @@ def _home(options: Translate, folder: Path | None) -> Path:
     if folder is not None:
         return folder
     if options.model is None or not options.model.is_dir():
-        raise UserError(f"--model {options.model} is no run folder, which stores translations. Give --generator.")
+        raise UserError(
+            f"--model {options.model} is no run folder, which stores translations. Give --generator."
+        )
     return options.model / "generators" / f"{options.source}-{options.target}"
 
 
@@ -97,13 +101,18 @@ def _fit(options: Translate) -> int:
     table = manifests.read(options.data)
     split = pairs.find_pairs(table, options.source, options.target)
     encoder.sensor_row(options.source, log)
-    log(f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of held-out objects to test on")
+    log(
+        f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of held-out objects to test on"
+    )
     size = encoder.config.model.image_size
-    (x, y), val, (test_x, test_y) = (pairs.read_pairs(table, part, size, subtract=encoder.subtracts) for part in split)
+    (x, y), val, (test_x, test_y) = (
+        pairs.read_pairs(table, part, size, subtract=encoder.subtracts) for part in split
+    )
     made, losses = training.fit(
         encoder, x, y, source=options.source, target=options.target, val=val, options=fit, log=log
     )
-    error, mean = training.errors(made, test_x, test_y).mean(), training.mean_errors(made, test_y).mean()
+    error = training.errors(made, test_x, test_y).mean()
+    mean = training.mean_errors(made, test_y).mean()
     report = {"error": error, "mean target": mean, "test pairs": len(test_x), "losses": losses}
     report["critic"] = made.design.has_critic
     atomic_write(home / "report.json", json.dumps(report, indent=2, allow_nan=False) + "\n")
@@ -124,11 +133,17 @@ def _translate(options: Translate) -> int:
     targets = _targets(options, ".npy" if design.shape.field else ".png")
     images = [decode(path) for path in options.images]
     if design.subtracts != (options.background is not None):
-        need = "needs a --background, which is subtracted" if design.subtracts else "takes no --background"
+        need = (
+            "needs a --background, which is subtracted"
+            if design.subtracts
+            else "takes no --background"
+        )
         raise UserError(f"The encoder of {home} {need}.")
     if options.background is not None:
         images = [subtract_background([one], decode(options.background))[0] for one in images]
-    inputs = np.concatenate([touch_evaluation([one], design.shape.model.image_size) for one in images])
+    inputs = np.concatenate(
+        [touch_evaluation([one], design.shape.model.image_size) for one in images]
+    )
     for target, result in zip(targets, made(inputs), strict=True):
         _write(target, result)
         print(target)
@@ -137,7 +152,8 @@ def _translate(options: Translate) -> int:
 
 def _targets(options: Translate, suffix: str) -> list[Path]:
     """Return where each result goes. Raises UserError for a file that is read, and for two results in one place."""
-    out, images = options.out, options.images
+    out = options.out
+    images = options.images
     if out is not None and out.suffix and not out.is_dir():
         if len(images) > 1 or out.suffix.lower() != suffix:
             raise UserError(f"--out {out} must be a folder, or a {suffix} file for a single image.")

@@ -7,12 +7,19 @@ from typing import Any
 
 TASKS = (("gelsight_mini", "duragel"), ("gelsight_mini", "tac3d"), ("digit", "tac3d"))
 TRANSLATIONS = dict(
-    zip(map("-".join, TASKS), ("GelSight Mini to DuraGel", "GelSight Mini to Tac3D", "DIGIT to Tac3D"), strict=True)
+    zip(
+        map("-".join, TASKS),
+        ("GelSight Mini to DuraGel", "GelSight Mini to Tac3D", "DIGIT to Tac3D"),
+        strict=True,
+    )
 )
 PIXELS = "pixels"
 TRANSLATORS = {
-    "anytouch": "AnyTouch", "stage1": "AnyTouch, stage 1", "t3": "T3-style", PIXELS: "pixels, no encoder",
-}  # fmt: skip
+    "anytouch": "AnyTouch",
+    "stage1": "AnyTouch, stage 1",
+    "t3": "T3-style",
+    PIXELS: "pixels, no encoder",
+}
 TUNES = {"frozen": "frozen", "fine": "fine-tuned", "scratch": "from scratch"}
 
 
@@ -21,9 +28,14 @@ def shared(about: Mapping[str, Any]) -> dict[str, Any]:
 
     Errors of pictures of another size are no rivals.
     """
-    task, fit = f"{about['from']} to {about['to']}", about["fit"]
-    kinds = {name: about.get(name, 1) for name in ("touches", "size", "subtracts", "version", "steps1")}
+    task = f"{about['from']} to {about['to']}"
+    fit = about["fit"]
+    kinds = {
+        name: about.get(name, 1) for name in ("touches", "size", "subtracts", "version", "steps1")
+    }
     return kinds | {
-        "steps": fit["steps"], f"encoder {about['name']} of seed {fit['seed']}": about["encoder"],
-        f"pairs {task}": about["pairs"], f"simulator of {task}": about.get("simulator"),
-    }  # fmt: skip
+        "steps": fit["steps"],
+        f"encoder {about['name']} of seed {fit['seed']}": about["encoder"],
+        f"pairs {task}": about["pairs"],
+        f"simulator of {task}": about.get("simulator"),
+    }

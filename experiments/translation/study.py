@@ -82,31 +82,53 @@ def one_run(about: dict[str, Any], encoder: Encoder | None, data: Any) -> dict[s
     (x, y), val, (test_x, test_y) = data
     begun = time.perf_counter()
     field = () if y.dtype == np.uint8 else y.shape[1:]
-    shape = None if encoder else Translation(replace(preset("tiny").model, image_size=about["size"]), field=field)
+    shape = (
+        None
+        if encoder
+        else Translation(replace(preset("tiny").model, image_size=about["size"]), field=field)
+    )
     made, losses = training.fit(
-        encoder, x, y, source=about["from"], target=about["to"], val=val, options=Fit(**about["fit"]), shape=shape
+        encoder,
+        x,
+        y,
+        source=about["from"],
+        target=about["to"],
+        val=val,
+        options=Fit(**about["fit"]),
+        shape=shape,
     )
     seconds = round(time.perf_counter() - begun, 1)
     away = made(test_x).astype(np.float64) - test_y
     each = training.errors(made, test_x, test_y)
     return {
-        "settings": about, "error": float(each.mean()), "each": [round(float(value), 5) for value in each],
-        "mean_target": float(training.mean_errors(made, test_y).mean()), "train_error": losses[-1]["error"],
-        "rms": [float(value) for value in np.sqrt((away**2).mean(axis=tuple(range(away.ndim - 1))))],
-        "pairs": [len(x), len(val[0]), len(test_x)], "seconds": seconds, "critic": made.design.has_critic,
-    }  # fmt: skip
+        "settings": about,
+        "error": float(each.mean()),
+        "each": [round(float(value), 5) for value in each],
+        "mean_target": float(training.mean_errors(made, test_y).mean()),
+        "train_error": losses[-1]["error"],
+        "rms": [
+            float(value) for value in np.sqrt((away**2).mean(axis=tuple(range(away.ndim - 1))))
+        ],
+        "pairs": [len(x), len(val[0]), len(test_x)],
+        "seconds": seconds,
+        "critic": made.design.has_critic,
+    }
 
 
 def encoders_of(options: Options, size: plan.Size, table: Manifest) -> Known:
     """Return encoders by name and seed: those of --runs, else those that the study trains."""
     if runs := runs_by_name(options.runs):
         loaded = {path: load_encoder(path) for paths in runs.values() for path in paths}
-        return {name: {seed: loaded[paths[seed % len(paths)]] for seed in options.seeds}
-                for name, paths in runs.items()}  # fmt: skip
+        return {
+            name: {seed: loaded[paths[seed % len(paths)]] for seed in options.seeds}
+            for name, paths in runs.items()
+        }
     work = Work(options.study or Path(f"runs/matrix{'-quick' * options.quick}"))
     by_seed = {seed: own_encoders.train(work, size, seed, table) for seed in options.seeds}
     names = by_seed[options.seeds[0]]
-    return {name: {seed: load_encoder(by_seed[seed][name]) for seed in options.seeds} for name in names}
+    return {
+        name: {seed: load_encoder(by_seed[seed][name]) for seed in options.seeds} for name in names
+    }
 
 
 def wanted_runs(
@@ -114,20 +136,37 @@ def wanted_runs(
 ) -> Iterator[tuple[str, tuple[dict[str, Any], Encoder | None]]]:
     """Yield the key of each run, its settings and its encoder, None for the network on pixels."""
     sensors = table.text_column("sensor")
-    data_of = {task: select_rows(table, np.flatnonzero(np.isin(sensors, task))).content_hash[:16] for task in TASKS}
-    plans = [(name, tune) for name, tune in product(known, options.tune)
-             if options.runs or (name, tune) not in own_encoders.NOT_TUNED]  # fmt: skip
+    data_of = {
+        task: select_rows(table, np.flatnonzero(np.isin(sensors, task))).content_hash[:16]
+        for task in TASKS
+    }
+    plans = [
+        (name, tune)
+        for name, tune in product(known, options.tune)
+        if options.runs or (name, tune) not in own_encoders.NOT_TUNED
+    ]
     for task, seed, (name, tune) in product(TASKS, options.seeds, [*plans, (PIXELS, "scratch")]):
         encoder = known[name][seed] if name in known else None
         side, subtracts = view_of(encoder) if encoder else plain
         key = re.sub(r"[^a-z0-9_]+", "-", f"{task[0]}-{task[1]}-{name}-{tune}-{seed}".lower())
         about = {
-            "from": task[0], "to": task[1], "name": name, "size": side, "subtracts": subtracts,
-            "encoder": f"{Path(encoder.source).name} (weights {encoder.fingerprint})" if encoder else PIXELS,
-            "fit": asdict(Fit(steps=options.steps, tune="fine" if tune == "fine" else "frozen", seed=seed)),
-            "touches": options.touches, "version": training.VERSION, "simulator": VERSION, **longer,
+            "from": task[0],
+            "to": task[1],
+            "name": name,
+            "size": side,
+            "subtracts": subtracts,
+            "encoder": f"{Path(encoder.source).name} (weights {encoder.fingerprint})"
+            if encoder
+            else PIXELS,
+            "fit": asdict(
+                Fit(steps=options.steps, tune="fine" if tune == "fine" else "frozen", seed=seed)
+            ),
+            "touches": options.touches,
+            "version": training.VERSION,
+            "simulator": VERSION,
+            **longer,
             "pairs": data_of[task],
-        }  # fmt: skip
+        }
         yield key, (about, encoder)
 
 
@@ -137,27 +176,48 @@ def run(options: Options) -> int:
         raise UserError("--steps1 is for encoders that the study trains. Leave it out with --runs.")
     enable_compilation_cache()
     usual = {"touches": 24, "steps": 40, "seeds": (0,)} if options.quick else {}
-    options = replace(options, **{k: v for k, v in usual.items() if getattr(options, k) == getattr(Options(), k)})
+    options = replace(
+        options, **{k: v for k, v in usual.items() if getattr(options, k) == getattr(Options(), k)}
+    )
     longer = {"steps1": options.steps1} if options.steps1 else {}
     size = replace(plan.QUICK if options.quick else plan.FULL, **longer)
     name = "_".join(["translation", *["quick"] * options.quick, *map(str, longer.values())])
     out = options.out or Path("runs" if options.quick else "experiments/results") / f"{name}.jsonl"
     scenes = Scenes(
-        touches=options.touches, objects=24 if options.quick else 60, seed=7, grade="fine", units="one", frames=6,
-        sensors=("gelsight_mini", "digit", "duragel", "tac3d"), size=128, vision=0.0, text=0.0,
-    )  # fmt: skip
+        touches=options.touches,
+        objects=24 if options.quick else 60,
+        seed=7,
+        grade="fine",
+        units="one",
+        frames=6,
+        sensors=("gelsight_mini", "digit", "duragel", "tac3d"),
+        size=128,
+        vision=0.0,
+        text=0.0,
+    )
     folder = options.work / f"pairs-{options.touches}-{VERSION}"
-    simulate(scenes, folder, progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True))
+    simulate(
+        scenes,
+        folder,
+        progress=lambda done, of: print(f"pairs: {done} of {of} touches", end="\r", flush=True),
+    )
     table = manifests.read(folder / "manifest.parquet")
     known = encoders_of(options, size, table)
-    plain = view_of(known[next(iter(known))][options.seeds[0]])  # one view for all, the references too
+    # one view for all, the references too
+    plain = view_of(known[next(iter(known))][options.seeds[0]])
     wanted = dict(wanted_runs(options, table, known, plain, longer))
     done = read_records(out)
     others = [record["settings"] for key, record in done.items() if key not in wanted]
-    check_alike(out, [shared(about) for about in (*(about for about, _ in wanted.values()), *others)])
+    check_alike(
+        out, [shared(about) for about in (*(about for about, _ in wanted.values()), *others)]
+    )
     for source, target in TASKS:
-        todo = [(key, *one) for key, one in wanted.items() if (one[0]["from"], one[0]["to"]) == (source, target)
-                and done.get(key, {}).get("settings") != one[0]]  # fmt: skip
+        todo = [
+            (key, *one)
+            for key, one in wanted.items()
+            if (one[0]["from"], one[0]["to"]) == (source, target)
+            and done.get(key, {}).get("settings") != one[0]
+        ]
         if not todo:
             continue
         split = pairs.find_pairs(table, source, target)
@@ -165,7 +225,9 @@ def run(options: Options) -> int:
         for key, about, encoder in todo:
             record = one_run(about, encoder, data)
             write_record(out, key, record)
-            print(f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {record['seconds']} s")
+            print(
+                f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {record['seconds']} s"
+            )
     return 0
 
 

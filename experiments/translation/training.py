@@ -22,7 +22,17 @@ from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.train.optim import learning_rate
-from experiments.translation.generator import Design, Fit, Generator, Params, features, judged, nameless, predict, units
+from experiments.translation.generator import (
+    Design,
+    Fit,
+    Generator,
+    Params,
+    features,
+    judged,
+    nameless,
+    predict,
+    units,
+)
 from experiments.translation.networks import STATES, Translation
 
 Log = Callable[[str], None]
@@ -59,10 +69,17 @@ class State(NamedTuple):
 
 
 def fit(
-    encoder: Encoder | None, images: np.ndarray, targets: np.ndarray, *, source: str, target: str,
-    val: tuple[np.ndarray, np.ndarray] | None = None, options: Fit | None = None, shape: Translation | None = None,
+    encoder: Encoder | None,
+    images: np.ndarray,
+    targets: np.ndarray,
+    *,
+    source: str,
+    target: str,
+    val: tuple[np.ndarray, np.ndarray] | None = None,
+    options: Fit | None = None,
+    shape: Translation | None = None,
     log: Log | None = None,
-) -> tuple[Generator, list[dict[str, float]]]:  # fmt: skip
+) -> tuple[Generator, list[dict[str, float]]]:
     """Train a translation on pairs: source `images` u8 (n, H, W, 3), `targets` images u8 alike or fields f32.
 
     `encoder` None trains the reference that reads pixels; it needs a `shape`. `val`: pairs of other objects; of the
@@ -72,28 +89,39 @@ def fit(
     options = options or Fit()
     design = _design(encoder, images, targets, source, target, options, shape)
     params = start(design, encoder, images, targets)
-    pairs = _pairs(design, params, images, targets, val if val is not None and len(val[0]) else None)
+    pairs = _pairs(
+        design, params, images, targets, val if val is not None and len(val[0]) else None
+    )
     program = _step(nameless(design))
     state, still = begin(design, params)
     losses: list[dict[str, float]] = []
-    best, made = np.inf, state.made
+    best = np.inf
+    made = state.made
     every = max(1, options.steps // 20)
     for step in range(options.steps):
-        state, metrics = program(state, still, pairs.batch(options, step), rates(design, params["fixed"], step))
+        state, metrics = program(
+            state, still, pairs.batch(options, step), rates(design, params["fixed"], step)
+        )
         if step % every == every - 1 or step == options.steps - 1:
             error = pairs.val_error(Generator(design, state.made | still))
             losses.append(_finite(step, metrics, error))
             if error is None or error < best:
-                best, made = error or 0.0, state.made
+                best = error or 0.0
+                made = state.made
             if log is not None:
                 log(", ".join(f"{name} {value:.4g}" for name, value in losses[-1].items()))
     return Generator(design, jax.tree.map(np.asarray, made | still)), losses
 
 
 def _design(
-    encoder: Encoder | None, images: np.ndarray, targets: np.ndarray, source: str, target: str, options: Fit,
+    encoder: Encoder | None,
+    images: np.ndarray,
+    targets: np.ndarray,
+    source: str,
+    target: str,
+    options: Fit,
     shape: Translation | None,
-) -> Design:  # fmt: skip
+) -> Design:
     """What is trained. Raises UserError for a reference without a shape, and pictures of another size."""
     if shape is None:
         if encoder is None:
@@ -102,8 +130,12 @@ def _design(
         field = () if targets.dtype == np.uint8 else targets.shape[1:]
         shape = Translation(model, field=field, states=min(STATES, model.touch.depth + 1))
     side = shape.model.image_size
-    if images.shape[1:] != (side, side, 3) or (targets.dtype == np.uint8 and targets.shape[1:] != images.shape[1:]):
-        raise UserError(f"images must be {side} x {side} pixels of three colours, not {images.shape}, {targets.shape}")
+    if images.shape[1:] != (side, side, 3) or (
+        targets.dtype == np.uint8 and targets.shape[1:] != images.shape[1:]
+    ):
+        raise UserError(
+            f"images must be {side} x {side} pixels of three colours, not {images.shape}, {targets.shape}"
+        )
     whence, less = (None, False) if encoder is None else (encoder.source, encoder.subtracts)
     return Design(source, target, shape, whence, options, len(images), less)
 
@@ -121,7 +153,9 @@ class _Pairs(NamedTuple):
 
     def batch(self, options: Fit, step: int) -> Batch:
         """The pairs of a step: a function of the seed and the step alone."""
-        rows = np.random.default_rng([options.seed % 2**63, step]).integers(len(self.x), size=options.batch)
+        rows = np.random.default_rng([options.seed % 2**63, step]).integers(
+            len(self.x), size=options.batch
+        )
         y = (self.y[rows].astype(np.float32) - self.mean) / self.scale
         return Batch(self.x[rows], y, None if self.real is None else self.real[rows])
 
@@ -134,7 +168,9 @@ class _Pairs(NamedTuple):
         return float(_errors(now, guess, target).mean())
 
 
-def _pairs(design: Design, params: Params, images: np.ndarray, targets: np.ndarray, val: Any) -> _Pairs:
+def _pairs(
+    design: Design, params: Params, images: np.ndarray, targets: np.ndarray, val: Any
+) -> _Pairs:
     """The pairs; those of a frozen encoder are seen by it once, before the first step."""
     mean, scale = units(design, params["fixed"])
     if design.encoder is None or design.fit.tune != "frozen":
@@ -152,20 +188,30 @@ def _finite(step: int, metrics: dict[str, Any], error: float | None) -> dict[str
     losses |= {} if error is None else {"val": error}
     for name, where in (("error", ""), ("val", " on val")):
         if not np.isfinite(losses.get(name, 0.0)):
-            raise UserError(f"the error{where} is not finite at step {step + 1}; lower the learning rate")
+            raise UserError(
+                f"the error{where} is not finite at step {step + 1}; lower the learning rate"
+            )
     return losses
 
 
-def start(design: Design, encoder: Encoder | None, images: np.ndarray, targets: np.ndarray) -> Params:
+def start(
+    design: Design, encoder: Encoder | None, images: np.ndarray, targets: np.ndarray
+) -> Params:
     """Return the first parameters: `encoder`, a new `head`, and constants `fixed` of the training pairs."""
     key = jax.random.fold_in(jax.random.key(design.fit.seed), 0)
     params: Params = {"head": design.head.init(key)}
     if encoder is not None:
         params["encoder"] = encoder.params
     every = max(1, len(images) // _SAMPLE)
-    read = run_in_batches(partial(_features(nameless(design)), params.get("encoder")), images[::every][:_SAMPLE])
+    read = run_in_batches(
+        partial(_features(nameless(design)), params.get("encoder")), images[::every][:_SAMPLE]
+    )
     mean, scale = _moments(read)
-    fixed = {"mean": mean, "scale": scale} if encoder is None else {"mean": mean, "whiten": whitening(read)}
+    fixed = (
+        {"mean": mean, "scale": scale}
+        if encoder is None
+        else {"mean": mean, "whiten": whitening(read)}
+    )
     if design.shape.field:
         fixed["unit_mean"], fixed["unit_scale"] = _moments(targets)
     if design.has_critic and design.subtracts:
@@ -177,7 +223,8 @@ def start(design: Design, encoder: Encoder | None, images: np.ndarray, targets: 
 def _moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and deviation of the last axis, 1 for what never changes."""
     flat = values.reshape(-1, values.shape[-1]).astype(np.float64)
-    mean, scale = flat.mean(0), flat.std(0)
+    mean = flat.mean(0)
+    scale = flat.std(0)
     return mean.astype(np.float32), np.where(scale > 1e-9, scale, 1).astype(np.float32)
 
 
@@ -199,16 +246,21 @@ def untouched(targets: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> np.nd
     return ((np.median(targets, axis=0) - mean) / scale).astype(np.float32)
 
 
-def mean_target(targets: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mean_target(
+    targets: np.ndarray, mean: np.ndarray, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The mean of normalised targets, and the deviation from it by channel: the first reference, and a unit."""
-    total, square = np.zeros(targets.shape[1:]), np.zeros(targets.shape[1:])
+    total = np.zeros(targets.shape[1:])
+    square = np.zeros(targets.shape[1:])
     for first in range(0, len(targets), _CHUNK):
         part = (targets[first : first + _CHUNK].astype(np.float64) - mean) / scale
         total += part.sum(0)
         square += (part**2).sum(0)
     middle = total / len(targets)
     variance = np.maximum(square / len(targets) - middle**2, 0).mean(tuple(range(middle.ndim - 1)))
-    return middle.astype(np.float32), np.sqrt(np.where(variance > 1e-12, variance, 1)).astype(np.float32)
+    return middle.astype(np.float32), np.sqrt(np.where(variance > 1e-12, variance, 1)).astype(
+        np.float32
+    )
 
 
 @lru_cache(maxsize=8)
@@ -225,7 +277,9 @@ def _judged(design: Design) -> Any:
 
 
 # AdamW before its learning rate, gradients clipped.
-_TX = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(b2=0.99), optax.add_decayed_weights(0.05))
+_TX = optax.chain(
+    optax.clip_by_global_norm(1.0), optax.scale_by_adam(b2=0.99), optax.add_decayed_weights(0.05)
+)
 
 
 def rates(design: Design, fixed: Params, step: int) -> Rates:
@@ -240,10 +294,13 @@ def rates(design: Design, fixed: Params, step: int) -> Rates:
 
 def begin(design: Design, params: Params) -> tuple[State, Params]:
     """Return the state before the first step, and the frozen parameters."""
-    made, still = {"head": params["head"]}, {"fixed": params["fixed"]}
+    made = {"head": params["head"]}
+    still = {"fixed": params["fixed"]}
     critic: Params = {}
     if design.has_critic:
-        critic = {"head": design.critic.init(jax.random.fold_in(jax.random.key(design.fit.seed), 1))}
+        critic = {
+            "head": design.critic.init(jax.random.fold_in(jax.random.key(design.fit.seed), 1))
+        }
     if "encoder" in params:
         (made if design.fit.tune == "fine" else still)["encoder"] = params["encoder"]
         if design.has_critic and design.fit.tune == "fine":
@@ -271,7 +328,9 @@ def _step(design: Design) -> Any:
         fooled = jnp.mean(jax.nn.softplus(-design.critic.apply(critic["head"], read)))
         return error + weight * fooled, (error, out, read)
 
-    def critic_loss(critic: Params, still: Params, batch: Batch, out: Array, read: Array, weight: Array) -> Array:
+    def critic_loss(
+        critic: Params, still: Params, batch: Batch, out: Array, read: Array, weight: Array
+    ) -> Array:
         real = batch.real if frozen else judge_features(critic, still, batch.y)
         fake = read if frozen else judge_features(critic, still, out)
         logit = lambda x: design.critic.apply(critic["head"], x)  # noqa: E731
@@ -280,15 +339,22 @@ def _step(design: Design) -> Any:
         losses = jnp.mean(jax.nn.softplus(-logit(real))) + jnp.mean(jax.nn.softplus(logit(fake)))
         return losses + 0.5 * weight * penalty
 
-    def step(state: State, still: Params, batch: Batch, rates: Rates) -> tuple[State, dict[str, Array]]:
+    def step(
+        state: State, still: Params, batch: Batch, rates: Rates
+    ) -> tuple[State, dict[str, Array]]:
         rate, weight, penalty = rates
-        grads, (error, out, read) = jax.grad(made_loss, has_aux=True)(state.made, state.critic, still, batch, weight)
+        grads, (error, out, read) = jax.grad(made_loss, has_aux=True)(
+            state.made, state.critic, still, batch, weight
+        )
         made, made_moments = _updated(rate, grads, state.made_moments, state.made)
         metrics = {"error": error}
-        critic, critic_moments = state.critic, state.critic_moments
+        critic = state.critic
+        critic_moments = state.critic_moments
         if design.has_critic:
             out, read = jax.lax.stop_gradient((out, read))
-            metrics["critic"], grads = jax.value_and_grad(critic_loss)(critic, still, batch, out, read, penalty)
+            metrics["critic"], grads = jax.value_and_grad(critic_loss)(
+                critic, still, batch, out, read, penalty
+            )
             critic, critic_moments = _updated(rate, grads, critic_moments, critic)
         return State(made, critic, made_moments, critic_moments), metrics
 

@@ -28,28 +28,71 @@ def wrench(fields, header: Header) -> WrenchStamped:
 
 def cloud(fields, header: Header) -> PointCloud2:
     points = fields.points()[0].astype("<f4") / 1000
-    axes = [PointField(name=name, offset=4 * place, datatype=PointField.FLOAT32, count=1)
-            for place, name in enumerate("xyz")]  # fmt: skip
+    axes = [
+        PointField(name=name, offset=4 * place, datatype=PointField.FLOAT32, count=1)
+        for place, name in enumerate("xyz")
+    ]
     height, width = points.shape[:2]
-    return PointCloud2(header=header, height=height, width=width, fields=axes, is_bigendian=False, point_step=12,
-                       row_step=12 * width, data=points.tobytes(), is_dense=True)  # fmt: skip
+    return PointCloud2(
+        header=header,
+        height=height,
+        width=width,
+        fields=axes,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * width,
+        data=points.tobytes(),
+        is_dense=True,
+    )
 
 
 def main() -> None:
     rclpy.init()
-    node, any_type = Node("touch"), ParameterDescriptor(dynamic_typing=True)  # camera:=0 is a number for ROS
-    values = {name: str(node.declare_parameter(name, default, any_type).value) for name, default in (
-        ("model", "anytouch-tiny"), ("camera", "0"), ("sensor", "digit"), ("background", ""), ("width_mm", "0"),
-        ("frame", "touch"))}  # fmt: skip
-    kinds = {"features": Float32MultiArray, "contact": Bool, "wrench": WrenchStamped, "points": PointCloud2}
-    send = {name: node.create_publisher(kind, f"touch/{name}", 1).publish for name, kind in kinds.items()}  # newest
-    encoder, (source, live) = at.load_encoder(values["model"]), open_source(values["camera"])
+    # camera:=0 is a number for ROS
+    node = Node("touch")
+    any_type = ParameterDescriptor(dynamic_typing=True)
+    values = {
+        name: str(node.declare_parameter(name, default, any_type).value)
+        for name, default in (
+            ("model", "anytouch-tiny"),
+            ("camera", "0"),
+            ("sensor", "digit"),
+            ("background", ""),
+            ("width_mm", "0"),
+            ("frame", "touch"),
+        )
+    }
+    kinds = {
+        "features": Float32MultiArray,
+        "contact": Bool,
+        "wrench": WrenchStamped,
+        "points": PointCloud2,
+    }
+    # newest
+    send = {
+        name: node.create_publisher(kind, f"touch/{name}", 1).publish
+        for name, kind in kinds.items()
+    }
+    encoder = at.load_encoder(values["model"])
+    (source, live) = open_source(values["camera"])
     gel = decode(values["background"]) if values["background"] else None
-    preprocess = at.Preprocess(encoder, gel)  # without a picture it estimates one from the frames
-    gate, row = ContactGate(preprocess, values["sensor"]), encoder.sensor_row(values["sensor"])
-    width, length = float(values["width_mm"]) or None, encoder.config.model.frames if encoder.measures else 1
+    # without a picture it estimates one from the frames
+    preprocess = at.Preprocess(encoder, gel)
+    gate = ContactGate(preprocess, values["sensor"])
+    row = encoder.sensor_row(values["sensor"])
+    width = float(values["width_mm"]) or None
+    length = encoder.config.model.frames if encoder.measures else 1
     measure = encoder.measure_of(values["sensor"], gel, width) if encoder.measures else None
-    frames = stream(encoder, source, preprocess, live=live, sensor=row, contact=gate, frames=length, measure=measure)
+    frames = stream(
+        encoder,
+        source,
+        preprocess,
+        live=live,
+        sensor=row,
+        contact=gate,
+        frames=length,
+        measure=measure,
+    )
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(frames):
         for frame in frames:
             if not rclpy.ok():  # Ctrl-C has ended ROS, which then refuses to publish
@@ -57,7 +100,9 @@ def main() -> None:
             send["features"](Float32MultiArray(data=frame.values.tolist()))
             if frame.contact == frame.contact:  # NaN without a background: contact is unknown
                 send["contact"](Bool(data=bool(frame.contact)))
-            if frame.fields is not None and frame.fields.force is not None:  # None: nobody knows the width in mm
+            if (
+                frame.fields is not None and frame.fields.force is not None
+            ):  # None: nobody knows the width in mm
                 header = Header(stamp=node.get_clock().now().to_msg(), frame_id=values["frame"])
                 send["wrench"](wrench(frame.fields, header))
                 send["points"](cloud(frame.fields, header))

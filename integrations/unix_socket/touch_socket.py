@@ -14,11 +14,14 @@ from typing import Any
 
 def serve(embedded: Any, path: str) -> None:
     """Send each frame of a stream to all clients of the socket at `path`. A client that is too slow is dropped."""
-    clients, file = list[socket.socket](), Path(path)
+    clients = list[socket.socket]()
+    file = Path(path)
     if file.exists():
         with socket.socket(socket.AF_UNIX) as old:
             if not file.is_socket() or old.connect_ex(path) != errno.ECONNREFUSED:
-                raise SystemExit(f"{path} is in use. Stop the program that serves it, or choose another address.")
+                raise SystemExit(
+                    f"{path} is in use. Stop the program that serves it, or choose another address."
+                )
         file.unlink()  # left by a program that was killed
     with socket.socket(socket.AF_UNIX) as server, contextlib.ExitStack() as stack:
         server.bind(path)
@@ -30,7 +33,8 @@ def serve(embedded: Any, path: str) -> None:
                 clients.append(stack.enter_context(server.accept()[0]))
                 clients[-1].setblocking(False)
             line = {"frame": frame.number, "time": frame.time, "features": frame.values.tolist()}
-            line["contact"] = None if frame.contact != frame.contact else bool(frame.contact)  # NaN is unknown
+            # NaN is unknown
+            line["contact"] = None if frame.contact != frame.contact else bool(frame.contact)
             line |= {"background": "estimated"} if frame.estimated else {}
             if frame.fields is not None:  # force in N, depth in mm and others, with deviations
                 line["fields"] = frame.fields.summary()
@@ -52,10 +56,20 @@ if __name__ == "__main__":
     for name, count in {"camera": None, "sensor": None, "address": None, "background": "?"}.items():
         parser.add_argument(name, nargs=count)
     given = parser.parse_args()
-    encoder, (source, live) = at.load_encoder("anytouch-tiny"), open_source(given.camera)
+    encoder = at.load_encoder("anytouch-tiny")
+    (source, live) = open_source(given.camera)
     gel = given.background and decode(given.background)
-    preprocess, row = at.Preprocess(encoder, gel), encoder.sensor_row(given.sensor)  # without a gel it estimates one
-    gate, more = ContactGate(preprocess, given.sensor), {}
+    # without a gel it estimates one
+    preprocess = at.Preprocess(encoder, gel)
+    row = encoder.sensor_row(given.sensor)
+    gate = ContactGate(preprocess, given.sensor)
+    more = {}
     if encoder.measures:
-        more = {"measure": encoder.measure_of(given.sensor, gel), "frames": encoder.config.model.frames}
-    serve(stream(encoder, source, preprocess, live=live, sensor=row, contact=gate, **more), given.address)
+        more = {
+            "measure": encoder.measure_of(given.sensor, gel),
+            "frames": encoder.config.model.frames,
+        }
+    serve(
+        stream(encoder, source, preprocess, live=live, sensor=row, contact=gate, **more),
+        given.address,
+    )

@@ -35,7 +35,9 @@ _ALIASES = {  # public names that say more outside their module
     "load_exported": ("encoder.export", "load"),
     "read_manifest": ("data.manifest.manifest", "read"),
 }
-_HOME = {name: (module, name) for module, names in _HOMES.items() for name in names.split()} | _ALIASES
+_HOME = {
+    name: (module, name) for module, names in _HOMES.items() for name in names.split()
+} | _ALIASES
 
 __all__ = sorted(_HOME)
 __version__ = "0.2.0"

@@ -24,13 +24,27 @@ def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
         yield lambda done: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     display = outer = _display
     if display is None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        display = _display = Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty())
-    begun, task = time.monotonic(), display.add_task(words, total=total, visible=False)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
+        display = _display = Progress(
+            *columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()
+        )
+    begun = time.monotonic()
+    task = display.add_task(words, total=total, visible=False)
 
     def advance(done: int | None = None) -> None:
         if is_long := time.monotonic() - begun >= WAIT:

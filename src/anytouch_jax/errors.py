@@ -13,19 +13,23 @@ _LETTERS = 500  # of a message
 
 def shorten(text: str) -> str:
     """Return a message without its middle if it is long, as one that quotes a damaged file can be."""
-    return text if len(text) <= _LETTERS else f"{text[:350]} ... {text[-140:]}"
+    if len(text) <= _LETTERS:
+        return text
+    return f"{text[:350]} ... {text[-140:]}"
 
 
 def letters_apart(one: str, other: str) -> int:
     """Return how many letters must be added, removed, replaced or exchanged with the next to get the other word."""
-    before, last = list[int](), list(range(len(other) + 1))
+    before = list[int]()
+    last = list(range(len(other) + 1))
     for i, letter in enumerate(one):
         row = [i + 1]
         for j, wanted in enumerate(other):
             row.append(min(last[j + 1] + 1, row[j] + 1, last[j] + (letter != wanted)))
             if i and j and letter == other[j - 1] and one[i - 1] == wanted:
                 row[-1] = min(row[-1], before[j - 1] + 1)
-        before, last = last, row
+        before = last
+        last = row
     return last[-1]
 
 
@@ -67,7 +71,8 @@ _inherited = False  # whether this process was forked from one whose jax was run
 def _look() -> None:
     """After a fork: what jax is asked for would hang, so it raises. A change of settings makes it look."""
     global _inherited
-    bridge = sys.modules.get("jax._src.xla_bridge")  # jax has no public question for it
+    # jax has no public question for it
+    bridge = sys.modules.get("jax._src.xla_bridge")
     if _inherited or getattr(bridge, "backends_are_initialized", lambda: bridge is not None)():
         _inherited = True
         for setting in ("jax_no_execution", "jax_no_tracing"):

@@ -41,11 +41,14 @@ def atomic_path(path: str | Path, *, sync: bool = True, part: Path | None = None
             raise
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
-        with contextlib.suppress(OSError):  # the folder may not exist
+        # the folder may not exist
+        with contextlib.suppress(OSError):
             part.unlink()
 
 
-def atomic_write(path: str | Path, data: bytes | str, *, sync: bool = True, part: Path | None = None) -> None:
+def atomic_write(
+    path: str | Path, data: bytes | str, *, sync: bool = True, part: Path | None = None
+) -> None:
     """Write a whole file or none, text as UTF-8, see `atomic_path`. Raises OSError with the file's name."""
     with atomic_path(path, sync=sync, part=part) as target:
         target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
@@ -81,7 +84,8 @@ def placeholder(file: str | Path | bytes) -> str | None:
 def csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the first line, from 1, and the cells of each row of a CSV file. Raises csv.Error for a quote left open."""
     with path.open(encoding="utf-8-sig", newline="") as file:
-        line, rows = 1, csv.reader(file, strict=True)
+        line = 1
+        rows = csv.reader(file, strict=True)
         try:
             for cells in rows:
                 if cells:
@@ -89,10 +93,14 @@ def csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                 line = rows.line_num + 1
         except csv.Error:
             limit = csv.field_size_limit()
-            raise csv.Error(f"the quote in line {line} is not closed, or its cell is longer than {limit:,}") from None
+            raise csv.Error(
+                f"the quote in line {line} is not closed, or its cell is longer than {limit:,}"
+            ) from None
 
 
-def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = lambda _: True) -> dict[str, np.ndarray]:
+def read_arrays(
+    file: str | Path | IO[bytes], *, only: Callable[[str], bool] = lambda _: True
+) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz file by name. Raises OSError, or ValueError for a file that is not one.
 
     Every header is read before any array. Pickled objects, sizes that the file does not have, and more than 1 GiB in a
@@ -123,7 +131,9 @@ def read_arrays(file: str | Path | IO[bytes], *, only: Callable[[str], bool] = l
     except (OSError, ValueError):
         raise
     except Exception as error:  # damaged bytes raise any type of error
-        raise ValueError(f"it is damaged or not an .npz file ({type(error).__name__}: {str(error)[:200]})") from error
+        raise ValueError(
+            f"it is damaged or not an .npz file ({type(error).__name__}: {str(error)[:200]})"
+        ) from error
 
 
 def _check_header(file: IO[bytes], file_size: int, name: str) -> np.ndarray:
@@ -131,13 +141,18 @@ def _check_header(file: IO[bytes], file_size: int, name: str) -> np.ndarray:
     import numpy as np
 
     version = np.lib.format.read_magic(file)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
     if read is None:
         raise ValueError(f"its array {name[:80]} has an unknown form")
     shape, _, dtype = read(file)
     size = math.prod(shape) * dtype.itemsize
     if dtype.hasobject or min(shape, default=0) < 0 or size != file_size - file.tell():
-        raise ValueError(f"its array {name[:80]} of shape {shape} has other bytes than its header says")
+        raise ValueError(
+            f"its array {name[:80]} of shape {shape} has other bytes than its header says"
+        )
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
@@ -160,7 +175,8 @@ def remove_old(folder: Path, pattern: str, days: float = 60) -> None:
     """Remove the files of a folder that match a pattern and were not written or touched for so many days."""
     old = time.time() - days * 86400
     for file in folder.glob(pattern):
-        with contextlib.suppress(OSError):  # another process may remove it, or own it
+        # another process may remove it, or own it
+        with contextlib.suppress(OSError):
             if file.stat().st_mtime < old:
                 file.unlink()
 

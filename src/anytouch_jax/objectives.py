@@ -31,10 +31,16 @@ def _arrays(batch: Batch) -> Batch:
     """Return a batch, or several, with arrays in the place of lists and numbers. Arrays and None are kept."""
 
     def convert(x: Any) -> Any:
-        return _arrays(x) if hasattr(x, "_fields") else x if x is None or hasattr(x, "shape") else jnp.asarray(x)
+        if hasattr(x, "_fields"):
+            return _arrays(x)
+        if x is None or hasattr(x, "shape"):
+            return x
+        return jnp.asarray(x)
 
     parts: Any = [convert(x) for x in batch]
-    return type(batch)(*parts) if hasattr(batch, "_fields") else type(batch)(parts)
+    if hasattr(batch, "_fields"):
+        return type(batch)(*parts)
+    return type(batch)(parts)
 
 
 def normalise_touch(clip: Array) -> Array:
@@ -50,13 +56,21 @@ def normalise_image(image: Array) -> Array:
 def _normalise(pixels: Array, mean: tuple[float, ...], std: tuple[float, ...]) -> Array:
     pixels = jnp.asarray(pixels)
     shape = (1,) * (pixels.ndim - 1) + (3,)
-    return (pixels.astype(jnp.float32) / 255.0 - jnp.asarray(mean).reshape(shape)) / jnp.asarray(std).reshape(shape)
+    return (pixels.astype(jnp.float32) / 255.0 - jnp.asarray(mean).reshape(shape)) / jnp.asarray(
+        std
+    ).reshape(shape)
 
 
 def stage1_terms(
-    params: Params, clip: Array, sensor: Array, noise: Array, *, net: Net, config: Config,
+    params: Params,
+    clip: Array,
+    sensor: Array,
+    noise: Array,
+    *,
+    net: Net,
+    config: Config,
     decoder_sensor: Array | None = None,
-) -> tuple[Array, Metrics]:  # fmt: skip
+) -> tuple[Array, Metrics]:
     """Return the loss of stage 1 and its terms: masked reconstruction and, for clips, the next frame (Eq. 8).
 
     `clip` float (B, T, H, W, 3), normalised: T = 1 a still, 3 a clip, 4 a clip and its next frame. `sensor` i32 (B,)
@@ -66,17 +80,27 @@ def stage1_terms(
     clip, sensor, noise = _arrays((clip, sensor, noise))
     if not config.objective.next_frame:
         clip = clip[:, : net.model.frames]
-    pixels, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor)
+    pixels, hidden = reconstruct(
+        params, clip, sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor
+    )
     target = tokens.patchify(clip, net.model.patch)
     if config.objective.norm_pix_loss:
         target = losses.normalise_patches(target)
-    return losses.reconstruction_loss(pixels, target, hidden, next_frame=clip.shape[1] > net.model.frames)
+    return losses.reconstruction_loss(
+        pixels, target, hidden, next_frame=clip.shape[1] > net.model.frames
+    )
 
 
 def reconstruct(
-    params: Params, clip: Array, sensor: Array, noise: Array, *, net: Net, config: Config,
+    params: Params,
+    clip: Array,
+    sensor: Array,
+    noise: Array,
+    *,
+    net: Net,
+    config: Config,
     decoder_sensor: Array | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     """Return pixels (B, N, T, P*P*3) of all positions from the visible ones, and `hidden` (B, N).
 
     See `stage1_terms`. The encoder sees the first three frames only, whatever T is.
@@ -85,7 +109,9 @@ def reconstruct(
     visible = tokens.count_visible(net.model.patches, config.objective.keep_ratio)
     keep_ids, restore_ids, hidden = tokens.random_mask(noise, visible)
     past = clip[:, : net.model.frames]
-    pixels = net.reconstruct(params, past, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor)
+    pixels = net.reconstruct(
+        params, past, sensor, keep_ids, restore_ids, clip.shape[1], decoder_sensor
+    )
     return pixels, hidden
 
 
@@ -96,18 +122,29 @@ def stage1_loss(
 
     The clips are u8 (B, T, H, W, 3). `progress` f32 () in [0, 1] drives p_u (Eq. 7).
     """
-    batch, (key_noise, key_universal) = _arrays(batch), jax.random.split(key)
+    batch = _arrays(batch)
+    (key_noise, key_universal) = jax.random.split(key)
     noise = jax.random.uniform(key_noise, (len(batch.sensor), net.model.patches))
     p_u, sensor = _draw_tokens(batch.sensor, key_universal, progress, net, config)
     clip = normalise_touch(batch.clip)
-    loss, metrics = stage1_terms(params, clip, sensor, noise, net=net, config=config, decoder_sensor=batch.sensor)
-    return _with_fields(params, batch.fields, loss, metrics | {"p_u": p_u}, key, progress, net, config)
+    loss, metrics = stage1_terms(
+        params, clip, sensor, noise, net=net, config=config, decoder_sensor=batch.sensor
+    )
+    return _with_fields(
+        params, batch.fields, loss, metrics | {"p_u": p_u}, key, progress, net, config
+    )
 
 
 def _with_fields(
-    params: Params, batch: FieldBatch | None, loss: Array, metrics: Metrics, key: Array, progress: Array, net: Net,
+    params: Params,
+    batch: FieldBatch | None,
+    loss: Array,
+    metrics: Metrics,
+    key: Array,
+    progress: Array,
+    net: Net,
     config: Config,
-) -> tuple[Array, Metrics]:  # fmt: skip
+) -> tuple[Array, Metrics]:
     """Add the loss of touches with fields, if the batch has some."""
     if batch is None:
         return loss, metrics
@@ -118,7 +155,8 @@ def _with_fields(
 
 
 TOUCHED = 1e-3  # of the gel's modulus: a pressure that counts as contact
-LEAST_FORCE = 1e-3  # of modulus times width squared, some 0.05 N: smaller forces have no meaningful ratio
+# of modulus times width squared, some 0.05 N: smaller forces have no meaningful ratio
+LEAST_FORCE = 1e-3
 
 
 def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, Metrics]:
@@ -131,35 +169,46 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
     out = net.measure(params, batch.clip, batch.sensor, batch.aspect)
     touched = (batch.pressure > TOUCHED).astype(jnp.float32)
     share = losses.mean(touched)
-    weight = 0.5 * touched / jnp.maximum(share, 1e-2) + 0.5 * (1 - touched) / jnp.maximum(1 - share, 1e-2)
+    weight = 0.5 * touched / jnp.maximum(share, 1e-2) + 0.5 * (1 - touched) / jnp.maximum(
+        1 - share, 1e-2
+    )
 
     def over_pixels(values: Array) -> Array:
         return losses.mean(weight * values)
 
     depth = (out.depth - batch.depth) / LENGTH
     shear = (out.shear - batch.shear) / LENGTH
-    slopes = losses.mean(jnp.abs(jnp.diff(depth, axis=1))) + losses.mean(jnp.abs(jnp.diff(depth, axis=2)))
+    slopes = losses.mean(jnp.abs(jnp.diff(depth, axis=1))) + losses.mean(
+        jnp.abs(jnp.diff(depth, axis=2))
+    )
     pressure = jnp.abs(out.pressure - batch.pressure) / STRESS
     ratio = jnp.log((out.force[:, 2] + LEAST_FORCE) / (batch.force[:, 2] + LEAST_FORCE))
     sideways = (out.force[:, :2] - batch.force[:, :2]) / FORCE
     pressed = (jnp.max(touched, (1, 2)) > 0).astype(jnp.float32)
-    slip = jnp.where(pressed > 0, jax.nn.sigmoid(out.slip) - batch.slip, 0.0)  # none without contact
+    # none without contact
+    slip = jnp.where(pressed > 0, jax.nn.sigmoid(out.slip) - batch.slip, 0.0)
     terms = {
         "depth": over_pixels(losses.laplace_loss(depth, out.depth_log)),
         "slopes": slopes,
         "shear": over_pixels(jnp.mean(losses.laplace_loss(shear, out.shear_log[..., None]), -1)),
-        "contact": 2 * losses.mean(losses.binary_loss(out.contact, touched)),  # unweighted: it is a probability
+        "contact": 2
+        * losses.mean(losses.binary_loss(out.contact, touched)),  # unweighted: it is a probability
         "pressure": over_pixels(pressure),
         "normal": losses.mean(losses.laplace_loss(ratio, out.force_log[:, 1])),
         "tangential": losses.mean(losses.laplace_loss(sideways, out.force_log[:, :1])),
-        "torque": losses.mean(losses.laplace_loss((out.torque - batch.torque) / TORQUE, out.torque_log)),
+        "torque": losses.mean(
+            losses.laplace_loss((out.torque - batch.torque) / TORQUE, out.torque_log)
+        ),
         "slip": losses.mean(losses.laplace_loss(slip, out.slip_log)),
     }
     seen = (out.contact > 0).astype(jnp.float32)
-    both, either = jnp.sum(seen * touched), jnp.sum(jnp.maximum(seen, touched))
+    both = jnp.sum(seen * touched)
+    either = jnp.sum(jnp.maximum(seen, touched))
     metrics = {f"field_{name}": value for name, value in terms.items()} | {
         "contact_iou": both / jnp.maximum(either, 1),
-        "depth_error": LENGTH * jnp.sum(jnp.abs(depth) * touched) / jnp.maximum(jnp.sum(touched), 1),
+        "depth_error": LENGTH
+        * jnp.sum(jnp.abs(depth) * touched)
+        / jnp.maximum(jnp.sum(touched), 1),
         "force_error": jnp.sum(jnp.abs(ratio) * pressed) / jnp.maximum(jnp.sum(pressed), 1),
     }
     return jnp.sum(jnp.stack(list(terms.values()))), metrics
@@ -172,7 +221,9 @@ def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tupl
     """
     batch = _arrays(batch)
     align, match = (None, None) if isinstance(batch, TouchBatch) else batch[:2]
-    pixels = batch if isinstance(batch, TouchBatch) else align if config.recipe == "release" else None
+    pixels = (
+        batch if isinstance(batch, TouchBatch) else align if config.recipe == "release" else None
+    )
     frames = 0 if pixels is None else pixels.clip.shape[1]
     has_image = align is not None and align.image.shape[0] > 0
     has_text = align is not None and align.text.shape[0] > 0
@@ -204,7 +255,11 @@ class Embeddings(NamedTuple):
 
 
 def touch_embeddings(
-    params: Params, touches: Sequence[tuple[Array, Array]], *, net: Net, keep_ids: Array | None = None
+    params: Params,
+    touches: Sequence[tuple[Array, Array]],
+    *,
+    net: Net,
+    keep_ids: Array | None = None,
 ) -> list[Array]:
     """Return unit-norm embeddings (B, E) of several batches of (clip (B, T, H, W, 3) float, sensor i32 (B,)).
 
@@ -215,7 +270,9 @@ def touch_embeddings(
     z: list[Array] = [jnp.zeros(0)] * len(touches)
     for shape in {clip.shape: None for clip, _ in touches}:
         members = [i for i, (clip, _) in enumerate(touches) if clip.shape == shape]
-        clips, sensors = (jnp.stack(part, axis=1) for part in zip(*(touches[i] for i in members), strict=True))
+        clips, sensors = (
+            jnp.stack(part, axis=1) for part in zip(*(touches[i] for i in members), strict=True)
+        )
         rows = clips.reshape(-1, *shape[1:]), sensors.reshape(-1)
         if keep_ids is None:
             flat = net.encode_touch(params, *rows)
@@ -234,7 +291,8 @@ def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Ne
     A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised floats. The content of
     an unused slot is replaced first: NaN would reach the gradients although the slot's value is dropped.
     """
-    batch, (touch,) = _arrays(batch), _arrays((touch,))
+    batch = _arrays(batch)
+    (touch,) = _arrays((touch,))
     image = text = has_image = has_text = None
     if batch.image.shape[0]:
         used = (batch.image_row < len(touch))[:, None, None, None]
@@ -242,7 +300,8 @@ def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Ne
         image, has_image = _scatter(packed, batch.image_row, len(touch))
     if batch.text.shape[0]:
         used = (batch.text_row < len(touch))[:, None]
-        ids, mask = jnp.where(used, batch.text, 0), batch.text_mask.astype(bool) | ~used
+        ids = jnp.where(used, batch.text, 0)
+        mask = batch.text_mask.astype(bool) | ~used
         packed = losses.normalise(net.encode_text(params, ids, mask))
         text, has_text = _scatter(packed, batch.text_row, len(touch))
     return Embeddings(touch, image, text, has_image, has_text)
@@ -255,48 +314,82 @@ def _scatter(packed: Array, row: Array, rows: int) -> tuple[Array, Array]:
 
 
 def stage2_terms(
-    params: Params, batch: Stage2Batch, noise: Array | None, *, net: Net, config: Config,
-    decoder_sensor: Array | None = None, match_noise: Array | None = None,
-) -> tuple[Array, Metrics]:  # fmt: skip
+    params: Params,
+    batch: Stage2Batch,
+    noise: Array | None,
+    *,
+    net: Net,
+    config: Config,
+    decoder_sensor: Array | None = None,
+    match_noise: Array | None = None,
+) -> tuple[Array, Metrics]:
     """Return L_align + lambda L_match (Eq. 9) and every term, unweighted.
 
     Pixels are normalised floats, sensor rows are already drawn. A part of `batch` that is None is not computed. The
     release recipe adds the stage-1 loss of the align batch, if `noise` (B, N) is given. `match_noise` (M, B, N) decides
     which patches the M touches of matching keep; None keeps all.
     """
-    (align, match, _), objective = _arrays(batch), config.objective
-    total, metrics = jnp.zeros(()), Metrics()
+    (align, match, _) = _arrays(batch)
+    objective = config.objective
+    total = jnp.zeros(())
+    metrics = Metrics()
     aligned = [] if align is None else [(align.clip[:, : net.model.frames], align.sensor)]
-    matched = [] if match is None else [(match.clip, match.sensor), (match.positive, match.positive_sensor)]
-    if match is not None and net.model.match_head != "cosine":  # by cosine the other pairs are the negatives
+    matched = (
+        []
+        if match is None
+        else [(match.clip, match.sensor), (match.positive, match.positive_sensor)]
+    )
+    if (
+        match is not None and net.model.match_head != "cosine"
+    ):  # by cosine the other pairs are the negatives
         matched.append((match.negative, match.negative_sensor))
     if match_noise is None:
         z_touch = touch_embeddings(params, aligned + matched, net=net)
     else:
         visible = max(1, tokens.count_visible(net.model.patches, objective.match_keep))
         ids = jax.vmap(lambda noise: tokens.random_mask(noise, visible)[0])(match_noise)
-        z_touch = touch_embeddings(params, aligned, net=net) + touch_embeddings(params, matched, net=net, keep_ids=ids)
-    if align is not None:
-        z, scale = align_embeddings(params, align, z_touch.pop(0), net=net), net.scale(params)
-        loss, terms = losses.alignment_loss(
-            *z, scale, config.pair_weights, groups=objective.groups, center=objective.center_embeddings
+        z_touch = touch_embeddings(params, aligned, net=net) + touch_embeddings(
+            params, matched, net=net, keep_ids=ids
         )
-        total, metrics = total + loss, metrics | terms | {"align": loss, "temperature": 1 / scale}
+    if align is not None:
+        z = align_embeddings(params, align, z_touch.pop(0), net=net)
+        scale = net.scale(params)
+        loss, terms = losses.alignment_loss(
+            *z,
+            scale,
+            config.pair_weights,
+            groups=objective.groups,
+            center=objective.center_embeddings,
+        )
+        total = total + loss
+        metrics = metrics | terms | {"align": loss, "temperature": 1 / scale}
         if config.recipe == "release" and noise is not None:
             loss, terms = stage1_terms(
-                params, align.clip, align.sensor, noise, net=net, config=config, decoder_sensor=decoder_sensor
+                params,
+                align.clip,
+                align.sensor,
+                noise,
+                net=net,
+                config=config,
+                decoder_sensor=decoder_sensor,
             )
-            total, metrics = total + loss, metrics | terms
+            total = total + loss
+            metrics = metrics | terms
     if match is not None:
         if net.model.match_head == "cosine":
-            (first, second), scale = z_touch, net.scale(params)
-            loss, right = losses.contrast_loss(first, second, scale, groups=objective.groups, place=match.place)
+            (first, second) = z_touch
+            scale = net.scale(params)
+            loss, right = losses.contrast_loss(
+                first, second, scale, groups=objective.groups, place=match.place
+            )
         else:
             z_anchor, *others = z_touch
-            positive, negative = (net.match(params, z_anchor, z) for z in others)  # Eq. 5
+            # Eq. 5
+            positive, negative = (net.match(params, z_anchor, z) for z in others)
             loss = losses.matching_loss(positive, negative)
             right = jnp.mean(jnp.concatenate([positive > 0, negative < 0]).astype(jnp.float32))
-        total, metrics = total + objective.match_weight * loss, metrics | {"match": loss, "match_accuracy": right}
+        total = total + objective.match_weight * loss
+        metrics = metrics | {"match": loss, "match_accuracy": right}
     return total, metrics
 
 
@@ -308,13 +401,19 @@ def stage2_loss(
     `progress` f32 () in [0, 1] drives p_u (Eq. 7).
     """
     key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
-    (align, match, fields), patches = _arrays(batch), net.model.patches
-    metrics, noise, own, match_noise = Metrics(), None, None, None
+    (align, match, fields) = _arrays(batch)
+    patches = net.model.patches
+    metrics = Metrics()
+    noise = None
+    own = None
+    match_noise = None
     if align is not None:
         own = align.sensor
         noise = jax.random.uniform(key_noise, (len(own), patches))
         metrics["p_u"], sensor = _draw_tokens(own, key_align, progress, net, config)
-        align = align._replace(clip=normalise_touch(align.clip), sensor=sensor, image=normalise_image(align.image))
+        align = align._replace(
+            clip=normalise_touch(align.clip), sensor=sensor, image=normalise_image(align.image)
+        )
     if match is not None:
         metrics["p_u"], match = _draw_match(match, key_match, progress, net, config)
         if config.objective.match_keep < 1:
@@ -327,7 +426,9 @@ def stage2_loss(
     return _with_fields(params, fields, loss, terms | metrics, key, progress, net, config)
 
 
-def _draw_tokens(sensor: Array, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, Array]:
+def _draw_tokens(
+    sensor: Array, key: Array, progress: Array, net: Net, config: Config
+) -> tuple[Array, Array]:
     """Return p_u at `progress`, and the sensor rows after one draw a sample (Eq. 7)."""
     objective = config.objective
     p_u = tokens.universal_probability(progress, objective.universal_start, objective.universal_end)
@@ -335,7 +436,9 @@ def _draw_tokens(sensor: Array, key: Array, progress: Array, net: Net, config: C
     return p_u, tokens.draw_tokens(sensor, uniform, p_u, net.model.universal_row)
 
 
-def _draw_match(batch: MatchBatch, key: Array, progress: Array, net: Net, config: Config) -> tuple[Array, MatchBatch]:
+def _draw_match(
+    batch: MatchBatch, key: Array, progress: Array, net: Net, config: Config
+) -> tuple[Array, MatchBatch]:
     """Return the matching pair or triple with normalised pixels and drawn tokens."""
     # The release shares one draw between anchor, positive and negative.
     keys = [key] * 3 if config.recipe == "release" else list(jax.random.split(key, 3))

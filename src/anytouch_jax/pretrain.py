@@ -34,14 +34,23 @@ from anytouch_jax.weights.families import load_start
 
 Params = dict[str, Any]
 Log = Callable[[str], None]
-SCRATCH_VOCABULARY, TOKENIZER, CHECKPOINTS = 2048, "tokenizer.json", "checkpoints"
+SCRATCH_VOCABULARY = 2048
+TOKENIZER = "tokenizer.json"
+CHECKPOINTS = "checkpoints"
 
 
 def pretrain(
-    config: Config, run: str | Path, *, init: str | Path | None = None, clip: str | Path | None = None,
-    stop_after: int | None = None, log: Log = print, mesh: Mesh | None = None,
-    curve: bool = False, until: float | None = None,
-) -> FitResult:  # fmt: skip
+    config: Config,
+    run: str | Path,
+    *,
+    init: str | Path | None = None,
+    clip: str | Path | None = None,
+    stop_after: int | None = None,
+    log: Log = print,
+    mesh: Mesh | None = None,
+    curve: bool = False,
+    until: float | None = None,
+) -> FitResult:
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
     `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1
@@ -51,7 +60,9 @@ def pretrain(
     """
     refuse_forked()
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
-    report, log = log, log if jax.process_index() == 0 else silent  # every process reads other samples
+    # every process reads other samples
+    report = log
+    log = log if jax.process_index() == 0 else silent
     resumes = bool(steps(run / CHECKPOINTS))
     _check(config, run, init, clip, resumes)
     real = tuple(name for name in config.data.manifests if name != SIMULATED)
@@ -62,9 +73,12 @@ def pretrain(
     config, tokenizer = _choose_tokenizer(config, run, manifest, clip, resumes, simulates)
     net = build(config.model)
     params = net.init(jax.random.key(config.run.seed))
-    stored, sensors, notes = dict[str, Any](), tuple[str, ...](), list[str]()
+    stored = dict[str, Any]()
+    sensors = tuple[str, ...]()
+    notes = list[str]()
     if resumes:  # only the shapes of `params` matter
-        with suppress(CheckpointError):  # `fit` reports a damaged checkpoint
+        # `fit` reports a damaged checkpoint
+        with suppress(CheckpointError):
             stored = read_metadata(run)
         _check_resume(run, manifest, stored, log, init=init, clip=clip)
     else:
@@ -75,7 +89,9 @@ def pretrain(
         loader = SimulatedLoader(config, manifest, tokenizer=tokenizer, devices=mesh.size, log=log)
     else:
         assert manifest is not None
-        loader = Loader(manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard, log=report)
+        loader = Loader(
+            manifest, config, tokenizer=tokenizer, devices=mesh.size, shard=shard, log=report
+        )
     for note in (*notes, *loader.notes):
         log(note)
     config = _with_warmup(config, run, loader)
@@ -84,8 +100,18 @@ def pretrain(
         "sensors": list(config.model.sensors),
         "seen": [name for name in config.model.sensors if name in trained],
         "preprocessing": {
-            "touch": {"size": config.model.image_size, "mean": IMAGENET_MEAN, "std": IMAGENET_STD, "channels": "RGB"},
-            "image": {"size": config.model.image_size, "mean": CLIP_MEAN, "std": CLIP_STD, "channels": "RGB"},
+            "touch": {
+                "size": config.model.image_size,
+                "mean": IMAGENET_MEAN,
+                "std": IMAGENET_STD,
+                "channels": "RGB",
+            },
+            "image": {
+                "size": config.model.image_size,
+                "mean": CLIP_MEAN,
+                "std": CLIP_STD,
+                "channels": "RGB",
+            },
         },
         "source": stored.get("source", {"init": init and str(init), "clip": clip and str(clip)}),
         "data": _content(manifest),
@@ -95,32 +121,50 @@ def pretrain(
         if jax.process_index() == 0 and tokenizer is not None and not resumes:
             tokenizer.save(run / TOKENIZER)
         return fit(
-            config, params=params, loss_fn=partial(loss, net=net, config=config), batches=loader.stream, run_dir=run,
-            trained=partial(objectives.trained_by, config=config), stop_after=stop_after, metadata=metadata,
-            on_report=partial(_draw_reconstructions, run=run, net=net, config=config), log=log, mesh=mesh,
-            curve=curve, until=until, examples=getattr(loader, "examples", ()),
-        )  # fmt: skip
+            config,
+            params=params,
+            loss_fn=partial(loss, net=net, config=config),
+            batches=loader.stream,
+            run_dir=run,
+            trained=partial(objectives.trained_by, config=config),
+            stop_after=stop_after,
+            metadata=metadata,
+            on_report=partial(_draw_reconstructions, run=run, net=net, config=config),
+            log=log,
+            mesh=mesh,
+            curve=curve,
+            until=until,
+            examples=getattr(loader, "examples", ()),
+        )
 
 
 def _check(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> None:
     """Raise UserError for settings that this machine or this stage cannot follow, and for missing weights."""
-    model, has_x64 = config.model, jax.config.read("jax_enable_x64")
-    cudnn, float64 = model.attention == "cudnn", model.dtype == "float64"
-    wide, lacks_x64 = model.dtype != "bfloat16", float64 and not has_x64
-    linear, twice = model.match_head == "linear" and config.recipe == "paper", init is not None and clip is not None
+    model = config.model
+    has_x64 = jax.config.read("jax_enable_x64")
+    cudnn = model.attention == "cudnn"
+    float64 = model.dtype == "float64"
+    wide = model.dtype != "bfloat16"
+    lacks_x64 = float64 and not has_x64
+    linear = model.match_head == "linear" and config.recipe == "paper"
+    twice = init is not None and clip is not None
     slots = config.stage == 2 and bool(model.image or model.text)
     has_tokenizer = model.text is None or (run / TOKENIZER).exists()
     lacks_clip = config.towers == "pretrained" and clip is None and not (resumes and has_tokenizer)
     wrong = {
-        "--model.attention cudnn needs a GPU of NVIDIA; leave it out here": cudnn and jax.default_backend() != "gpu",
-        "--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out": cudnn and wide,
+        "--model.attention cudnn needs a GPU of NVIDIA; leave it out here": cudnn
+        and jax.default_backend() != "gpu",
+        "--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out": cudnn
+        and wide,
         "--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32": lacks_x64,
         "JAX_ENABLE_X64 is set, which changes the random numbers and the checkpoints of a run: unset it, or add "
         "--model.dtype float64": has_x64 and not float64,
         "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "
         "whole batch; lower --batch instead": slots and config.optim.accumulate > 1,
         "--model.match-head linear is the head of the release; add --recipe release, or choose mlp": linear,
-        "--init and --clip-weights both give stage 1 its touch encoder; leave one out": config.stage == 1 and twice,
+        "--init and --clip-weights both give stage 1 its touch encoder; leave one out": config.stage
+        == 1
+        and twice,
         f"{run} is a file, not a folder; choose another --run": run.is_file(),
         "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in the same "
         "folder": lacks_clip,
@@ -128,16 +172,24 @@ def _check(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> No
     if sentences := [sentence for sentence, is_so in wrong.items() if is_so]:
         raise UserError(sentences[0])
     if (earlier := begun_with(run)) is not None and earlier.stage != config.stage:
-        raise UserError(f"{run} has a run of stage {earlier.stage}; choose another --run for stage {config.stage}")
+        raise UserError(
+            f"{run} has a run of stage {earlier.stage}; choose another --run for stage {config.stage}"
+        )
 
 
 def _content(manifest: manifests.Manifest | None) -> str:
     """Return the hash of the rows that a run reads."""
-    return SIMULATED if manifest is None else manifest.content_hash
+    if manifest is None:
+        return SIMULATED
+    return manifest.content_hash
 
 
 def _check_resume(
-    run: Path, manifest: manifests.Manifest | None, stored: Mapping[str, Any], log: Log, **paths: str | Path | None
+    run: Path,
+    manifest: manifests.Manifest | None,
+    stored: Mapping[str, Any],
+    log: Log,
+    **paths: str | Path | None,
 ) -> None:
     """Raise UserError if a run resumes on other rows; log weights that differ from those that it started from."""
     if stored.get("data") not in (None, _content(manifest)):
@@ -148,9 +200,15 @@ def _check_resume(
     source = stored.get("source") or {}
     for name, path in paths.items():
         before = source.get(name)
-        if stored and path is not None and (before is None or Path(before).resolve() != Path(path).resolve()):
+        if (
+            stored
+            and path is not None
+            and (before is None or Path(before).resolve() != Path(path).resolve())
+        ):
             option = "--clip-weights" if name == "clip" else "--init"
-            log(f"{run} resumes and was started with {option} {before or '(nothing)'}: {path} is not read")
+            log(
+                f"{run} resumes and was started with {option} {before or '(nothing)'}: {path} is not read"
+            )
 
 
 def _with_warmup(config: Config, run: Path, loader: Loader | SimulatedLoader) -> Config:
@@ -168,16 +226,23 @@ def _choose_tokenizer(
     if config.model.text is None:
         return config, None
     file = None
-    if resumes and (run / TOKENIZER).exists():  # without a checkpoint it is left from a start that failed
+    if (
+        resumes and (run / TOKENIZER).exists()
+    ):  # without a checkpoint it is left from a start that failed
         file = run / TOKENIZER
     elif config.data.tokenizer is None and config.towers == "pretrained":
         file = (Path(clip) if Path(clip).is_dir() else Path(clip).parent) / TOKENIZER
     if simulates:
-        own = simulated.caption_tokenizer(config, manifest) if file is None else load_tokenizer(file)
+        own = (
+            simulated.caption_tokenizer(config, manifest) if file is None else load_tokenizer(file)
+        )
         if config.towers == "pretrained":
             return config, own
-        return config.with_settings({"model.text": replace(config.model.text, vocab=own.vocab_size)}), own
-    rows, most = manifest.rows_of(config.data.split), min(SCRATCH_VOCABULARY, config.model.text.vocab)
+        return config.with_settings(
+            {"model.text": replace(config.model.text, vocab=own.vocab_size)}
+        ), own
+    rows = manifest.rows_of(config.data.split)
+    most = min(SCRATCH_VOCABULARY, config.model.text.vocab)
     tokenizer, _ = pools.choose_tokenizer(manifest, rows, config, file=file, vocabulary=most)
     if tokenizer is None or config.towers == "pretrained":
         return config, tokenizer
@@ -185,7 +250,9 @@ def _choose_tokenizer(
     return config.with_settings({"model.text": text}), tokenizer
 
 
-def _draw_reconstructions(step: int, params: Params, batch: Any, *, run: Path, net: Net, config: Config) -> None:
+def _draw_reconstructions(
+    step: int, params: Params, batch: Any, *, run: Path, net: Net, config: Config
+) -> None:
     """Draw the first samples of a batch that has touches to reconstruct."""
     if isinstance(batch, Stage2Batch):
         batch = batch.align

@@ -6,7 +6,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-_LETTERS, _ITEMS = 80, 12  # of a value
+# of a value
+_LETTERS = 80
+_ITEMS = 12
 
 
 def shown_short(kind: type[T]) -> type[T]:
@@ -18,12 +20,16 @@ def shown_short(kind: type[T]) -> type[T]:
 def described(title: str, **lines: str) -> str:
     """Return a title, and below it an indented line for each of the others that is not empty."""
     width = max(map(len, lines))
-    return "\n".join([_cut(title), *(f"  {name:{width}}  {text}" for name, text in lines.items() if text)])
+    return "\n".join(
+        [_cut(title), *(f"  {name:{width}}  {text}" for name, text in lines.items() if text)]
+    )
 
 
 def count_of(number: int) -> str:
     """Return a number of parameters: 2.7 M."""
-    return f"{number / 1e6:.1f} M" if number >= 1e5 else f"{number:,}"
+    if number >= 1e5:
+        return f"{number / 1e6:.1f} M"
+    return f"{number:,}"
 
 
 def leaves(tree: Any) -> Iterator[Any]:
@@ -36,19 +42,28 @@ def leaves(tree: Any) -> Iterator[Any]:
 
 
 def _repr(record: Any) -> str:
-    defaults, names = getattr(record, "_field_defaults", {}), getattr(record, "_fields", ())
+    defaults = getattr(record, "_field_defaults", {})
+    names = getattr(record, "_fields", ())
     if dataclasses.is_dataclass(record):
         shown = [field for field in dataclasses.fields(record) if field.repr]
         made = ((field.default_factory, field) for field in shown)
-        defaults = {one.name: one.default if make is dataclasses.MISSING else make() for make, one in made}
+        defaults = {
+            one.name: one.default if make is dataclasses.MISSING else make() for make, one in made
+        }
         names = tuple(defaults)
     values = ((name, getattr(record, name)) for name in names)
-    fields = (f"{name}={_short(value)}" for name, value in values if not _is(value, defaults.get(name, ...)))
+    fields = (
+        f"{name}={_short(value)}"
+        for name, value in values
+        if not _is(value, defaults.get(name, ...))
+    )
     return f"{type(record).__name__}({', '.join(fields)})"
 
 
 def _is(value: Any, default: Any) -> bool:
-    return value is default or (type(value) is type(default) and not hasattr(value, "shape") and bool(value == default))
+    return value is default or (
+        type(value) is type(default) and not hasattr(value, "shape") and bool(value == default)
+    )
 
 
 def _short(value: Any) -> str:
@@ -63,9 +78,13 @@ def _short(value: Any) -> str:
         return f"<{len(value)} entries>"
     if type(value) in (tuple, list):
         inner = ", ".join(map(_short, value)) + "," * (type(value) is tuple and len(value) == 1)
-        return f"({inner})" if isinstance(value, tuple) else f"[{inner}]"
+        if isinstance(value, tuple):
+            return f"({inner})"
+        return f"[{inner}]"
     return _cut(repr(value))
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= _LETTERS else f"{text[:50]} ... {text[-25:]}"
+    if len(text) <= _LETTERS:
+        return text
+    return f"{text[:50]} ... {text[-25:]}"

@@ -33,7 +33,8 @@ SIMULATED = "simulated"  # the word of --data that stands for simulated touches
 WORDINGS = 8  # captions of each object
 VOCABULARY = 2048
 WEIGHT = 9.0  # of simulated touches (--data.weights simulated) over all real ones
-FREE = (0.06, 0.02)  # share of the touches of stage 1 and 2 that show an untouched gel, if fields are learned
+# share of the touches of stage 1 and 2 that show an untouched gel, if fields are learned
+FREE = (0.06, 0.02)
 TRIES = 8  # draws in which a partner by another unit is looked for
 MOST_PIXELS = 4_000_000_000  # bytes of real frames that are kept on the device
 FIELD_SHARE = 0.5  # of a batch's touches: those whose fields are learned
@@ -49,7 +50,8 @@ class Real(NamedTuple):
     """Real frames on the device. `windows` and `pairs` have an entry for stills and one for clips, or None."""
 
     frame: Any  # u8 (N, S, S, 3)
-    gel: Any  # u8 (G, 2, S, S, 3): the stored picture of the untouched gel, and the median of the unit
+    # u8 (G, 2, S, S, 3): the stored picture of the untouched gel, and the median of the unit
+    gel: Any
     gel_of: Any  # i32 (N,)
     sensor: Any  # i32 (N,)
     caption: Any  # i32 (N,), -1 without
@@ -87,31 +89,52 @@ class SimulatedLoader:
     """
 
     def __init__(
-        self, config: Config, manifest: Manifest | None = None, *, tokenizer: Tokenizer | None = None,
-        devices: int = 1, log: Callable[[str], None] = lambda _: None,
-    ) -> None:  # fmt: skip
-        simulated, model, size = config.simulated, config.model, config.data.batch_size
+        self,
+        config: Config,
+        manifest: Manifest | None = None,
+        *,
+        tokenizer: Tokenizer | None = None,
+        devices: int = 1,
+        log: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        simulated = config.simulated
+        model = config.model
+        size = config.data.batch_size
         if config.recipe == "release":
             raise UserError("--data simulated is for the recipe paper; leave out --recipe release")
-        self.config, self.tokenizer, self.notes = config, tokenizer, list[str]()
+        self.config = config
+        self.tokenizer = tokenizer
+        self.notes = list[str]()
         self.objects = training_objects(config)
-        world = endless.make_world(self.objects, simulated.sensors, places=simulated.places, seed=simulated.seed)
+        world = endless.make_world(
+            self.objects, simulated.sensors, places=simulated.places, seed=simulated.seed
+        )
         self._rows = np.array(
-            [model.sensor_row(find_sensor(name).name) for name in simulated.sensors] + [model.universal_row], np.int32
+            [model.sensor_row(find_sensor(name).name) for name in simulated.sensors]
+            + [model.universal_row],
+            np.int32,
         )
         self._real = None if manifest is None else load_real(manifest, config, log)
         weight = dict(config.data.weights or ()).get(SIMULATED, WEIGHT)
-        self._count = size if self._real is None else max(1, min(size - 1, round(size * weight / (weight + 1))))
-        self._photos, self._texts = None, None
+        self._count = (
+            size
+            if self._real is None
+            else max(1, min(size - 1, round(size * weight / (weight + 1))))
+        )
+        self._photos = None
+        self._texts = None
         if config.stage == 2 and model.image is not None and simulated.vision:
             self._photos = jax.device_put(photo_bank(self.objects, world.places, model.image_size))
         if config.stage == 2 and model.text is not None:
             self._texts = jax.device_put(self._encode(manifest))
-        self._world, self._key = jax.device_put(world), jax.random.key(config.run.seed)
+        self._world = jax.device_put(world)
+        self._key = jax.random.key(config.run.seed)
         self._pool: tuple[tuple[int, int], SimulatedTouches] | None = None
         kinds = sum(1 for part in self._real.windows if part is not None) if self._real else 2
         self._has_clips = kinds > 1 and config.data.clip_share > 0
-        self._assemble = jax.jit(partial(_assemble, config=config, rows=self._rows, devices=devices))
+        self._assemble = jax.jit(
+            partial(_assemble, config=config, rows=self._rows, devices=devices)
+        )
 
     @property
     def steps_per_epoch(self) -> int:
@@ -121,12 +144,16 @@ class SimulatedLoader:
     @property
     def trained_sensors(self) -> list[str]:
         """Names of the sensors that batches are drawn from, in the order of the sensor table."""
-        rows = {*self._rows[:-1].tolist(), *(() if self._real is None else np.asarray(self._real.sensor).tolist())}
+        rows = {
+            *self._rows[:-1].tolist(),
+            *(() if self._real is None else np.asarray(self._real.sensor).tolist()),
+        }
         return [name for number, name in enumerate(self.config.model.sensors) if number in rows]
 
     def _encode(self, manifest: Manifest | None) -> Texts:
         """Return the tokens of all captions, and an empty caption last."""
-        tower, tokenizer = self.config.model.text, self.tokenizer
+        tower = self.config.model.text
+        tokenizer = self.tokenizer
         assert tower is not None and tokenizer is not None
         texts = [*wordings(self.objects), *real_captions(manifest)]
         length = min(tower.length, -(-tokenizer.longest(texts) // 8) * 8)
@@ -136,20 +163,29 @@ class SimulatedLoader:
         """Return the frames of the touches of a step: 1 for stills."""
         share = self.config.data.clip_share if self._has_clips else 0.0
         is_clip = np.floor((step + 1) * share) > np.floor(step * share)
-        return (self.config.model.frames + self.config.reconstructs) if is_clip else 1
+        if is_clip:
+            return self.config.model.frames + self.config.reconstructs
+        return 1
 
     def _sampled(self, step: int) -> tuple[Array, World, Sampling, int, Array]:
         """Return what the simulated touches of a step are sampled from."""
         config, simulated = self.config, self.config.simulated
         sampling = Sampling(
-            frames=self.frames(step), takes=config.stage, size=config.model.image_size, coarse=simulated.coarse,
+            frames=self.frames(step),
+            takes=config.stage,
+            size=config.model.image_size,
+            coarse=simulated.coarse,
             free=FREE[config.stage - 1] if config.model.fields else 0.0,
-            vision=simulated.vision if self._photos is not None else 0.0, wild=simulated.wild,
-            depth=simulated.depth, fields=FIELDS if config.model.fields else (),
+            vision=simulated.vision if self._photos is not None else 0.0,
+            wild=simulated.wild,
+            depth=simulated.depth,
+            fields=FIELDS if config.model.fields else (),
             field_size=config.model.image_size // 2,
-        )  # fmt: skip
+        )
         key = jax.random.fold_in(jax.random.fold_in(self._key, 1), step // simulated.reuse)
-        gallery = jax.random.randint(jax.random.fold_in(key, sampling.frames), (), 0, len(simulated.sensors))
+        gallery = jax.random.randint(
+            jax.random.fold_in(key, sampling.frames), (), 0, len(simulated.sensors)
+        )
         return key, self._world, sampling, self._count, gallery
 
     def touches(self, step: int) -> SimulatedTouches:
@@ -169,7 +205,9 @@ class SimulatedLoader:
             key, world, sampling, count, gallery = self._sampled(step)
             sample = partial(endless.sample_touches, sampling=sampling, count=count)
             touches = jax.eval_shape(sample, key, world, gallery=gallery)
-            batch: Batch = jax.eval_shape(self._assemble, key, touches, self._real, self._photos, self._texts)
+            batch: Batch = jax.eval_shape(
+                self._assemble, key, touches, self._real, self._photos, self._texts
+            )
             return batch
 
         first = {self.frames(step): step for step in range(20, -1, -1)}
@@ -206,7 +244,13 @@ def real_captions(manifest: Manifest | None) -> list[str]:
     """Return the distinct captions of a manifest, in the order of their codes."""
     if manifest is None:
         return []
-    return [str(text) for text in manifest.column("text").combine_chunks().dictionary_encode().dictionary.to_pylist()]
+    return [
+        str(text)
+        for text in manifest.column("text")
+        .combine_chunks()
+        .dictionary_encode()
+        .dictionary.to_pylist()
+    ]
 
 
 def caption_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
@@ -233,7 +277,9 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
     for note in pools.notes:
         log(note)
     size = config.model.image_size
-    windows = [pool.windows for pool in pools.touch] + [pool.windows for pool in pools.match if pool is not None]
+    windows = [pool.windows for pool in pools.touch] + [
+        pool.windows for pool in pools.match if pool is not None
+    ]
     rows = np.unique(np.concatenate([part.ravel() for part in windows]))
     if len(rows) * size * size * 3 > MOST_PIXELS:
         raise UserError(
@@ -249,27 +295,41 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
     caption = column.indices.fill_null(-1).to_numpy(False)[rows].astype(np.int32)
     weights, _ = epoch_weights(manifest, config, rows)
     weights = np.ones(len(manifest)) if weights is None else weights
-    kinds = [(place[pool.windows], _cumulative(weights[pool.windows[:, -1]])) for pool in pools.touch]
+    kinds = [
+        (place[pool.windows], _cumulative(weights[pool.windows[:, -1]])) for pool in pools.touch
+    ]
     windows_of = (*kinds, *[None] * (2 - len(kinds)))
     pairs = tuple(_pairs(manifest, match, place, weights) for match in pools.match)
-    real = Real(frame, gels, gel_of, pools.sensor[rows].astype(np.int32), caption, windows_of, pairs)
+    real = Real(
+        frame, gels, gel_of, pools.sensor[rows].astype(np.int32), caption, windows_of, pairs
+    )
     return jax.device_put(real)
 
 
-def _real_gels(manifest: Manifest, rows: np.ndarray, frame: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _real_gels(
+    manifest: Manifest, rows: np.ndarray, frame: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return pictures of untouched gels u8 (G, 2, S, S, 3), stored and median of the unit, and that of each row."""
     stored = manifest.codes("background_path")[rows]
-    unit, sensor = manifest.codes("unit")[rows], manifest.codes("sensor")[rows]
+    unit = manifest.codes("unit")[rows]
+    sensor = manifest.codes("sensor")[rows]
     owner = np.where(unit >= 0, unit, -1 - sensor)
-    _, first, group = np.unique(np.stack([owner, stored]), axis=1, return_index=True, return_inverse=True)
-    medians, gels = dict[int, np.ndarray](), []
+    _, first, group = np.unique(
+        np.stack([owner, stored]), axis=1, return_index=True, return_inverse=True
+    )
+    medians = dict[int, np.ndarray]()
+    gels = []
     for place in first:
         if (own := int(owner[place])) not in medians:
             same = np.flatnonzero(owner == own)
-            medians[own] = np.median(frame[same[:: max(1, len(same) // 300)]], axis=0).astype(np.uint8)
+            medians[own] = np.median(frame[same[:: max(1, len(same) // 300)]], axis=0).astype(
+                np.uint8
+            )
         picture = medians[own]
         if stored[place] >= 0:
-            picture = touch_evaluation([read_image(manifest, int(rows[place]), "background_path")], size)[0]
+            picture = touch_evaluation(
+                [read_image(manifest, int(rows[place]), "background_path")], size
+            )[0]
         gels.append(np.stack([picture, medians[own]]))
     return np.stack(gels), group.ravel().astype(np.int32)
 
@@ -278,7 +338,9 @@ def _cumulative(weights: np.ndarray) -> np.ndarray:
     return (np.cumsum(weights) / weights.sum()).astype(np.float32)
 
 
-def _pairs(manifest: Manifest, match: MatchPool | None, place: np.ndarray, weights: np.ndarray) -> _Pairs | None:
+def _pairs(
+    manifest: Manifest, match: MatchPool | None, place: np.ndarray, weights: np.ndarray
+) -> _Pairs | None:
     if match is None:
         return None
     windows = match.windows[match.matches.anchors]
@@ -288,7 +350,9 @@ def _pairs(manifest: Manifest, match: MatchPool | None, place: np.ndarray, weigh
     low = np.searchsorted(touch[order], touch)
     count = np.searchsorted(touch[order], touch, side="right") - low
     numbers = (order, low, count, touch, manifest.codes("unit")[last])
-    return _Pairs(place[windows], _cumulative(weights[last]), *(x.astype(np.int32) for x in numbers))
+    return _Pairs(
+        place[windows], _cumulative(weights[last]), *(x.astype(np.int32) for x in numbers)
+    )
 
 
 class _Touches(NamedTuple):
@@ -299,16 +363,26 @@ class _Touches(NamedTuple):
 
 
 def _assemble(
-    key: Array, touches: SimulatedTouches, real: Real | None, photos: Array | None, texts: Texts | None, *,
-    config: Config, rows: np.ndarray, devices: int,
-) -> Batch:  # fmt: skip
+    key: Array,
+    touches: SimulatedTouches,
+    real: Real | None,
+    photos: Array | None,
+    texts: Texts | None,
+    *,
+    config: Config,
+    rows: np.ndarray,
+    devices: int,
+) -> Batch:
     """Return the batch of a step from simulated touches and the real frames."""
-    count, missing = len(touches.object), config.data.batch_size - len(touches.object)
+    count = len(touches.object)
+    missing = config.data.batch_size - len(touches.object)
     sensor = jnp.asarray(rows)[touches.sensor]
     touches = moved_gel(jax.random.fold_in(key, 7), touches)
     keys = jax.random.split(key, 6)
     takes = [
-        _Touches(prepared(keys[m], touches.clip[:, m], touches.background[:, m], config), sensor[:, m])
+        _Touches(
+            prepared(keys[m], touches.clip[:, m], touches.background[:, m], config), sensor[:, m]
+        )
         for m in range(touches.clip.shape[1])
     ]
     fields = None
@@ -319,7 +393,9 @@ def _assemble(
         one = takes[0]
         if real is not None:
             picked, share = real.windows[kind]
-            one = _joined(one, _real_touches(keys[3], real, picked[_drawn(keys[4], share, missing)], config))
+            one = _joined(
+                one, _real_touches(keys[3], real, picked[_drawn(keys[4], share, missing)], config)
+            )
         return TouchBatch(one.clip, one.sensor, fields)
     first, second = takes
     place = jnp.arange(count, dtype=jnp.int32)
@@ -332,8 +408,12 @@ def _assemble(
         pairs: _Pairs = real.pairs[kind] if real.pairs[kind] is not None else real.pairs[STILL]
         at = _drawn(keys[3], pairs.share, missing)
         other = _partners(keys[4], pairs, at)
-        first = _joined(first, _real_touches(jax.random.fold_in(keys[3], 1), real, pairs.rows[at], config))
-        second = _joined(second, _real_touches(jax.random.fold_in(keys[4], 1), real, pairs.rows[other], config))
+        first = _joined(
+            first, _real_touches(jax.random.fold_in(keys[3], 1), real, pairs.rows[at], config)
+        )
+        second = _joined(
+            second, _real_touches(jax.random.fold_in(keys[4], 1), real, pairs.rows[other], config)
+        )
         place = jnp.concatenate([place, count + pairs.place[at]])
         own = real.caption[pairs.rows[at][:, -1]]
         # Captions of real rows come after the simulated ones, and an empty one is last.
@@ -341,15 +421,21 @@ def _assemble(
         caption = jnp.concatenate([caption, jnp.where(own >= 0, first_real + own, -1)])
     match = MatchBatch(first.clip, first.sensor, second.clip, second.sensor, place=place)
     size = len(first.sensor)
-    image, image_row = jnp.zeros((0, *first.clip.shape[2:]), jnp.uint8), jnp.zeros(0, jnp.int32)
+    image = jnp.zeros((0, *first.clip.shape[2:]), jnp.uint8)
+    image_row = jnp.zeros(0, jnp.int32)
     if photos is not None:
         slots = min(_slots(count / 2, devices), count)
-        seen = jnp.argsort(touches.photo < 0, stable=True)[:slots]  # touches with a photograph come first
+        # touches with a photograph come first
+        seen = jnp.argsort(touches.photo < 0, stable=True)[:slots]
         image = photos[touches.object[seen], jnp.maximum(touches.photo[seen], 0)]
         image_row = jnp.where(touches.photo[seen] >= 0, seen, size).astype(jnp.int32)
-    text, mask, text_row = jnp.zeros((0, 2), jnp.int32), jnp.zeros((0, 2), bool), jnp.zeros(0, jnp.int32)
+    text = jnp.zeros((0, 2), jnp.int32)
+    mask = jnp.zeros((0, 2), bool)
+    text_row = jnp.zeros(0, jnp.int32)
     if texts is not None:
-        text, mask = texts.ids[caption], texts.mask[caption]  # row -1 is the empty caption
+        # row -1 is the empty caption
+        text = texts.ids[caption]
+        mask = texts.mask[caption]
         text_row = jnp.where(caption >= 0, jnp.arange(size), size).astype(jnp.int32)
     align = AlignBatch(first.clip, first.sensor, image, image_row, text, mask, text_row)
     has_towers = photos is not None or texts is not None
@@ -373,7 +459,9 @@ def _drawn(key: Array, share: Array, count: int) -> Array:
 def _partners(key: Array, pairs: _Pairs, at: Array) -> Array:
     """Return a touch of the same place for each of `at`: by another unit if TRIES draws find one, else another one."""
     draw = jax.random.uniform(key, (len(at), TRIES))
-    tries = pairs.order[pairs.low[at][:, None] + (draw * pairs.count[at][:, None]).astype(jnp.int32)]
+    tries = pairs.order[
+        pairs.low[at][:, None] + (draw * pairs.count[at][:, None]).astype(jnp.int32)
+    ]
     score = 2 * (pairs.unit[tries] != pairs.unit[at][:, None]) + (tries != at[:, None])
     return jnp.take_along_axis(tries, jnp.argmax(score, 1)[:, None], 1)[:, 0]
 
@@ -381,10 +469,13 @@ def _partners(key: Array, pairs: _Pairs, at: Array) -> Array:
 def _real_touches(key: Array, real: Real, rows: Array, config: Config) -> _Touches:
     """Return augmented and prepared real touches of windows of rows (B, T)."""
     warp, gel, prepare = jax.random.split(key, 3)
-    which = jax.random.bernoulli(gel, 0.4, (len(rows),)).astype(jnp.int32)  # the stored picture, or the median
+    # the stored picture, or the median
+    which = jax.random.bernoulli(gel, 0.4, (len(rows),)).astype(jnp.int32)
     background = real.gel[real.gel_of[rows[:, -1]], which]
     moved = augmented(warp, jnp.concatenate([real.frame[rows], background[:, None]], 1), config)
-    return _Touches(prepared(prepare, moved[:, :-1], moved[:, -1], config), real.sensor[rows[:, -1]])
+    return _Touches(
+        prepared(prepare, moved[:, :-1], moved[:, -1], config), real.sensor[rows[:, -1]]
+    )
 
 
 def augmented(key: Array, clip: Array, config: Config) -> Array:
@@ -402,23 +493,33 @@ def augmented(key: Array, clip: Array, config: Config) -> Array:
 def _warped(clip: Array, draw: Array, affine: tuple[float, float, float]) -> Array:
     """Turn, zoom, stretch and shift a clip u8 (T, S, S, 3) about its centre by shares `draw` (5,) of the most."""
     degrees, share, growth = affine
-    angle, zoom, stretch = jnp.deg2rad(draw[0] * degrees), (1 + growth) ** draw[1], 1.25 ** draw[4]
+    angle = jnp.deg2rad(draw[0] * degrees)
+    zoom = (1 + growth) ** draw[1]
+    stretch = 1.25 ** draw[4]
     height, width = clip.shape[1:3]
     y, x = jnp.mgrid[:height, :width]
-    y, x = y - (height - 1) / 2 - draw[2] * share * height, x - (width - 1) / 2 - draw[3] * share * width
-    source = jnp.stack([jnp.cos(angle) * y - jnp.sin(angle) * x, jnp.sin(angle) * y + jnp.cos(angle) * x])
+    y = y - (height - 1) / 2 - draw[2] * share * height
+    x = x - (width - 1) / 2 - draw[3] * share * width
+    source = jnp.stack(
+        [jnp.cos(angle) * y - jnp.sin(angle) * x, jnp.sin(angle) * y + jnp.cos(angle) * x]
+    )
     source = source / (zoom * jnp.stack([stretch**0.5, stretch**-0.5]))[:, None, None]
     source = source + jnp.array([(height - 1) / 2, (width - 1) / 2])[:, None, None]
     planes = jnp.moveaxis(clip, -1, 1).reshape(-1, height, width).astype(jnp.float32)
-    warped = jax.vmap(lambda plane: map_coordinates(plane, list(source), order=1, mode="mirror"))(planes)
+    warped = jax.vmap(lambda plane: map_coordinates(plane, list(source), order=1, mode="mirror"))(
+        planes
+    )
     warped = jnp.round(warped).astype(jnp.uint8).reshape(clip.shape[0], 3, height, width)
     return jnp.moveaxis(warped, 1, -1)
 
 
-def prepared(key: Array, clip: Array, background: Array, config: Config, *, jitter: bool = True) -> Array:
+def prepared(
+    key: Array, clip: Array, background: Array, config: Config, *, jitter: bool = True
+) -> Array:
     """Return clips u8 (B, T, S, S, 3), the background subtracted or not; `jitter` changes brightness and colours."""
     choice, light = jax.random.split(key)
-    frames, gel = clip.astype(jnp.float32), background[:, None].astype(jnp.float32)
+    frames = clip.astype(jnp.float32)
+    gel = background[:, None].astype(jnp.float32)
     size = (len(clip), 1, 1, 1, 3)
     share = {"keep": 0.0, "subtract": 1.0, "either": SUBTRACTED}[config.data.background]
     subtract = jax.random.bernoulli(choice, share, (len(clip), 1, 1, 1, 1))
@@ -437,15 +538,20 @@ def moved_gel(key: Array, touches: SimulatedTouches, most: float = MOVED) -> Sim
 
     def moved(picture: Array, by: Array) -> Array:
         picture = picture.astype(jnp.float32)
-        return jax.image.scale_and_translate(picture, picture.shape, (0, 1), jnp.ones(2), by, "linear", antialias=False)
+        return jax.image.scale_and_translate(
+            picture, picture.shape, (0, 1), jnp.ones(2), by, "linear", antialias=False
+        )
 
     return touches._replace(background=jax.vmap(jax.vmap(moved))(touches.background, shift))
 
 
-def field_batch(key: Array, touches: SimulatedTouches, sensor: Array, config: Config, count: int) -> FieldBatch:
+def field_batch(
+    key: Array, touches: SimulatedTouches, sensor: Array, config: Config, count: int
+) -> FieldBatch:
     """Return the first `count` touches of the last take with their fields, free of scale. `sensor` (B, M) are rows."""
     clip = touches.clip[:count, -1, -config.model.frames :]
-    width, labels = touches.width[:count, -1], {name: x[:count, -1, -1] for name, x in touches.labels.items()}
+    width = touches.width[:count, -1]
+    labels = {name: x[:count, -1, -1] for name, x in touches.labels.items()}
     fields = touches.fields[:count, -1]
     stiff = touches.modulus[:count, -1]
     aspect = touches.aspect[:count, -1]
@@ -455,7 +561,13 @@ def field_batch(key: Array, touches: SimulatedTouches, sensor: Array, config: Co
     # Force outside of the picture cannot be seen.
     force = force.at[:, 2].set(jnp.mean(shown, (1, 2)) * jnp.exp(aspect))
     return FieldBatch(
-        prepared(key, clip, touches.background[:count, -1], config, jitter=False), sensor[:count, -1], aspect,
-        fields[..., 0] / width[:, None, None], fields[..., 1:3] / width[:, None, None, None], shown, force,
-        labels["torque"] / (scale * width), labels["slip"],
-    )  # fmt: skip
+        prepared(key, clip, touches.background[:count, -1], config, jitter=False),
+        sensor[:count, -1],
+        aspect,
+        fields[..., 0] / width[:, None, None],
+        fields[..., 1:3] / width[:, None, None, None],
+        shown,
+        force,
+        labels["torque"] / (scale * width),
+        labels["slip"],
+    )

@@ -52,9 +52,12 @@ def pressed(tmp_path: Path) -> Path:
     for i, depth in enumerate(depths):
         cv2.imwrite(str(tmp_path / f"{i}.png"), press(depth))
     more = {
-        "split": ["background"] * 2 + ["train"] * 8, "dataset": ["mine"] * 10, "background_path": ["0.png"] * 10,
-        "label.force": [0.1 * depth for depth in depths], "license": ["MIT"] * 6 + ["CC-BY-NC-4.0"] * 3 + [None],
-    }  # fmt: skip
+        "split": ["background"] * 2 + ["train"] * 8,
+        "dataset": ["mine"] * 10,
+        "background_path": ["0.png"] * 10,
+        "label.force": [0.1 * depth for depth in depths],
+        "license": ["MIT"] * 6 + ["CC-BY-NC-4.0"] * 3 + [None],
+    }
     file = tmp_path / "touch.parquet"
     manifests.write(manifests.from_columns(columns(10, **more), file), file)
     return file

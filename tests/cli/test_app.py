@@ -44,7 +44,9 @@ def test_every_help_has_an_example_and_imports_nothing_heavy(tmp_path):
     pages = json.loads(done.stdout.splitlines()[-1])
     for name in COMMANDS:
         group, _, last = name.rpartition(" ")
-        assert f"\n  {name} " in pages[""] and (not group or f"\n  {last} " in pages[group].replace(f"{group} ", ""))
+        assert f"\n  {name} " in pages[""] and (
+            not group or f"\n  {last} " in pages[group].replace(f"{group} ", "")
+        )
         assert f"\nExample: anytouch {name} " in pages[name] and "--help" in pages[name]
         for option in re.split(r"\n\s*(?=--[\w-]+[ ,])", re.sub("[╭╮╰╯─│]", "", pages[name]))[1:]:
             words = re.sub(r"--[\w-]+|\{[^}]*\}|\((default|required)[^)]*\)", "", option)
@@ -62,12 +64,19 @@ def test_no_command_is_a_usage_error_and_the_version_is_printed(anytouch, monkey
 @pytest.mark.parametrize(
     ("typed", "meant"),
     [
-        ("trin", "train"), ("data simulat", "data simulate"), ("probe task", "probe tasks"), ("xyzzy", None),
-        ("simulate --out x", "anytouch data simulate"), ("convert a b", "anytouch export"),
-        ("pour --run x", "make pouring"), ("translate", "make translation"), ("bench", "make bench"),
-        ("parity", "make parity"), ("probe --label object", "probe label"),
+        ("trin", "train"),
+        ("data simulat", "data simulate"),
+        ("probe task", "probe tasks"),
+        ("xyzzy", None),
+        ("simulate --out x", "anytouch data simulate"),
+        ("convert a b", "anytouch export"),
+        ("pour --run x", "make pouring"),
+        ("translate", "make translation"),
+        ("bench", "make bench"),
+        ("parity", "make parity"),
+        ("probe --label object", "probe label"),
     ],
-)  # fmt: skip
+)
 def test_an_unknown_command_gets_one_line_that_names_the_right_one(anytouch, typed, meant):
     done = anytouch(*typed.split())
     assert done.status == 2 and len(done.err.splitlines()) == 1 and not done.out
@@ -80,20 +89,26 @@ def options_and_words(name):
     words = [word for one in options if one.is_required for word in given(one)]
     if name == "train":
         config = preset("tiny", stage=2, towers="scratch")
-        options += options_of(Sections, Sections(*(getattr(config, home) for home in get_type_hints(Sections))))
+        options += options_of(
+            Sections, Sections(*(getattr(config, home) for home in get_type_hints(Sections)))
+        )
     return options, words
 
 
 def given(option, value=None):
     """Words that give an option a value for each of its places; `value` for its numbers."""
     values = [value or "1" if kind in (int, float) else "x" for kind in option.kinds]
-    return values if option.is_positional else [option.name, *values]
+    if option.is_positional:
+        return values
+    return [option.name, *values]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_of_every_command_answers_a_mistake_with_one_sentence(name, mistake, anytouch):
     options, needed = options_and_words(name)
-    flags = {one.name.rpartition(".")[0] + one.name.rpartition(".")[2] for one in options if one.is_flag}
+    flags = {
+        one.name.rpartition(".")[0] + one.name.rpartition(".")[2] for one in options if one.is_flag
+    }
     known = {one.name for one in options} | flags
 
     def answer(option, *words, part=None):
@@ -140,33 +155,51 @@ def test_every_number_of_every_command_has_a_range(name, mistake):
         assert option.name in ranges or not {int, float} & {*option.kinds}, option
         is_whole, (low, high, _) = ranges.get(option.name, (True, (-np.inf, np.inf, "")))
         wrong = [f"{2**70}"] if is_whole else ["nan", "inf", "-inf", "1e400"]
-        wrong += [f"{low - 1:.17g}"] * bool(np.isfinite(low)) + [f"{high + 1:.17g}"] * bool(np.isfinite(high))
+        wrong += [f"{low - 1:.17g}"] * bool(np.isfinite(low)) + [f"{high + 1:.17g}"] * bool(
+            np.isfinite(high)
+        )
         for value in wrong if option.name in ranges else ():
-            last = option.name.rpartition(".")[2]  # a stack of blocks does not know the name of its section
-            assert last in mistake(*name.split(), *needed, *given(option, value)), (option.name, value)
+            # a stack of blocks does not know the name of its section
+            last = option.name.rpartition(".")[2]
+            assert last in mistake(*name.split(), *needed, *given(option, value)), (
+                option.name,
+                value,
+            )
 
 
 @pytest.mark.parametrize(
     ("typed", "right"),
     [
-        ("embed --run r --data m.csv --out f.npz", "--model"), ("embed --model r --input m.csv --out f.npz", "--data"),
+        ("embed --run r --data m.csv --out f.npz", "--model"),
+        ("embed --model r --input m.csv --out f.npz", "--data"),
         ("embed --model r --data 0 --stream --out f.npz", "anytouch stream"),
         ("train --data m.csv --run r --loader.flip 0", "--data.flip"),
         ("train --data m.csv --run r --loop.seed=1", "--run.seed"),
         ("train --data m.csv --run r --clip weights", "--clip-weights"),
-        ("probe label --data m.csv --tasks all", "anytouch probe tasks"), ("export --run r --out f.bin", "--model"),
+        ("probe label --data m.csv --tasks all", "anytouch probe tasks"),
+        ("export --run r --out f.bin", "--model"),
         ("probe label --data a.csv --data=b.csv", "--data is given twice"),
-        ("train --data a --run r --model.sensors digit --model.sensors gelslim", "--model.sensors is given twice"),
+        (
+            "train --data a --run r --model.sensors digit --model.sensors gelslim",
+            "--model.sensors is given twice",
+        ),
         ("probe label --data a.csv --where force,7", "write --where force 7"),
-        ("data contact m.csv --threshold digit=5 gelsight=7", "write --threshold digit 5 gelsight 7"),
-        ("data simulate --out x --sensors [gelsight_mini, digit]", "write --sensors gelsight_mini digit"),
+        (
+            "data contact m.csv --threshold digit=5 gelsight=7",
+            "write --threshold digit 5 gelsight 7",
+        ),
+        (
+            "data simulate --out x --sensors [gelsight_mini, digit]",
+            "write --sensors gelsight_mini digit",
+        ),
         ("stream --data 0 --out x --camera-size 640x480", "write --camera-size 640 480"),
-        ("embed frames --out x", "did you mean --data frames?"), ("info a --health b", "'b' belongs to no option"),
+        ("embed frames --out x", "did you mean --data frames?"),
+        ("info a --health b", "'b' belongs to no option"),
         ("embed", "--data and --out are missing"),
         ("train --data m --run r --learning-rat 1", "did you mean --optim.learning-rate?"),
         ("train --data m --run r --model.sensors digti universal", "did you mean digit?"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_names_what_is_right(mistake, typed, right):
     assert right in mistake(*typed.split())
 
@@ -181,11 +214,18 @@ def test_the_home_folder_follows_an_equals_sign_too(monkeypatch, mistake, tmp_pa
     ("error", "status", "words"),
     [
         (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes."), 2, "memory"),
-        (MemoryError(), 2, "memory"), (KeyboardInterrupt(), 130, "interrupted"),
-        (OSError(errno.ENOSPC, "No space left on device", "f.npz"), 2, "f.npz: No space left on device"),
+        (MemoryError(), 2, "memory"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "f.npz"),
+            2,
+            "f.npz: No space left on device",
+        ),
     ],
-)  # fmt: skip
-def test_errors_of_the_machine_and_interrupts_are_one_line_and_bugs_are_not(capsys, error, status, words):
+)
+def test_errors_of_the_machine_and_interrupts_are_one_line_and_bugs_are_not(
+    capsys, error, status, words
+):
     def run(error=error):
         raise error
 
@@ -196,7 +236,9 @@ def test_errors_of_the_machine_and_interrupts_are_one_line_and_bugs_are_not(caps
         guarded("anytouch train", lambda: run(RuntimeError("a bug")))
 
 
-@pytest.mark.parametrize("error", [AssertionError(), UserError("could not read checkpoint"), RuntimeError("x")])
+@pytest.mark.parametrize(
+    "error", [AssertionError(), UserError("could not read checkpoint"), RuntimeError("x")]
+)
 def test_a_platform_that_jax_lacks_is_one_sentence(capsys, monkeypatch, error):
     def run(*_):
         raise error
@@ -204,14 +246,19 @@ def test_a_platform_that_jax_lacks_is_one_sentence(capsys, monkeypatch, error):
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     monkeypatch.setattr("jax.devices", run)
     assert guarded("anytouch embed", run) == 2
-    assert capsys.readouterr().err.startswith("anytouch embed: JAX_PLATFORMS is 'cuda', which jax cannot use here")
+    assert capsys.readouterr().err.startswith(
+        "anytouch embed: JAX_PLATFORMS is 'cuda', which jax cannot use here"
+    )
 
 
 def test_a_reader_that_closes_the_pipe_gets_no_traceback():
     # The shell prints the status of the writer, since `true` has its own.
     script = f"( {sys.executable} -m anytouch_jax --help; echo $? >&2 ) | true"
-    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=False, env={**os.environ})
-    assert done.stderr.strip() in ("141", "0")  # 0 if the page fits into the pipe before it is closed
+    done = subprocess.run(
+        ["sh", "-c", script], capture_output=True, text=True, check=False, env={**os.environ}
+    )
+    # 0 if the page fits into the pipe before it is closed
+    assert done.stderr.strip() in ("141", "0")
 
 
 def test_a_warning_of_the_library_is_a_sentence(capsys):
@@ -228,7 +275,9 @@ def test_a_warning_of_the_library_is_a_sentence(capsys):
 
 
 @pytest.mark.parametrize("command", ["probe label", "retrieve", "export"])
-def test_compiled_programs_are_cached_on_disk(tmp_path, world, tiny_run, anytouch, monkeypatch, command):
+def test_compiled_programs_are_cached_on_disk(
+    tmp_path, world, tiny_run, anytouch, monkeypatch, command
+):
     from anytouch_jax.train import mesh
 
     enabled = []
@@ -256,9 +305,12 @@ def test_mistakes(mistake, tmp_path):
 
 def test_it_serves_what_it_is_given(anytouch, pressed, monkeypatch):
     served = []
-    monkeypatch.setattr(server, "serve", lambda sources, host, port, show: served.append((sources, host, port)))
+    monkeypatch.setattr(
+        server, "serve", lambda sources, host, port, show: served.append((sources, host, port))
+    )
     assert anytouch("view", pressed, "--port", 9000).status == 0
     ((sources, host, port),) = served
     assert [source.kind for source in sources] == ["table"] and (host, port) == ("127.0.0.1", 9000)
     assert anytouch("view").status == 0
-    assert [source.kind for source in served[1][0]] == ["start", "table"]  # cameras, and the examples
+    # cameras, and the examples
+    assert [source.kind for source in served[1][0]] == ["start", "table"]

@@ -41,9 +41,13 @@ def write(path, model, params, **metadata):
     return path
 
 
-def test_the_file_for_jax_gives_the_features_of_the_live_model(anytouch, tmp_path, tiny_run, monkeypatch):
+def test_the_file_for_jax_gives_the_features_of_the_live_model(
+    anytouch, tmp_path, tiny_run, monkeypatch
+):
     out = tmp_path / "made" / "model.bin"
-    done = anytouch("export", "--model", tiny_run, "--out", out, "--frames", 1, "--platforms", "cpu", "cuda")
+    done = anytouch(
+        "export", "--model", tiny_run, "--out", out, "--frames", 1, "--platforms", "cpu", "cuda"
+    )
     assert done.status == 0, done
     assert "cpu, cuda" in done.out and f"{out}.json" in done.out
     frames = np.random.default_rng(0).integers(0, 256, (2, 1, 28, 28, 3), np.uint8)
@@ -62,7 +66,10 @@ def test_the_file_for_jax_gives_the_features_of_the_live_model(anytouch, tmp_pat
 
 def test_a_file_for_engines_embeds_and_streams_like_the_run(anytouch, tmp_path, tiny_run):
     pytest.importorskip("onnxruntime")
-    rng, out, small, table = np.random.default_rng(0), *(tmp_path / f"{n}" for n in ("m.onnx", "int8.onnx", "t.csv"))
+    rng, out, small, table = (
+        np.random.default_rng(0),
+        *(tmp_path / f"{n}" for n in ("m.onnx", "int8.onnx", "t.csv")),
+    )
     for number in range(200):
         cv2.imwrite(str(tmp_path / f"{number}.png"), rng.integers(0, 256, (28, 28, 3), np.uint8))
     write_rows(table, 200)
@@ -76,17 +83,29 @@ def test_a_file_for_engines_embeds_and_streams_like_the_run(anytouch, tmp_path, 
 
     done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", out)
     assert done.status == 0 and f"{out}.json" in done.out, done
-    done = anytouch("export", "--to", "onnx", "--model", tiny_run, "--out", small, "--int8", "--data", table)
+    done = anytouch(
+        "export", "--to", "onnx", "--model", tiny_run, "--out", small, "--int8", "--data", table
+    )
     assert done.status == 0 and "in int8" in done.out and "on 200 touches" in done.out, done
     live, fingerprint = features("embed", table, "--model", tiny_run)
     for model, tolerance in ((out, 1e-5), (small, 0.1)):
         found, weights = features("embed", table, "--model", model)
-        assert np.abs(found - live).max() < tolerance * np.abs(live).max() and weights == fingerprint
-    film = write_film(tmp_path / "film.avi", [cv2.imread(str(tmp_path / f"{number}.png")) for number in range(3)])
-    engines = (["--model", tiny_run], ["--model", tiny_run, "--engine", "onnxruntime"], ["--model", out])
+        assert (
+            np.abs(found - live).max() < tolerance * np.abs(live).max() and weights == fingerprint
+        )
+    film = write_film(
+        tmp_path / "film.avi", [cv2.imread(str(tmp_path / f"{number}.png")) for number in range(3)]
+    )
+    engines = (
+        ["--model", tiny_run],
+        ["--model", tiny_run, "--engine", "onnxruntime"],
+        ["--model", out],
+    )
     found = [features("stream", film, *words, "--sensor", "digit")[0] for words in engines]
     np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-5)
-    done = anytouch("stream", "--model", out, "--engine", "xla", "--data", film, "--out", tmp_path / "no.npz")
+    done = anytouch(
+        "stream", "--model", out, "--engine", "xla", "--data", film, "--out", tmp_path / "no.npz"
+    )
     assert done.status == 2 and "not on xla" in done.err and not (tmp_path / "no.npz").exists()
 
 
@@ -98,7 +117,8 @@ def test_weights_go_to_the_authors_names_and_back(tmp_path, tiny_run, weights):
     assert stat.S_IMODE(ours.stat().st_mode) == 0o644  # others may read it
     clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
     expected = load_encoder(tiny_run).encode_touch(clip, "digit")
-    for path in (theirs, ours, again):  # two heads of width 8: the shapes alone would suggest one head
+    # two heads of width 8: the shapes alone would suggest one head
+    for path in (theirs, ours, again):
         np.testing.assert_array_equal(load_encoder(path).encode_touch(clip, "digit"), expected)
 
 
@@ -106,10 +126,14 @@ def test_the_universal_tokens_go_to_the_last_row(tmp_path, weights):
     # A sensor added at the end of the table is after them, and the authors' code reads the last row.
     model = touch_model(sensors=(*SENSORS, "mine"))
     params = build(model).init(jax.random.key(0))
-    export_safetensors(tmp_path / "own.safetensors", params, {safetensors.MODEL_KEY: to_json(model)})
+    export_safetensors(
+        tmp_path / "own.safetensors", params, {safetensors.MODEL_KEY: to_json(model)}
+    )
     theirs = weights("release", tmp_path / "own.safetensors", tmp_path / "theirs.safetensors")
     table = load.read_weights(theirs)["sensor_token"]
-    np.testing.assert_array_equal(table[-1], params["touch"]["sensor_tokens"][SENSORS.index("universal")])
+    np.testing.assert_array_equal(
+        table[-1], params["touch"]["sensor_tokens"][SENSORS.index("universal")]
+    )
     np.testing.assert_array_equal(table[-2], params["touch"]["sensor_tokens"][-1])
     assert load_encoder(theirs).sensor_row("mine") == len(SENSORS) - 1
 
@@ -119,7 +143,10 @@ def two(tmp_path):
     """(first, second): files of two encoders of one network, and the parameters of both."""
     model = touch_model()
     params = [{"touch": build(model).init(jax.random.key(seed))["touch"]} for seed in (0, 1)]
-    files = [write(tmp_path / f"{name}.safetensors", model, tree) for name, tree in zip("ab", params, strict=True)]
+    files = [
+        write(tmp_path / f"{name}.safetensors", model, tree)
+        for name, tree in zip("ab", params, strict=True)
+    ]
     return files, params
 
 
@@ -127,14 +154,18 @@ def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
     (first, second), params = two
     start, end = (flatten(tree) for tree in params)
     for share in (0, 0.25, 1):
-        out = weights("safetensors", second, tmp_path / "w.safetensors", "--between", first, "--share", share)
+        out = weights(
+            "safetensors", second, tmp_path / "w.safetensors", "--between", first, "--share", share
+        )
         arrays = load.read_weights(out)
         assert arrays.keys() == end.keys()
         for name, array in arrays.items():
             expected = np.asarray(start[name]) * (1 - share) + np.asarray(end[name]) * share
             np.testing.assert_allclose(array, expected, rtol=1e-6, atol=1e-7)
     clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
-    np.testing.assert_array_equal(load_encoder(out).encode_touch(clip), load_encoder(second).encode_touch(clip))
+    np.testing.assert_array_equal(
+        load_encoder(out).encode_touch(clip), load_encoder(second).encode_touch(clip)
+    )
     source = safetensors.read_file_metadata(out)["source"]
     assert str(first) in source and str(second) in source
 
@@ -142,12 +173,16 @@ def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        ("--out m.bin --frames 2", "3 frames"), ("--out m.bin --model gone", "gone"),
-        ("--out m.bin --join sum", "--join"), ("--out m.bin --share 0.3", "--share"), ("--out afile/m.bin", "--out"),
+        ("--out m.bin --frames 2", "3 frames"),
+        ("--out m.bin --model gone", "gone"),
+        ("--out m.bin --join sum", "--join"),
+        ("--out m.bin --share 0.3", "--share"),
+        ("--out afile/m.bin", "--out"),
         ("--out m.onnx --int8", "--int8 has no effect with --to jax"),
         ("--out m.onnx --to onnx --data few.csv", "--int8 and --data"),
         ("--out m.onnx --to onnx --int8 --data few.csv", "needs 200 touches and --data has 3"),
-        ("--out m.onnx --to onnx --dtype bfloat16", "--dtype"), ("--out m.bin --to onnx", ".onnx"),
+        ("--out m.onnx --to onnx --dtype bfloat16", "--dtype"),
+        ("--out m.bin --to onnx", ".onnx"),
         ("--out w.bin --to release", ".safetensors"),
         ("--out w.safetensors --to release", "--to safetensors"),  # it lacks a decoder
         ("--out b.safetensors --to safetensors", "--out"),
@@ -156,12 +191,17 @@ def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
         ("--out w.safetensors --to safetensors --between eps.safetensors", "norm_eps"),
         ("--out w.safetensors --to safetensors --between gel.safetensors", "background"),
     ],
-)  # fmt: skip
+)
 def test_mistakes_write_nothing(two, tmp_path, mistake, monkeypatch, words, named):
     monkeypatch.chdir(tmp_path)
     params = two[1][0]
     write(tmp_path / "eps.safetensors", replace(touch_model(), norm_eps=1e-3), params)
-    write(tmp_path / "gel.safetensors", touch_model(), params, **{safetensors.BACKGROUND_KEY: "subtract"})
+    write(
+        tmp_path / "gel.safetensors",
+        touch_model(),
+        params,
+        **{safetensors.BACKGROUND_KEY: "subtract"},
+    )
     (tmp_path / "afile").write_text("")
     write_rows(tmp_path / "few.csv", 3)
     before = sorted(tmp_path.iterdir())

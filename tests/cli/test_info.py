@@ -18,21 +18,45 @@ def test_a_run_a_manifest_and_features(anytouch, tiny_run, world, tmp_path):
     assert done.status == 0, done.err
     run, manifest, lines = done.out.strip().split("\n\n")
     for words in (
-        str(tiny_run), "stage 1", "step 2 of 4", "checkpoints at 2", "digit, gelsight_mini", str(world), "loss ",
-    ):  # fmt: skip
+        str(tiny_run),
+        "stage 1",
+        "step 2 of 4",
+        "checkpoints at 2",
+        "digit, gelsight_mini",
+        str(world),
+        "loss ",
+    ):
         assert words in run
-    recordings = ("12 rows", "3 recordings", "4 clips", "test 2, train 8, val 2", "digit 8, gelsight_mini 4")
-    for words in (str(world), *recordings, "image_path 1, text 4, touch 12, object 12", "labels: object"):
+    recordings = (
+        "12 rows",
+        "3 recordings",
+        "4 clips",
+        "test 2, train 8, val 2",
+        "digit 8, gelsight_mini 4",
+    )
+    for words in (
+        str(world),
+        *recordings,
+        "image_path 1, text 4, touch 12, object 12",
+        "labels: object",
+    ):
         assert words in manifest
-    assert f"{features}: 12 features of 12" in lines and "frame_index, object, label.object" in lines
+    assert (
+        f"{features}: 12 features of 12" in lines and "frame_index, object, label.object" in lines
+    )
     assert "spread: the mean cosine of two features is" in lines
-    assert f"encoder: {tiny_run}" in lines and anytouch("info", world.parent).out.startswith(str(world))
+    assert f"encoder: {tiny_run}" in lines and anytouch("info", world.parent).out.startswith(
+        str(world)
+    )
 
 
 def test_a_damaged_checkpoint_is_reported(anytouch, tiny_run, tmp_path):
     shutil.copytree(tiny_run, tmp_path / "run")
     assert "is damaged" not in anytouch("info", tmp_path / "run").out
-    largest = max((tmp_path / "run" / "checkpoints").rglob("*"), key=lambda file: file.stat().st_size * file.is_file())
+    largest = max(
+        (tmp_path / "run" / "checkpoints").rglob("*"),
+        key=lambda file: file.stat().st_size * file.is_file(),
+    )
     with open(largest, "r+b") as file:
         file.seek(largest.stat().st_size // 2)
         file.write(b"not what was here")
@@ -46,16 +70,31 @@ def test_weights_report_whose_names_they_have(anytouch, tmp_path):
 
     model = touch_model()
     params = build(model).init(jax.random.key(0))
-    ours, theirs = tmp_path / "ours.safetensors", tmp_path / "theirs.safetensors"
-    export_safetensors(ours, params, {safetensors.MODEL_KEY: to_json(model), safetensors.SEEN_KEY: "digit"})
-    safetensors.write_safetensors(theirs, convert.to_release(params, model), {safetensors.MODEL_KEY: to_json(model)})
-    assert "this package's names" in (done := anytouch("info", ours)).out and "trained sensors: digit." in done.out
-    assert "authors' (stage1) names" in (done := anytouch("info", theirs)).out and "unknown" in done.out
+    ours = tmp_path / "ours.safetensors"
+    theirs = tmp_path / "theirs.safetensors"
+    export_safetensors(
+        ours, params, {safetensors.MODEL_KEY: to_json(model), safetensors.SEEN_KEY: "digit"}
+    )
+    safetensors.write_safetensors(
+        theirs, convert.to_release(params, model), {safetensors.MODEL_KEY: to_json(model)}
+    )
+    assert (
+        "this package's names" in (done := anytouch("info", ours)).out
+        and "trained sensors: digit." in done.out
+    )
+    assert (
+        "authors' (stage1) names" in (done := anytouch("info", theirs)).out
+        and "unknown" in done.out
+    )
     for kind in ("sensor", "shared"):
         other = touch_model(patch_encoder=kind)
-        export_safetensors(theirs, build(other).init(jax.random.key(0)), {safetensors.MODEL_KEY: to_json(other)})
+        export_safetensors(
+            theirs, build(other).init(jax.random.key(0)), {safetensors.MODEL_KEY: to_json(other)}
+        )
         assert f"{kind} patches of 7" in anytouch("info", theirs).out
-    export_safetensors(ours, params, {safetensors.MODEL_KEY: to_json(model), safetensors.BACKGROUND_KEY: "either"})
+    export_safetensors(
+        ours, params, {safetensors.MODEL_KEY: to_json(model), safetensors.BACKGROUND_KEY: "either"}
+    )
     assert "background: either" in anytouch("info", ours).out
 
 
@@ -79,12 +118,31 @@ def test_a_folder_is_the_run_in_it_else_its_manifest(mistake, tmp_path, anytouch
 
 
 def test_an_adapted_run_and_an_export(anytouch, tiny_run, world, tmp_path):
-    words = ("--model", tiny_run, "--data", world, "--sensor", "my_gel", "--frames", 0, "--out", tmp_path / "new")
+    words = (
+        "--model",
+        tiny_run,
+        "--data",
+        world,
+        "--sensor",
+        "my_gel",
+        "--frames",
+        0,
+        "--out",
+        tmp_path / "new",
+    )
     assert anytouch("adapt", *words).status == 0
     done = anytouch("info", tmp_path / "new").out
-    assert f"the run {tiny_run}, with tokens of my_gel fitted to 0 frames" in done and "step" not in done
+    assert (
+        f"the run {tiny_run}, with tokens of my_gel fitted to 0 frames" in done
+        and "step" not in done
+    )
     (tmp_path / "encoder.bin").write_bytes(b"x")
-    about = {"format": "anytouch_jax.export.1", "bytes": 1, "sha256": hashlib.sha256(b"x").hexdigest(), "frames": 3}
+    about = {
+        "format": "anytouch_jax.export.1",
+        "bytes": 1,
+        "sha256": hashlib.sha256(b"x").hexdigest(),
+        "frames": 3,
+    }
     about |= {"image_size": 28, "features": 12, "platforms": ["cpu"], "sensors": {"universal": 0}}
     about |= dict.fromkeys(("jax", "background", "pooling", "join", "dtype"), "x")
     (tmp_path / "encoder.bin.json").write_text(json.dumps(about))
@@ -93,7 +151,9 @@ def test_an_adapted_run_and_an_export(anytouch, tiny_run, world, tmp_path):
     assert "is damaged" in anytouch("info", tmp_path / "encoder.bin").err
 
 
-def test_the_health_of_each_unit_is_a_table_a_picture_and_a_status(anytouch, mistake, tmp_path, world, tiny_run):
+def test_the_health_of_each_unit_is_a_table_a_picture_and_a_status(
+    anytouch, mistake, tmp_path, world, tiny_run
+):
     done = anytouch("info", world, "--health", "--picture", tmp_path / "h.png", "--model", tiny_run)
     assert done.status in (0, 1) and "digit" in done.out and "orientation and colours" in done.out
     assert "contact visible to the encoder" in done.out and "units are good" in done.out

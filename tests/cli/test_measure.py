@@ -39,7 +39,12 @@ def test_every_form_of_data_gives_maps_and_a_line_a_frame(frames, weights, capsy
     more = ("--film", "shown.avi", "--ply", "gel.ply")
     for data, count in (("frames", 5), ("film.avi", 5), ("frames/4.png", 1), ("manifest.csv", 6)):
         sensor = () if data == "manifest.csv" else ("--sensor", "digit")
-        assert main(["measure", "--model", weights, "--data", data, "--out", "out.npz", *sensor, *more]) == 0
+        assert (
+            main(
+                ["measure", "--model", weights, "--data", data, "--out", "out.npz", *sensor, *more]
+            )
+            == 0
+        )
         assert f"{count} frames" in capsys.readouterr().out
         lines = list(csv.DictReader((frames / "out.csv").read_text().splitlines()))
         with np.load("out.npz") as arrays:
@@ -51,7 +56,8 @@ def test_every_form_of_data_gives_maps_and_a_line_a_frame(frames, weights, capsy
                 assert {"slip_std", "area", "centre_x", "torque", "time"} <= line.keys()
             if data == "frames":
                 by_folder = arrays["force"]
-    with np.load("out.npz") as arrays:  # a manifest measures what the folder does
+    # a manifest measures what the folder does
+    with np.load("out.npz") as arrays:
         np.testing.assert_allclose(arrays["force"][:5], by_folder, atol=1e-4)
         assert arrays["width_mm"].tolist() == pytest.approx([14.25] * 5 + [18.88])
     shown = cv2.VideoCapture("shown.avi")
@@ -62,17 +68,24 @@ def test_every_form_of_data_gives_maps_and_a_line_a_frame(frames, weights, capsy
 @pytest.mark.parametrize(
     ("more", "word"),
     [
-        (("--out", "out.csv"), ".npz"), (("--out", "frames.npz", "--film", "x.gif"), ".mp4"),
+        (("--out", "out.csv"), ".npz"),
+        (("--out", "frames.npz", "--film", "x.gif"), ".mp4"),
         (("--out", "manifest.npz", "--data", "manifest.csv"), "is a file that is read"),
-        (("--out", "out.npz", "--width-mm", "0"), "above 0"), (("--out", "out.npz", "--data", "nothing"), "is no"),
+        (("--out", "out.npz", "--width-mm", "0"), "above 0"),
+        (("--out", "out.npz", "--data", "nothing"), "is no"),
         (("--out", "out.npz", "--model", "plain.safetensors"), "--model.fields 32"),
-        (("--out", "out.npz", "--data", "manifest.csv", "--sensor", "digit"), "--sensor has no effect"),
+        (
+            ("--out", "out.npz", "--data", "manifest.csv", "--sensor", "digit"),
+            "--sensor has no effect",
+        ),
     ],
-)  # fmt: skip
+)
 def test_mistakes_are_one_sentence(frames, weights, capsys, monkeypatch, more, word):
     monkeypatch.chdir(frames)
     measuring_weights(frames / "plain.safetensors", fields=0)
-    given = {"--model": weights, "--data": "frames/4.png"} | dict(zip(more[::2], more[1::2], strict=True))
+    given = {"--model": weights, "--data": "frames/4.png"} | dict(
+        zip(more[::2], more[1::2], strict=True)
+    )
     assert main(["measure", *(part for pair in given.items() for part in pair)]) == 2
     assert word in capsys.readouterr().err.splitlines()[-1]
 
@@ -81,5 +94,20 @@ def test_a_fault_is_reported_once(frames, weights, capsys, monkeypatch):
     monkeypatch.chdir(frames)
     for number in range(40):
         cv2.imwrite(f"frames/{number}.png", np.full((64, 48, 3), 90 + number, np.uint8))
-    assert main(["measure", "--model", weights, "--data", "frames", "--out", "o.npz", "--sensor", "digit"]) == 0
+    assert (
+        main(
+            [
+                "measure",
+                "--model",
+                weights,
+                "--data",
+                "frames",
+                "--out",
+                "o.npz",
+                "--sensor",
+                "digit",
+            ]
+        )
+        == 0
+    )
     assert capsys.readouterr().err.count("the picture is grey") == 1

@@ -3,7 +3,9 @@ import json
 import pytest
 
 
-def test_a_label_is_reported_on_test_and_written_as_json(tmp_path, world, tiny_run, anytouch, mistake):
+def test_a_label_is_reported_on_test_and_written_as_json(
+    tmp_path, world, tiny_run, anytouch, mistake
+):
     words = ("probe", "label", "--data", world, "--model", tiny_run, "--seeds", 2)
     done = anytouch(*words, "--label", "object", "--no-controls", "--out", tmp_path / "probe.json")
     assert done.status == 0, done.err
@@ -22,10 +24,12 @@ def test_a_label_is_reported_on_test_and_written_as_json(tmp_path, world, tiny_r
         ("label --save h.npz --model a b", ["--save", "--model"]),
         ("label --save h.json --model a", ["--save", ".npz"]),
         ("label --model a --save h.npz --out h.npz", ["--save", "--out"]),
-        ("label --out nowhere.csv/deep/p.json", ["nowhere.csv"]), ("tasks --cache afile", ["--cache", "afile"]),
-        ("tasks --tasks slip --join concat", ["--join"]), ("tasks --frames 1 --order repeated", ["--order"]),
+        ("label --out nowhere.csv/deep/p.json", ["nowhere.csv"]),
+        ("tasks --cache afile", ["--cache", "afile"]),
+        ("tasks --tasks slip --join concat", ["--join"]),
+        ("tasks --frames 1 --order repeated", ["--order"]),
     ],
-)  # fmt: skip
+)
 def test_options_that_do_not_go_together_are_named(mistake, tmp_path, monkeypatch, typed, named):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "afile").write_text("")
@@ -47,4 +51,5 @@ def test_options_that_do_not_go_together_are_named(mistake, tmp_path, monkeypatc
 def test_options_that_go_together_reach_the_manifest(mistake, tmp_path, monkeypatch, typed):
     monkeypatch.chdir(tmp_path)
     command, *words = typed.split()
-    assert "nowhere.csv" in mistake("probe", command, "--data", "nowhere.csv", *words)  # the manifest is missing
+    # the manifest is missing
+    assert "nowhere.csv" in mistake("probe", command, "--data", "nowhere.csv", *words)

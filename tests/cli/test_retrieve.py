@@ -10,7 +10,9 @@ from anytouch_jax.encoder import embed
 
 @pytest.fixture(scope="module")
 def touches(tmp_path_factory):
-    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 6, "val": 6, "test": 10}, each=2)
+    return make_touches(
+        tmp_path_factory.mktemp("touches"), touches={"train": 6, "val": 6, "test": 10}, each=2
+    )
 
 
 def test_retrieval_of_a_run_and_its_controls(touches, tiny_run, tmp_path, capsys):
@@ -18,20 +20,34 @@ def test_retrieval_of_a_run_and_its_controls(touches, tiny_run, tmp_path, capsys
     words = ["--model", str(tiny_run), "--data", str(touches), "--gallery", "6", "--out", str(out)]
     assert main(["retrieve", *words]) == 0
     table = capsys.readouterr().out
-    for name in (str(tiny_run), "random encoder", "pixels minus background", "area, centroid, force"):
+    for name in (
+        str(tiny_run),
+        "random encoder",
+        "pixels minus background",
+        "area, centroid, force",
+    ):
         assert f"| {name} | all | all |" in table
     result = json.loads(out.read_text())
     assert result["split"] == "test" and len(result["data"]) == 64
-    pooled = {one["name"]: one for one in result["results"] if one["query_sensor"] == "all" and not one["centred"]}
+    pooled = {
+        one["name"]: one
+        for one in result["results"]
+        if one["query_sensor"] == "all" and not one["centred"]
+    }
     assert len(pooled) == 4
     for one in pooled.values():
-        assert one["gallery"] == 6 and one["queries"] == 60 and one["chance1"] == pytest.approx(1 / 6)
+        assert (
+            one["gallery"] == 6 and one["queries"] == 60 and one["chance1"] == pytest.approx(1 / 6)
+        )
         assert one["low"] <= one["top1"] <= one["high"] <= one["top5_high"]
-    assert pooled["pixels minus background"]["top1"] > 0.4  # every touch has its own texture
+    # every touch has its own texture
+    assert pooled["pixels minus background"]["top1"] > 0.4
     shares = []
     for more in ([], ["--by-chance"]):
         assert main(["retrieve", "--data", str(touches), "--gallery", "6", *more]) == 0
-        line = next(x for x in capsys.readouterr().out.splitlines() if "force | all | all | no" in x)
+        line = next(
+            x for x in capsys.readouterr().out.splitlines() if "force | all | all | no" in x
+        )
         shares.append(float(line.split("|")[5].split()[0]))
     assert shares[1] > shares[0]
 
@@ -39,12 +55,26 @@ def test_retrieval_of_a_run_and_its_controls(touches, tiny_run, tmp_path, capsys
 def test_a_mistake_is_one_sentence(touches, mistake, tmp_path, world, monkeypatch):
     monkeypatch.setattr(embed, "embed_rows", lambda *_, **__: pytest.fail("the work was begun"))
     for words, named in (
-        ("--split unused", "unused"), ("--model nowhere", "nowhere"), ("--gallery 5000", "5000"),
-        ("--gallery 1", "--gallery"), ("--frames -1", "--frames"), ("--seeds 2", "--seeds"), ("--count 3", "--count"),
-    ):  # fmt: skip
+        ("--split unused", "unused"),
+        ("--model nowhere", "nowhere"),
+        ("--gallery 5000", "5000"),
+        ("--gallery 1", "--gallery"),
+        ("--frames -1", "--frames"),
+        ("--seeds 2", "--seeds"),
+        ("--count 3", "--count"),
+    ):
         assert named in mistake("retrieve", "--data", touches, *words.split())
     assert "--index" in mistake("retrieve")
-    words = ["--data", touches, "--stage1", tmp_path / "s1", "--stage2", tmp_path / "s2", "--out", tmp_path / "report"]
+    words = [
+        "--data",
+        touches,
+        "--stage1",
+        tmp_path / "s1",
+        "--stage2",
+        tmp_path / "s2",
+        "--out",
+        tmp_path / "report",
+    ]
     assert "s1" in mistake("report", *words) and not (tmp_path / "report").exists()
 
 

@@ -26,20 +26,33 @@ def options_of(sizes: dict[str, object]) -> list[str]:
 SMALL = options_of(SIZES)
 # The sizes of `tiny_run`.
 TINY_RUN = options_of(
-    {name: value for name, value in SIZES.items() if "clip-share" not in name} | {"model.touch.depth": 2}
+    {name: value for name, value in SIZES.items() if "clip-share" not in name}
+    | {"model.touch.depth": 2}
 )
 
 
 def parse(*words: object) -> command.TrainRequest:
-    return command.parse(command.TrainOptions, "train", ["--data", "m.csv", "--run", "r", *map(str, words)])
+    return command.parse(
+        command.TrainOptions, "train", ["--data", "m.csv", "--run", "r", *map(str, words)]
+    )
 
 
 def test_sections_come_after_the_preset_the_recipe_and_the_short_options():
     words = ("--recipe", "release", "--steps", 40, "--batch", 8, "--seed", 3, "--preset", "small")
-    config = parse(*words, "--objective.mask-ratio", 0.5, "--data.threads=1", "--model.touch.heads", 3).config
+    config = parse(
+        *words, "--objective.mask-ratio", 0.5, "--data.threads=1", "--model.touch.heads", 3
+    ).config
     usual = preset("small", stage=1, recipe="release")
-    assert config.objective.mask_ratio == 0.5 and config.optim == usual.optim and config.recipe == "release"
-    assert config.data.manifests == ("m.csv",) and config.data.threads == 1 and config.data.batch_size == 8
+    assert (
+        config.objective.mask_ratio == 0.5
+        and config.optim == usual.optim
+        and config.recipe == "release"
+    )
+    assert (
+        config.data.manifests == ("m.csv",)
+        and config.data.threads == 1
+        and config.data.batch_size == 8
+    )
     assert (config.run.steps, config.run.seed) == (40, 3)
     assert config.model.touch == replace(usual.model.touch, heads=3)
     assert parse("--data.batch-size", 5, "--batch", 8).config.data.batch_size == 5
@@ -50,21 +63,30 @@ def test_help_all_lists_and_explains_every_field_with_the_defaults_of_the_preset
     assert done.status == 0 and "(default: 384)" in done.out
     lines = [line.strip("│ ") for line in done.out.splitlines()]
     fields = [place for place, line in enumerate(lines) if line.startswith("--")]
-    assert len(fields) > 60 and not [lines[place] for place in fields if lines[place + 1].startswith("(default")]
-    for option in ("--model.touch.width", "--objective.mask-ratio", "--optim.learning-rate", "--data.threads"):
+    assert len(fields) > 60 and not [
+        lines[place] for place in fields if lines[place + 1].startswith("(default")
+    ]
+    for option in (
+        "--model.touch.width",
+        "--objective.mask-ratio",
+        "--optim.learning-rate",
+        "--data.threads",
+    ):
         assert option in done.out
 
 
 @pytest.mark.parametrize(
     ("words", "option"),
     [
-        (("--steps", 0), "--steps"), (("--model.patch", 13), "patch"),
+        (("--steps", 0), "--steps"),
+        (("--model.patch", 13), "patch"),
         (("--model.decoder.width", 18, "--model.decoder.heads", 2), "--model.decoder.width"),
         (("--stage", 2, "--towers", "pretrained"), "--clip-weights"),
         (("--stage", 1, "--towers", "pretrained"), "--clip-weights"),
-        (("--stage", 2, "--clip-weights", "c"), "--towers"), (("--init", "gone"), "gone"),
+        (("--stage", 2, "--clip-weights", "c"), "--towers"),
+        (("--init", "gone"), "gone"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_value_is_named_and_starts_no_run(words, option, anytouch, tmp_path, world):
     done = anytouch("train", "--data", world, "--run", tmp_path / "r", *words)
     assert done.status == 2 and option in " ".join(done.err.replace("│", " ").split())
@@ -77,7 +99,9 @@ def test_a_missing_manifest_is_one_sentence(mistake, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_corrupt_picture_is_named_and_may_be_skipped_and_counted(anytouch, mistake, tmp_path, world):
+def test_a_corrupt_picture_is_named_and_may_be_skipped_and_counted(
+    anytouch, mistake, tmp_path, world
+):
     manifest = shutil.copytree(world.parent, tmp_path / "world") / world.name
     (manifest.parent / "a1.png").write_bytes(b"not a picture")
     words = ("train", "--data", manifest, "--batch", 8, "--steps", 4, "--save-every", 4, *SMALL)
@@ -86,7 +110,11 @@ def test_a_corrupt_picture_is_named_and_may_be_skipped_and_counted(anytouch, mis
     done = anytouch(*words, "--run", tmp_path / "r", "--on-bad-sample", "skip", "--stop-after", 1)
     assert done.status == 0 and "a1.png" in done.err and "another sample replaces it" in done.err
     line = json.loads((tmp_path / "r" / "metrics.jsonl").read_text())
-    assert line["skipped"] == line["skipped_batches"] == 0 and line["skipped_samples"] >= 1 and line["loss"] > 0
+    assert (
+        line["skipped"] == line["skipped_batches"] == 0
+        and line["skipped_samples"] >= 1
+        and line["loss"] > 0
+    )
 
 
 def test_a_run_folder_that_is_taken_is_one_sentence(mistake, tiny_run, world, tmp_path):
@@ -98,20 +126,38 @@ def test_a_run_folder_that_is_taken_is_one_sentence(mistake, tiny_run, world, tm
 def test_a_run_continues_and_refuses_other_settings(anytouch, mistake, tmp_path, world, tiny_run):
     shutil.copytree(tiny_run, tmp_path / "r")
     words = [
-        "train", "--data", world, "--run", tmp_path / "r", "--steps", 4, "--save-every", 4, "--batch", 8, *TINY_RUN,
-    ]  # fmt: skip
+        "train",
+        "--data",
+        world,
+        "--run",
+        tmp_path / "r",
+        "--steps",
+        4,
+        "--save-every",
+        4,
+        "--batch",
+        8,
+        *TINY_RUN,
+    ]
     assert "run.steps" in mistake(*words, "--steps", 5)
     done = anytouch(*words, "--stop-after", 3)
     assert done.status == 0 and "step 2" in done.err and "3 of 4 steps" in done.err
 
 
 @pytest.mark.parametrize(
-    "place", ["anytouch_jax.data.manifest.manifest.read", "anytouch_jax.weights.checkpoint.Checkpoints.latest"]
+    "place",
+    [
+        "anytouch_jax.data.manifest.manifest.read",
+        "anytouch_jax.weights.checkpoint.Checkpoints.latest",
+    ],
 )
-def test_a_termination_before_the_first_step_is_polite(anytouch, tmp_path, world, monkeypatch, place):
+def test_a_termination_before_the_first_step_is_polite(
+    anytouch, tmp_path, world, monkeypatch, place
+):
     module, _, name = place.rpartition(".")
     owner = pkgutil.resolve_name(module)
-    before, real = signal.getsignal(signal.SIGTERM), getattr(owner, name)
+    before = signal.getsignal(signal.SIGTERM)
+    real = getattr(owner, name)
 
     def terminated(*args, **options):
         signal.raise_signal(signal.SIGTERM)
@@ -121,7 +167,9 @@ def test_a_termination_before_the_first_step_is_polite(anytouch, tmp_path, world
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, terminated)
         done = anytouch(*words)
-    assert done.status == 0 and "SIGTERM" in done.err.splitlines()[-1] and "Traceback" not in done.err
+    assert (
+        done.status == 0 and "SIGTERM" in done.err.splitlines()[-1] and "Traceback" not in done.err
+    )
     assert signal.getsignal(signal.SIGTERM) is before
     assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {"config.json", ".lock"}
     assert anytouch(*words, "--stop-after", 0).status == 0
@@ -164,7 +212,9 @@ def agree(run: Path, other: Path) -> None:
     for a, b in zip(*rows, strict=True):
         assert a.keys() == b.keys()
         for name in a.keys() - {"wait", "wait_share", "match_accuracy", "update_norm"}:
-            close = 1e-5 if name in ("loss", "align", "match", "reconstruction", "next_frame") else 1e-4
+            close = (
+                1e-5 if name in ("loss", "align", "match", "reconstruction", "next_frame") else 1e-4
+            )
             assert b[name] == pytest.approx(a[name], rel=close, abs=1e-6), (a["step"], name)
 
 
@@ -181,7 +231,11 @@ def test_one_two_and_four_devices_and_two_processes_give_the_same_losses(lone, w
     if stage == 2:  # InfoNCE over the global batch: some rows have no photograph or caption
         assert 0 < read_metrics(run)[0]["touch_text_pairs"] < 8
     for devices, fsdp in ((2, 1), (4, 2)):
-        train(config_of(world, stage, fsdp=fsdp), tmp_path / f"{devices}", mesh=make_mesh(devices // fsdp, fsdp))
+        train(
+            config_of(world, stage, fsdp=fsdp),
+            tmp_path / f"{devices}",
+            mesh=make_mesh(devices // fsdp, fsdp),
+        )
         agree(run, tmp_path / f"{devices}")
     first, second = processes(world, tmp_path / "two", stage, fsdp=2)
     assert "20 of 20 steps" in first and second == ""
@@ -192,7 +246,9 @@ def test_one_two_and_four_devices_and_two_processes_give_the_same_losses(lone, w
 @pytest.mark.slow
 def test_a_figure_is_drawn_once(world, tmp_path):
     processes(world, tmp_path / "r", 1, steps=2, fsdp=2, figure_every=2)
-    assert [path.name for path in (tmp_path / "r" / "figures").iterdir()] == ["reconstruction_000002.png"]
+    assert [path.name for path in (tmp_path / "r" / "figures").iterdir()] == [
+        "reconstruction_000002.png"
+    ]
 
 
 @pytest.mark.slow
@@ -200,12 +256,29 @@ def test_the_script_starts_processes_by_hand(world, tmp_path):
     program = tmp_path / "anytouch"
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m anytouch_jax "$@"\n')
     program.chmod(0o755)
-    options = ["--stage", "1", "--data", str(world), "--run", str(tmp_path / "run"), "--steps", "2", "--batch", "8"]
-    environ = os.environ | {"ANYTOUCH": str(program), "COORDINATOR": free_address(), "PYTHONPATH": str(ROOT / "src")}
+    options = [
+        "--stage",
+        "1",
+        "--data",
+        str(world),
+        "--run",
+        str(tmp_path / "run"),
+        "--steps",
+        "2",
+        "--batch",
+        "8",
+    ]
+    environ = os.environ | {
+        "ANYTOUCH": str(program),
+        "COORDINATOR": free_address(),
+        "PYTHONPATH": str(ROOT / "src"),
+    }
     script = [ROOT / "experiments" / "launch" / "by_hand.sh", *options, *SMALL]
 
     def launch(*more: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([*script, *more], env=environ, capture_output=True, text=True, timeout=900, check=False)
+        return subprocess.run(
+            [*script, *more], env=environ, capture_output=True, text=True, timeout=900, check=False
+        )
 
     for expected in ("2 of 2 steps", "nothing to do"):
         done = launch()
@@ -213,6 +286,10 @@ def test_the_script_starts_processes_by_hand(world, tmp_path):
     assert saved_steps(tmp_path / "run") == [2]
     done = launch("--run.seed", "1")
     assert done.returncode == 2 and "was killed" not in done.stderr, done.stderr
-    for process in range(2):  # each finds the mistake by itself, and none is aborted by the other's end
-        assert f"process {process} of 2: the run in" in done.stderr and "run.seed was 0 and is now 1" in done.stderr
+    # each finds the mistake by itself, and none is aborted by the other's end
+    for process in range(2):
+        assert (
+            f"process {process} of 2: the run in" in done.stderr
+            and "run.seed was 0 and is now 1" in done.stderr
+        )
     assert jax.process_count() == 1

@@ -36,7 +36,14 @@ def make(tmp_path: Path) -> Callable[..., manifests.Manifest]:
     def build(rows: list[dict[str, Any]], folder: str = ".") -> manifests.Manifest:
         root = tmp_path / folder
         full = [
-            {"path": f"f{i}.png", "sensor": "digit", "sequence": f"s{i}", "frame_index": 0, "split": "train", **row}
+            {
+                "path": f"f{i}.png",
+                "sensor": "digit",
+                "sequence": f"s{i}",
+                "frame_index": 0,
+                "split": "train",
+                **row,
+            }
             for i, row in enumerate(rows)
         ]
         for i, row in enumerate(full):
@@ -45,7 +52,9 @@ def make(tmp_path: Path) -> Callable[..., manifests.Manifest]:
                 if row.get(name):
                     save(root / row[name], (i + 1, 200, 9), (40, 40))
         names = {name: None for row in full for name in row}
-        return manifests.from_columns({name: [row.get(name) for row in full] for name in names}, root / "manifest.csv")
+        return manifests.from_columns(
+            {name: [row.get(name) for row in full] for name in names}, root / "manifest.csv"
+        )
 
     return build
 
@@ -57,9 +66,13 @@ def rich() -> list[dict[str, Any]]:
     for i in range(8):
         for k in range(6):
             row = {
-                "sequence": f"s{i}", "frame_index": k, "sensor": "digit" if i % 2 else "gelslim",
-                "touch": f"place{i // 2}.{k}", "object": f"o{i // 2}", "unit": f"u{i % 2}",
-            }  # fmt: skip
+                "sequence": f"s{i}",
+                "frame_index": k,
+                "sensor": "digit" if i % 2 else "gelslim",
+                "touch": f"place{i // 2}.{k}",
+                "object": f"o{i // 2}",
+                "unit": f"u{i % 2}",
+            }
             row |= {"image_path": f"v{i}{k}.png"} if i < 3 else {}
             rows.append(row | ({"text": f"caption {i}"} if i % 3 == 2 else {}))
     return rows
@@ -69,11 +82,17 @@ def rich() -> list[dict[str, Any]]:
 def settings() -> Callable[..., configuration.Config]:
     """settings(stage, recipe, plain=True, **data): preset tiny at 28 pixels; `plain` leaves the colours alone."""
 
-    def build(stage: Any = 1, recipe: Any = "paper", plain: bool = True, **data: Any) -> configuration.Config:
+    def build(
+        stage: Any = 1, recipe: Any = "paper", plain: bool = True, **data: Any
+    ) -> configuration.Config:
         config = configuration.preset("tiny", stage=stage, recipe=recipe)
         if plain:
             data = {"flip": 0.0, "jitter": (0.0, 0.0, 0.0, 0.0), "rotation": 0.0, **data}
-        model = replace(config.model, image_size=28, text=config.model.text and replace(config.model.text, length=12))
+        model = replace(
+            config.model,
+            image_size=28,
+            text=config.model.text and replace(config.model.text, length=12),
+        )
         return replace(config, model=model, data=replace(config.data, **{"batch_size": 4, **data}))
 
     return build
@@ -82,4 +101,6 @@ def settings() -> Callable[..., configuration.Config]:
 @pytest.fixture
 def read_back() -> Callable[[np.ndarray], np.ndarray]:
     """Row ids of a clip array u8 (B, T, H, W, 3): i64 (B, T)."""
-    return lambda clip: np.array([[row_of(frame[10:11, 10]) for frame in sample] for sample in clip])
+    return lambda clip: np.array(
+        [[row_of(frame[10:11, 10]) for frame in sample] for sample in clip]
+    )

@@ -6,7 +6,9 @@ import pytest
 
 from anytouch_jax.data.dots import DotFlow
 
-SHAPE, PITCH, RADIUS = (240, 320), 32, 5
+SHAPE = (240, 320)
+PITCH = 32
+RADIUS = 5
 
 
 def gel_with_dots(motion=lambda x, y: (0 * x, 0 * y), *, ink=30, dots=True, noise=0.0, press=0.0):
@@ -14,16 +16,22 @@ def gel_with_dots(motion=lambda x, y: (0 * x, 0 * y), *, ink=30, dots=True, nois
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
     picture = np.stack([110 + 0.2 * x, 130 - 0.1 * y, 140 - 0.1 * x], -1)
     away = np.hypot(x - 170, y - 120) / 40
-    picture += press * np.exp(-(away**2))[..., None] * np.stack([(x - 170) / 40, (y - 120) / 40, (170 - x) / 40], -1)
+    picture += (
+        press
+        * np.exp(-(away**2))[..., None]
+        * np.stack([(x - 170) / 40, (y - 120) / 40, (170 - x) / 40], -1)
+    )
     for across in range(PITCH // 2, SHAPE[1], PITCH) if dots else ():
         for down in range(PITCH // 2, SHAPE[0], PITCH):
             dx, dy = motion(np.float32(across), np.float32(down))
-            share = np.clip(RADIUS + 0.5 - np.hypot(x - across - dx, y - down - dy), 0, 1)[..., None]
+            share = np.clip(RADIUS + 0.5 - np.hypot(x - across - dx, y - down - dy), 0, 1)[
+                ..., None
+            ]
             picture = picture + share * (ink - picture)
     rng = np.random.default_rng(0)
-    return np.clip(cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0, noise, picture.shape), 0, 255).astype(
-        np.uint8
-    )
+    return np.clip(
+        cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0, noise, picture.shape), 0, 255
+    ).astype(np.uint8)
 
 
 def drag(x, y):
@@ -40,7 +48,10 @@ def test_a_drag_of_dots_comes_back(ink, press):
     y, x = (np.mgrid[:56, :56] + 0.5) * np.array([SHAPE[0], SHAPE[1]])[:, None, None] / 56
     off = np.abs(shift * SHAPE[1] - np.stack(drag(x, y), -1))
     middle = np.s_[8:-8, 8:-8]
-    assert np.median(off[middle]) < 0.35 and off[middle].max() < 1.5, (np.median(off[middle]), off[middle].max())
+    assert np.median(off[middle]) < 0.35 and off[middle].max() < 1.5, (
+        np.median(off[middle]),
+        off[middle].max(),
+    )
     assert np.mean(off.mean(-1)[middle] < 3 * SHAPE[1] * deviation[middle]) > 0.9
 
 
@@ -55,7 +66,8 @@ def test_a_gel_without_dots_has_no_flow():
 
 
 def test_frames_of_another_size_show_the_same_shift():
-    flow, moved = DotFlow(gel_with_dots()), gel_with_dots(drag)
+    flow = DotFlow(gel_with_dots())
+    moved = gel_with_dots(drag)
     wanted = flow(moved, 56, 56)[0]
     larger = cv2.resize(moved, (640, 480), interpolation=cv2.INTER_CUBIC)
     np.testing.assert_allclose(flow(larger, 56, 56)[0], wanted, atol=0.5 / 320)

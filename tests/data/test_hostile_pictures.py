@@ -46,15 +46,18 @@ def _many_chunks(chunk: bytes, count: int, at: int = 33) -> bytes:
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (_many_scans(20_000), "more than 16384 scans"), (_padded(b"\xff" * 100_000), "bytes of padding"),
-        (_padded(b"\0" * 100_000), "bytes of padding"), (_padded(b"\xff\xd0" * 50_000), "bytes of padding"),
-        (_padded(b"\xff\xfe\0\2" * 5000), "4096 segments"), (_padded(b"\xff\xe1\0\0" * 5000), "4096 segments"),
+        (_many_scans(20_000), "more than 16384 scans"),
+        (_padded(b"\xff" * 100_000), "bytes of padding"),
+        (_padded(b"\0" * 100_000), "bytes of padding"),
+        (_padded(b"\xff\xd0" * 50_000), "bytes of padding"),
+        (_padded(b"\xff\xfe\0\2" * 5000), "4096 segments"),
+        (_padded(b"\xff\xe1\0\0" * 5000), "4096 segments"),
         (_many_chunks(_chunk(b"gAMA", b"\0\0\0\1"), 9000), "more than 4096 chunks"),
         (_many_chunks(_chunk(b"IDAT"), 9000), "more than 4096 chunks"),
         (_many_chunks(_chunk(b"tEXt", b"a\0b"), 9000, -12), "more than 4096 chunks"),
     ],
     ids=["scans", "fill", "zeros", "restarts", "comments", "exif", "gamma", "data", "text"],
-)  # fmt: skip
+)
 def test_a_picture_that_would_take_minutes_is_refused(data, words, monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     refused(f"hostile cannot be read: .*{words}", decode_bytes, data, "hostile")
@@ -63,14 +66,22 @@ def test_a_picture_that_would_take_minutes_is_refused(data, words, monkeypatch):
 def test_the_limit_of_scans_falls_with_the_size(monkeypatch):
     monkeypatch.setattr(images, "MAX_CODED", 20 * (1 << 16))
     refused("more than 20 scans", decode_bytes, _many_scans(30), "x")
-    hidden = _many_scans(0)[:-2] + b"\xff\xfe\0\4\xff\xd9" + _many_scans(30)[len(_many_scans(0)) - 2 :]
-    with pytest.raises(ImageError, match="more than 20 scans"):  # an end inside a comment is none
+    hidden = (
+        _many_scans(0)[:-2] + b"\xff\xfe\0\4\xff\xd9" + _many_scans(30)[len(_many_scans(0)) - 2 :]
+    )
+    # an end inside a comment is none
+    with pytest.raises(ImageError, match="more than 20 scans"):
         decode_bytes(hidden, "x")
 
 
 @pytest.mark.parametrize(
     "chunk",
-    [_chunk(b"gAMA", b"\0\0\0\0"), _chunk(b"sBIT", b"\0\0\0"), _chunk(b"iCCP", b"x\0\0y"), _chunk(b"tIME", b"")],
+    [
+        _chunk(b"gAMA", b"\0\0\0\0"),
+        _chunk(b"sBIT", b"\0\0\0"),
+        _chunk(b"iCCP", b"x\0\0y"),
+        _chunk(b"tIME", b""),
+    ],
 )
 def test_a_png_with_odd_chunks_is_decoded_without_a_word(chunk, capfd):
     np.testing.assert_array_equal(decode_bytes(_many_chunks(chunk, 300), "x"), RGB)
@@ -91,9 +102,15 @@ def test_an_animation_gives_its_first_picture():
 
 
 def test_decoders_print_nothing_and_no_thread_loses_a_line(capfd, tmp_path):
-    jpeg, png = _saved("JPEG"), _saved("PNG")
-    noisy = [jpeg[:-40] + b"\xff\xd9", jpeg[:-60] + b"\xff\x3a" + jpeg[-58:], png[:-20] + b"\0" + png[-19:]]
-    for data in noisy:  # today's decoders do print
+    jpeg = _saved("JPEG")
+    png = _saved("PNG")
+    noisy = [
+        jpeg[:-40] + b"\xff\xd9",
+        jpeg[:-60] + b"\xff\x3a" + jpeg[-58:],
+        png[:-20] + b"\0" + png[-19:],
+    ]
+    # today's decoders do print
+    for data in noisy:
         cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     assert len(capfd.readouterr().err.splitlines()) >= 2
 
@@ -117,7 +134,8 @@ def test_decoders_print_nothing_and_no_thread_loses_a_line(capfd, tmp_path):
 def test_videos_print_nothing(capfd, tmp_path, code, ending):
     path = tmp_path / f"film.{ending}"
     write_film(path, (cv2.resize(RGB, (64, 48)) for _ in range(12)), code=code)
-    data, rng = path.read_bytes(), np.random.default_rng(0)
+    data = path.read_bytes()
+    rng = np.random.default_rng(0)
     capfd.readouterr()
     for number in range(12):
         bad = bytearray(data[: len(data) // 2] if number == 0 else data)
@@ -129,7 +147,9 @@ def test_videos_print_nothing(capfd, tmp_path, code, ending):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", "down.bmp", ".tiff", ".webp", "lossless.webp", "tags.webp"])
+@pytest.mark.parametrize(
+    "suffix", [".png", ".jpg", ".bmp", "down.bmp", ".tiff", ".webp", "lossless.webp", "tags.webp"]
+)
 def test_a_declared_size_beyond_the_limit_is_refused_before_it_is_unpacked(suffix, monkeypatch):
     options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix.startswith("lossless") else []
     data = cv2.imencode(f".{suffix.rpartition('.')[2]}", RGB, options)[1].tobytes()
@@ -146,14 +166,19 @@ def test_a_declared_size_beyond_the_limit_is_refused_before_it_is_unpacked(suffi
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda png: png[:33] + b"\x7f\xff\xff\xf0" + _chunk(b"tEXt", b"a\0b")[4:] + png[33:], "cut short"),
+        (
+            lambda png: png[:33] + b"\x7f\xff\xff\xf0" + _chunk(b"tEXt", b"a\0b")[4:] + png[33:],
+            "cut short",
+        ),
         (lambda png: png[:33] + png[8:33] + png[33:], "corrupt"),
         (lambda png: png[:8] + _chunk(b"tEXt", b"a\0b") + png[8:], "corrupt"),
-        (lambda png: png[:-12], "cut short"), (lambda png: png[:-2], "cut short"),
+        (lambda png: png[:-12], "cut short"),
+        (lambda png: png[:-2], "cut short"),
     ],
-)  # fmt: skip
+)
 def test_a_png_is_walked_before_it_is_decoded(spoil, words, monkeypatch):
-    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))  # 4 GB and 13 seconds for the first
+    # 4 GB and 13 seconds for the first
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     refused(words, decode_bytes, spoil(_saved("PNG")), "x.png")
 
 
@@ -165,13 +190,18 @@ def test_a_tiff_that_declares_two_sizes_is_refused(first):
     count = int.from_bytes(data[at : at + 2], order)
     body = data[at + 2 : at + 2 + 12 * count]
     sizes = b"".join(
-        tag.to_bytes(2, order) + (4).to_bytes(2, order) + (1).to_bytes(4, order) + value.to_bytes(4, order)
+        tag.to_bytes(2, order)
+        + (4).to_bytes(2, order)
+        + (1).to_bytes(4, order)
+        + value.to_bytes(4, order)
         for value in (first, 60004 - first)
         for tag in (256, 257)
     )
     data[4:8] = len(data).to_bytes(4, order)
     with pytest.raises(ImageError, match="a tag twice"):
-        decode_bytes(bytes(data) + (count + 4).to_bytes(2, order) + sizes + body + bytes(4), "two.tiff")
+        decode_bytes(
+            bytes(data) + (count + 4).to_bytes(2, order) + sizes + body + bytes(4), "two.tiff"
+        )
 
 
 def _array(array):
@@ -181,22 +211,30 @@ def _array(array):
 
 def _declared(shape, kind):
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        stream, {"descr": kind, "fortran_order": False, "shape": shape}
+    )
     return stream.getvalue() + bytes(48)
 
 
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (_array(np.array([[0.5, np.nan]])), "NaN"), (_array(np.full((4, 5, 3), 2.0, np.float32)), r"0\.\.1"),
-        (_array(np.full((4, 5, 3), -np.inf)), r"0\.\.1"), (_array(np.zeros((4, 5, 2), np.uint8)), "shape"),
-        (_array(np.zeros((4, 5, 3), np.int64)), "int64"), (_array(np.zeros((4, 5, 3), object)), "cannot be read"),
-        (_declared((9999999, 9999999, 3), "|u1"), "cut short"), (_declared((4, 4, 3), "|O"), "Python objects"),
-        (_declared((0, 4, 3), "|u1"), "shape"), (_declared((2**70,), "|u1"), "cut short"),
-        (_declared((4, 4, 3), "|V1"), "type"), (_declared((-4, -4, 3), "|u1"), "cannot be read"),
+        (_array(np.array([[0.5, np.nan]])), "NaN"),
+        (_array(np.full((4, 5, 3), 2.0, np.float32)), r"0\.\.1"),
+        (_array(np.full((4, 5, 3), -np.inf)), r"0\.\.1"),
+        (_array(np.zeros((4, 5, 2), np.uint8)), "shape"),
+        (_array(np.zeros((4, 5, 3), np.int64)), "int64"),
+        (_array(np.zeros((4, 5, 3), object)), "cannot be read"),
+        (_declared((9999999, 9999999, 3), "|u1"), "cut short"),
+        (_declared((4, 4, 3), "|O"), "Python objects"),
+        (_declared((0, 4, 3), "|u1"), "shape"),
+        (_declared((2**70,), "|u1"), "cut short"),
+        (_declared((4, 4, 3), "|V1"), "type"),
+        (_declared((-4, -4, 3), "|u1"), "cannot be read"),
         (_declared((4, 4, 3), "<M8[s]"), "cut short"),
     ],
-)  # fmt: skip
+)
 def test_an_array_that_is_no_picture_or_declares_more_than_it_has_is_refused(data, words):
     refused(rf"x\.npy.*{words}", decode_bytes, data, "x.npy")
 
@@ -220,10 +258,18 @@ ROWS = zlib.compress(b"".join(b"\0" + row.tobytes() for row in RGB))
 
 @pytest.mark.parametrize(
     "data",
-    [_png(ROWS[: len(ROWS) // 2]), _png(b""), _png(ROWS, depth=7), _png(ROWS, colour=5), _png(ROWS, colour=3),
-     _png(ROWS, lace=9), _png(zlib.compress(b"".join(b"\x09" + row.tobytes() for row in RGB))), _png(bytes(500))],
+    [
+        _png(ROWS[: len(ROWS) // 2]),
+        _png(b""),
+        _png(ROWS, depth=7),
+        _png(ROWS, colour=5),
+        _png(ROWS, colour=3),
+        _png(ROWS, lace=9),
+        _png(zlib.compress(b"".join(b"\x09" + row.tobytes() for row in RGB))),
+        _png(bytes(500)),
+    ],
     ids=["few rows", "no rows", "depth", "colour", "no palette", "lace", "filter", "noise"],
-)  # fmt: skip
+)
 def test_a_png_that_contradicts_itself_is_an_error(data, capfd):
     np.testing.assert_array_equal(decode_bytes(_png(ROWS), "x"), RGB)
     refused("x cannot be read", decode_bytes, data, "x")

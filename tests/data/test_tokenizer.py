@@ -9,7 +9,12 @@ from refused import refused
 from anytouch_jax.data import tokenizer as text
 
 CLIP = SHARED / "clip"
-CAPTIONS = ["A soft, springy surface.", "A hard, smooth surface with ridges.", "A soft and smooth edge.", "rough rough"]
+CAPTIONS = [
+    "A soft, springy surface.",
+    "A hard, smooth surface with ridges.",
+    "A soft and smooth edge.",
+    "rough rough",
+]
 
 
 @pytest.mark.parametrize("folder", [CLIP] if CLIP.is_dir() else [])
@@ -52,18 +57,26 @@ def test_training_is_deterministic_and_covers_any_text(tmp_path):
     texts = [*CAPTIONS, "Ünïcode ½ 触覚 \U0001f91a", "  MANY   spaces\n\tand TABS "]
     np.testing.assert_array_equal(tokenizer.encode(texts, 77)[0], again.encode(texts, 77)[0])
     assert 258 < tokenizer.vocab_size <= 320 and tokenizer.end_id == tokenizer.vocab_size - 1
-    assert tokenizer.encode(["many spaces and tabs"], 77)[0].tolist() == tokenizer.encode(texts[-1:], 77)[0].tolist()
+    assert (
+        tokenizer.encode(["many spaces and tabs"], 77)[0].tolist()
+        == tokenizer.encode(texts[-1:], 77)[0].tolist()
+    )
     different = {tuple(row) for row in tokenizer.encode(texts, 77)[0].tolist()}
     assert len(different) == len(texts)
     for target in (tmp_path / "new", tmp_path / "new" / "other.json"):
         tokenizer.save(target)
         loaded = text.load_tokenizer(target)
         np.testing.assert_array_equal(loaded.encode(texts, 77)[0], tokenizer.encode(texts, 77)[0])
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["other.json", "tokenizer.json"]
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
+        "other.json",
+        "tokenizer.json",
+    ]
 
 
 def test_mistakes_are_errors(tmp_path):
-    refused(r"there is no tokenizer .*none.*tokenizer\.json", text.load_tokenizer, tmp_path / "none")
+    refused(
+        r"there is no tokenizer .*none.*tokenizer\.json", text.load_tokenizer, tmp_path / "none"
+    )
     (tmp_path / "tokenizer.json").write_text("{}")
     refused("is not a tokenizer", text.load_tokenizer, tmp_path)
     plain = tokenizers.Tokenizer(tokenizers.models.WordLevel({"a": 0}, unk_token="a"))

@@ -19,7 +19,8 @@ def _rng(*key):
 
 def test_the_whole_image_is_resized_without_a_crop():
     frame = np.zeros((1, 40, 80, 3), np.uint8)
-    frame[0, :20, :40] = 200  # the upper left quarter stays the upper left quarter
+    # the upper left quarter stays the upper left quarter
+    frame[0, :20, :40] = 200
     out = t.touch_transform(frame, 20, _rng(), PLAIN)
     assert out.shape == (1, 20, 20, 3) and out.dtype == np.uint8
     assert (out[0, :10, :10] == 200).all() and not out[0, 10:].any() and not out[0, :, 10:].any()
@@ -65,16 +66,20 @@ def _blob(affine, key):
 
 def test_an_affine_map_turns_grows_and_moves_within_its_bounds():
     area, middle = _blob((0.0, 0.0, 0.0), 0)
-    moved, grown = [], []
+    moved = []
+    grown = []
     for key in range(40):
         same, here = _blob((180.0, 0.0, 0.0), key)
-        assert abs(same / area - 1) < 0.02 and np.abs(here - middle).max() < 0.02  # a disc looks alike from all sides
+        # a disc looks alike from all sides
+        assert abs(same / area - 1) < 0.02 and np.abs(here - middle).max() < 0.02
         same, here = _blob((0.0, 0.2, 0.0), key)
         assert abs(same / area - 1) < 0.02
         moved.append(here - middle)
         grown.append(_blob((0.0, 0.0, 0.5), key)[0] / area)
-    moved, grown = np.array(moved), np.array(grown)
-    assert 0.15 < np.abs(moved).max() <= 0.201 and np.abs(moved.mean(0)).max() < 0.06  # in both directions, both ways
+    moved = np.array(moved)
+    grown = np.array(grown)
+    # in both directions, both ways
+    assert 0.15 < np.abs(moved).max() <= 0.201 and np.abs(moved.mean(0)).max() < 0.06
     assert 1.5**-2 * 0.97 < grown.min() < 0.6 and 1.7 < grown.max() < 1.5**2 * 1.03
 
 
@@ -83,12 +88,18 @@ def test_a_turn_is_a_turn_and_edges_are_mirrored():
     line[32] = 255
     angles = set()
     for key in range(6):
-        out = t.touch_transform([line], 65, _rng(key), replace(PLAIN, affine=(90.0, 0.0, 0.0)))[0, ..., 0]
+        out = t.touch_transform([line], 65, _rng(key), replace(PLAIN, affine=(90.0, 0.0, 0.0)))[
+            0, ..., 0
+        ]
         rows, columns = np.nonzero(out[12:-12, 12:-12] > 127)
-        angles.add(round(float(np.degrees(np.linalg.eigh(np.cov(columns, rows))[1][:, 1] @ [0, 1]))))
+        angles.add(
+            round(float(np.degrees(np.linalg.eigh(np.cov(columns, rows))[1][:, 1] @ [0, 1])))
+        )
     assert len(angles) >= 5
     flat = np.full((1, 24, 24, 3), 90, np.uint8)
-    np.testing.assert_array_equal(t.touch_transform(flat, 24, _rng(), replace(PLAIN, affine=(30.0, 0.3, 0.3))), flat)
+    np.testing.assert_array_equal(
+        t.touch_transform(flat, 24, _rng(), replace(PLAIN, affine=(30.0, 0.3, 0.3))), flat
+    )
 
 
 def _slow_jitter(frame, factors, order):
@@ -119,8 +130,10 @@ def test_jitter_is_torchvisions_within_half_a_level(key):
     frame = RNG.integers(0, 256, (10, 10, 3), np.uint8)
     frame[:3] = frame[:3, :, :1]  # grey pixels have no hue
     rng = _rng(key)
-    draw, order = rng.random(4), rng.permutation(4)
-    low, high = np.array([0.6, 0.6, 0.5, -0.3]), np.array([1.4, 1.4, 1.5, 0.3])
+    draw = rng.random(4)
+    order = rng.permutation(4)
+    low = np.array([0.6, 0.6, 0.5, -0.3])
+    high = np.array([1.4, 1.4, 1.5, 0.3])
     want = _slow_jitter(frame, low + (high - low) * draw, order)
     got = t.colour_jitter(frame[None], _rng(key), jitter)[0]
     assert np.abs(got - want).max() <= 0.51
@@ -172,13 +185,18 @@ def test_vision_resize_is_bicubic():
 
     def kernel(x):
         x = abs(x)
-        return 1.5 * x**3 - 2.5 * x**2 + 1 if x < 1 else -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2 if x < 2 else 0.0
+        if x < 1:
+            return 1.5 * x**3 - 2.5 * x**2 + 1
+        if x < 2:
+            return -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2
+        return 0.0
 
     want = [128 * kernel((i + 0.5) / 2 - 4.5) for i in range(16)]
     assert np.abs(out - np.clip(want, 0, 255)).max() <= 0.51
     gradient = np.tile(np.arange(0, 240, 4, dtype=np.uint8)[None, :, None], (60, 1, 3))
     line = t.vision_evaluation(gradient, 20)[10, 3:-3, 0].astype(float)
-    assert np.abs(np.diff(line) - 12).max() <= 1  # a straight line stays straight
+    # a straight line stays straight
+    assert np.abs(np.diff(line) - 12).max() <= 1
 
 
 def test_vision_flip_is_an_exact_mirror_and_rotation_turns():
@@ -200,9 +218,12 @@ def test_vision_flip_is_an_exact_mirror_and_rotation_turns():
 def test_a_frame_is_turned_clockwise_then_mirrored():
     frame = np.arange(6, dtype=np.uint8).reshape(2, 3, 1)  # 0 1 2 / 3 4 5
     wanted = {
-        (0, "none"): [[0, 1, 2], [3, 4, 5]], (90, "none"): [[3, 0], [4, 1], [5, 2]],
-        (180, "none"): [[5, 4, 3], [2, 1, 0]], (270, "none"): [[2, 5], [1, 4], [0, 3]],
-        (0, "across"): [[2, 1, 0], [5, 4, 3]], (90, "down"): [[5, 2], [4, 1], [3, 0]],
-    }  # fmt: skip
+        (0, "none"): [[0, 1, 2], [3, 4, 5]],
+        (90, "none"): [[3, 0], [4, 1], [5, 2]],
+        (180, "none"): [[5, 4, 3], [2, 1, 0]],
+        (270, "none"): [[2, 5], [1, 4], [0, 3]],
+        (0, "across"): [[2, 1, 0], [5, 4, 3]],
+        (90, "down"): [[5, 2], [4, 1], [3, 0]],
+    }
     for (rotate, flip), pixels in wanted.items():
         assert t.orient_frame(frame, rotate, flip)[..., 0].tolist() == pixels

@@ -24,7 +24,11 @@ from anytouch_jax.weights import safetensors
 
 pytest.importorskip("onnxruntime")
 CLIPS = np.random.default_rng(0).integers(0, 256, (5, 6, 28, 28, 3), np.uint8)
-ENGINES = [name for name in ("auto", "onnxruntime", "openvino") if name == "auto" or importlib.util.find_spec(name)]
+ENGINES = [
+    name
+    for name in ("auto", "onnxruntime", "openvino")
+    if name == "auto" or importlib.util.find_spec(name)
+]
 
 
 @pytest.fixture(autouse=True)
@@ -32,9 +36,12 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-def weights(path: Path, seed: int = 0, scale: float = 1.0, background: str = "keep", **changes) -> Path:
+def weights(
+    path: Path, seed: int = 0, scale: float = 1.0, background: str = "keep", **changes
+) -> Path:
     """Write weights that are all drawn, so that a forgotten one shows."""
-    model, rng = touch_model(**changes), np.random.default_rng(seed)
+    model = touch_model(**changes)
+    rng = np.random.default_rng(seed)
     params = build(model).abstract()
     params = jax.tree.map(lambda x: (0.3 * rng.standard_normal(x.shape)).astype(np.float32), params)
     params["touch"]["projection"]["kernel"] *= np.float32(scale)
@@ -47,8 +54,11 @@ def stored(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*.onnx"))
 
 
-def test_every_engine_gives_the_features_of_xla_also_after_a_change_of_weights_with_the_same_name(tmp_path):
-    path, before = tmp_path / "w.safetensors", None
+def test_every_engine_gives_the_features_of_xla_also_after_a_change_of_weights_with_the_same_name(
+    tmp_path,
+):
+    path = tmp_path / "w.safetensors"
+    before = None
     for seed, scale in ((0, 1.0), (1, 1.0), (1, 2.0)):
         weights(path, seed, scale)
         live = load_encoder(path, engine="xla")
@@ -57,15 +67,28 @@ def test_every_engine_gives_the_features_of_xla_also_after_a_change_of_weights_w
             for frames, pooling in ((1, "class"), (3, "both")):
                 wanted = live.encode_touch(CLIPS[:, :frames], "digit", pooling=pooling)
                 found = encoder.encode_touch(CLIPS[:, :frames], "digit", pooling=pooling)
-                assert encoder.exported(frames, pooling) is not None and live.exported(frames, pooling) is None
-                assert np.abs(found - wanted).max() <= 1e-5 * np.abs(wanted).max(), (engine, seed, frames)
-        assert before is None or np.abs(wanted - before).max() > 0.1  # the old export would have shown
+                assert (
+                    encoder.exported(frames, pooling) is not None
+                    and live.exported(frames, pooling) is None
+                )
+                assert np.abs(found - wanted).max() <= 1e-5 * np.abs(wanted).max(), (
+                    engine,
+                    seed,
+                    frames,
+                )
+        # the old export would have shown
+        assert before is None or np.abs(wanted - before).max() > 0.1
         before = wanted
 
 
-def test_an_export_is_made_once_and_again_when_anything_that_decides_it_changes(tmp_path, monkeypatch):
-    made, honest = [], cached_export.export
-    monkeypatch.setattr(cached_export, "export", lambda *given, **more: (made.append(0), honest(*given, **more))[1])
+def test_an_export_is_made_once_and_again_when_anything_that_decides_it_changes(
+    tmp_path, monkeypatch
+):
+    made = []
+    honest = cached_export.export
+    monkeypatch.setattr(
+        cached_export, "export", lambda *given, **more: (made.append(0), honest(*given, **more))[1]
+    )
 
     def features(path):
         return load_encoder(path).encode_touch(CLIPS[:, 0], "digit")
@@ -80,31 +103,39 @@ def test_an_export_is_made_once_and_again_when_anything_that_decides_it_changes(
     describes(stored(tmp_path)[0]).unlink()
     np.testing.assert_array_equal(features(path), first)
     assert len(made) == 3
-    for number, changes in enumerate(({"background": "subtract"}, {"activation": "quick_gelu"}, {"norm_eps": 0.1})):
+    for number, changes in enumerate(
+        ({"background": "subtract"}, {"activation": "quick_gelu"}, {"norm_eps": 0.1})
+    ):
         features(weights(path, **changes))
         assert len(made) == 4 + number  # the parameters are the same
     monkeypatch.setattr("onnxruntime.__version__", "0")
     features(path)
     assert len(made) == 7
-    assert not [file for file in path.parent.rglob("*") if file.name.startswith(".") and file.is_file()]
+    assert not [
+        file for file in path.parent.rglob("*") if file.name.startswith(".") and file.is_file()
+    ]
 
 
 def test_exports_of_the_package_and_of_a_folder_that_cannot_be_written_are_in_the_cache_of_the_user(
     tmp_path, monkeypatch
 ):
     own = cache_folder() / "engines"
-    assert cached_export._folders("anytouch-tiny") == cached_export._folders("hf://user/repo") == [own]
+    assert (
+        cached_export._folders("anytouch-tiny") == cached_export._folders("hf://user/repo") == [own]
+    )
     path = weights(tmp_path / "w.safetensors")
     (tmp_path / ".engines").write_text("a file where the folder would be")
     one, two = (load_encoder(path).encode_touch(CLIPS[:, 0], "digit") for _ in range(2))
     np.testing.assert_array_equal(one, two)
     assert [file.parent for file in stored(tmp_path)] == [own]
-    monkeypatch.setenv("XDG_CACHE_HOME", str(path))  # nothing can be written
+    # nothing can be written
+    monkeypatch.setenv("XDG_CACHE_HOME", str(path))
     np.testing.assert_array_equal(load_encoder(path).encode_touch(CLIPS[:, 0], "digit"), one)
 
 
 def test_an_export_that_differs_is_never_used_and_not_tried_again(tmp_path, monkeypatch):
-    honest, tried = engines.touch_graph, []
+    honest = engines.touch_graph
+    tried = []
 
     def other(params, *rest):
         tried.append(0)
@@ -126,10 +157,14 @@ def test_xla_computes_what_an_export_cannot(tmp_path, monkeypatch):
     path = weights(tmp_path / "w.safetensors")
     auto, live = (load_encoder(path, engine=engine) for engine in ("auto", "xla"))
     for given in ({"pooling": "mean"}, {"join": "concat"}):
-        np.testing.assert_array_equal(*(one.encode_touch(CLIPS, "digit", **given) for one in (auto, live)))
+        np.testing.assert_array_equal(
+            *(one.encode_touch(CLIPS, "digit", **given) for one in (auto, live))
+        )
     half = [one.computed_in("bfloat16").encode_touch(CLIPS[:, 0], "digit") for one in (auto, live)]
     np.testing.assert_array_equal(*half)
-    gradient = jax.grad(lambda params: auto.traceable()(params, CLIPS[:1, :1], np.zeros(1, np.int32)).sum())
+    gradient = jax.grad(
+        lambda params: auto.traceable()(params, CLIPS[:1, :1], np.zeros(1, np.int32)).sum()
+    )
     assert np.isfinite(jax.tree.leaves(gradient(auto.params))[0]).all()
     assert auto.encode_touch(CLIPS[:0, :1]).shape == (0, 12)
     assert stored(tmp_path) == []
@@ -167,9 +202,19 @@ def test_an_engine_that_cannot_compute_says_so(tmp_path):
     path = weights(tmp_path / "w.safetensors")
     family = Path(__file__).parents[1] / "parity" / "golden_others" / "timm_vit.safetensors"
     for call, words in (
-        (lambda: load_encoder(path, engine="tensorrt"), "engine is one of auto, xla, onnxruntime, openvino"),
+        (
+            lambda: load_encoder(path, engine="tensorrt"),
+            "engine is one of auto, xla, onnxruntime, openvino",
+        ),
         (lambda: load_encoder(family, heads=4, engine="onnxruntime"), "another family"),
-        (lambda: load_encoder(path, engine="onnxruntime").computed_in("bfloat16").encode_touch(CLIPS[:, 0]), "dtype"),
+        (
+            lambda: (
+                load_encoder(path, engine="onnxruntime")
+                .computed_in("bfloat16")
+                .encode_touch(CLIPS[:, 0])
+            ),
+            "dtype",
+        ),
     ):
         with pytest.raises(UserError, match=words):
             call()

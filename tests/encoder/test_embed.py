@@ -11,9 +11,12 @@ from anytouch_jax.errors import UserError
 RNG = np.random.default_rng(0)
 
 
-@pytest.mark.parametrize(("count", "shapes"), [(0, []), (3, [3]), (4, [4]), (9, [4, 4, 4]), (8, [4, 4])])
+@pytest.mark.parametrize(
+    ("count", "shapes"), [(0, []), (3, [3]), (4, [4]), (9, [4, 4, 4]), (8, [4, 4])]
+)
 def test_batches_are_of_one_size_and_results_keep_their_order(count, shapes):
-    sizes, items = [], RNG.standard_normal((count, 5))
+    sizes = []
+    items = RNG.standard_normal((count, 5))
 
     def double(batch):
         sizes.append(len(batch))
@@ -41,8 +44,14 @@ def test_the_spread_is_the_mean_cosine_of_pairs(noise, is_constant):
     assert f"{wanted:.4f}" in lines[0] and len(lines) == 1 + is_constant
     assert not is_constant or ("Train longer" in lines[1] and "background subtraction" in lines[1])
     assert spread_lines(values[:1]) == [] and spread_lines(np.zeros((0, 0), np.float32)) == []
-    assert len(spread_lines(np.repeat(values, 100, axis=0))) == 1 + is_constant, "more rows than are compared"
-    assert spread_lines(values.astype(np.float64) * 1e200) == spread_lines(values.astype(np.float64) * 1e-200) == lines
+    assert len(spread_lines(np.repeat(values, 100, axis=0))) == 1 + is_constant, (
+        "more rows than are compared"
+    )
+    assert (
+        spread_lines(values.astype(np.float64) * 1e200)
+        == spread_lines(values.astype(np.float64) * 1e-200)
+        == lines
+    )
 
 
 def test_each_press_is_felt_by_each_sensor_and_differs_from_the_untouched_gel():
@@ -60,17 +69,30 @@ def write(path, values, **more):
         "key/path": np.array([f"{i}.png" for i in range(len(values))]),
         "key/label.object": np.full(len(values), "a"),
     }
-    np.savez(path, **{"features": values, "rows": np.arange(len(values)), "about/weights": "12ab", **keys, **more})
+    np.savez(
+        path,
+        **{
+            "features": values,
+            "rows": np.arange(len(values)),
+            "about/weights": "12ab",
+            **keys,
+            **more,
+        },
+    )
     return path
 
 
 def test_the_nearest_are_those_of_largest_cosine(tmp_path):
     rng = np.random.default_rng(0)
-    values = rng.standard_normal((500, 8)).astype(np.float32) * rng.uniform(0.1, 10, (500, 1)).astype(np.float32)
+    values = rng.standard_normal((500, 8)).astype(np.float32) * rng.uniform(
+        0.1, 10, (500, 1)
+    ).astype(np.float32)
     index = load_index(write(tmp_path / "f.npz", values))
     query = rng.standard_normal((3, 8))
     ids, cosines = index.search(query, 7)
-    cosine = query @ values.T / np.linalg.norm(query, axis=1)[:, None] / np.linalg.norm(values, axis=1)
+    cosine = (
+        query @ values.T / np.linalg.norm(query, axis=1)[:, None] / np.linalg.norm(values, axis=1)
+    )
     np.testing.assert_array_equal(ids, np.argsort(-cosine, axis=1)[:, :7])
     np.testing.assert_allclose(cosines, -np.sort(-cosine, axis=1)[:, :7], atol=1e-5)
     assert index.search(3 * values[4], 1)[0].tolist() == [[4]]
@@ -91,12 +113,15 @@ def test_cells_find_almost_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "_LOOKED_INTO", 20)  # of 40 cells
     values = np.random.default_rng(1).standard_normal((400, 16)).astype(np.float32)
     path = write(tmp_path / "f.npz", values)
-    exact, index = load_index(path).search(values[:20], 5), load_index(path, approximate=True)
+    exact = load_index(path).search(values[:20], 5)
+    index = load_index(path, approximate=True)
     ids, cosines = index.search(values[:20], 5)
     assert np.mean([len(set(a) & set(b)) / 5 for a, b in zip(exact[0], ids, strict=True)]) > 0.9
     np.testing.assert_array_equal(ids[:, 0], np.arange(20))
     np.testing.assert_allclose(cosines[:, 0], 1, atol=1e-4)
-    np.testing.assert_array_equal(index.search(values[:3], 400)[0], load_index(path).search(values[:3], 400)[0])
+    np.testing.assert_array_equal(
+        index.search(values[:3], 400)[0], load_index(path).search(values[:3], 400)[0]
+    )
 
 
 def test_a_hostile_file_is_refused(tmp_path):

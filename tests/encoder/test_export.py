@@ -42,10 +42,12 @@ def test_any_number_of_touches_gives_the_features_of_the_live_model(artefact, en
         assert result.shape == (count, 12) and result.dtype == np.float32
         np.testing.assert_allclose(result, live, atol=1e-5)
     np.testing.assert_allclose(run(CLIPS, "digit"), encoder.encode_touch(CLIPS, "digit"), atol=1e-5)
-    np.testing.assert_allclose(run(CLIPS), encoder.encode_touch(CLIPS), atol=1e-5)  # the universal tokens
+    # the universal tokens
+    np.testing.assert_allclose(run(CLIPS), encoder.encode_touch(CLIPS), atol=1e-5)
     assert np.abs(run(CLIPS) - run(CLIPS, "digit")).max() > 1e-4
     names = list(encoder.config.model.sensors)
-    for each in ([names[row] for row in ROWS], np.array(names, object)[ROWS]):  # as `Encoder.embed` takes them
+    # as `Encoder.embed` takes them
+    for each in ([names[row] for row in ROWS], np.array(names, object)[ROWS]):
         np.testing.assert_array_equal(run(CLIPS, each), run(CLIPS, ROWS))
     assert 0 <= about["worst_difference"] < 1e-4
 
@@ -53,10 +55,19 @@ def test_any_number_of_touches_gives_the_features_of_the_live_model(artefact, en
 def test_the_description_tells_how_to_call_it(artefact, encoder, monkeypatch):
     path, about = artefact
     assert json.loads(describes(path).read_text()) == about
-    assert about["platforms"] == ["cpu", "cuda"] and about["frames"] == 3 and about["image_size"] == 28
-    assert about["features"] == 12 and about["sensors"]["digit"] == 1 and about["sensors"]["universal"] == 9
+    assert (
+        about["platforms"] == ["cpu", "cuda"] and about["frames"] == 3 and about["image_size"] == 28
+    )
+    assert (
+        about["features"] == 12
+        and about["sensors"]["digit"] == 1
+        and about["sensors"]["universal"] == 9
+    )
     assert about["bytes"] == path.stat().st_size
-    assert "to 28 x 28, its shape not kept: OpenCV's INTER_AREA" in about["resize"] and "gel" not in about["resize"]
+    assert (
+        "to 28 x 28, its shape not kept: OpenCV's INTER_AREA" in about["resize"]
+        and "gel" not in about["resize"]
+    )
     monkeypatch.chdir(path.parent)
     space = {"frames": CLIPS, "sensor": ROWS}
     exec(about["example"], space)  # what a reader would copy
@@ -66,8 +77,12 @@ def test_the_description_tells_how_to_call_it(artefact, encoder, monkeypatch):
 @pytest.mark.parametrize("attention", ["cudnn", "mapped"])
 def test_attention_of_one_platform_is_exported_for_all(tmp_path, encoder, attention):
     model = replace(encoder.config.model, attention=attention)
-    export(replace(encoder, config=replace(encoder.config, model=model)), tmp_path / "m.bin", frames=3)
-    np.testing.assert_allclose(load(tmp_path / "m.bin")(CLIPS, ROWS), encoder.encode_touch(CLIPS, ROWS), atol=1e-5)
+    export(
+        replace(encoder, config=replace(encoder.config, model=model)), tmp_path / "m.bin", frames=3
+    )
+    np.testing.assert_allclose(
+        load(tmp_path / "m.bin")(CLIPS, ROWS), encoder.encode_touch(CLIPS, ROWS), atol=1e-5
+    )
 
 
 def test_an_artefact_needs_no_code_of_the_network(artefact):
@@ -84,13 +99,21 @@ def test_an_artefact_needs_no_code_of_the_network(artefact):
 def test_wrong_touches_and_sensors_are_one_sentence(artefact):
     run = load(artefact[0])
     for clips, sensor, word in (
-        (CLIPS.astype(np.float32), ROWS, "float32"), (CLIPS[:, :2], ROWS, r"\(B, 3, 28, 28, 3\)"),
-        (CLIPS[:, :, :27], ROWS, r"\(B, 3, 28, 28, 3\)"), (CLIPS[:0], ROWS[:0], "at least one"),
+        (CLIPS.astype(np.float32), ROWS, "float32"),
+        (CLIPS[:, :2], ROWS, r"\(B, 3, 28, 28, 3\)"),
+        (CLIPS[:, :, :27], ROWS, r"\(B, 3, 28, 28, 3\)"),
+        (CLIPS[:0], ROWS[:0], "at least one"),
         (CLIPS, ROWS.astype(float), r"one integer for each of the 5 touches, not float64 \(5,\)"),
         (CLIPS, ["digit"] * 4, "one integer for each of the 5 touches"),
-        (CLIPS, ["digit"] * 4 + ["nobody"], "sensor 'nobody' is not one of .*; universal serves any other"),
-        (CLIPS, ROWS - 1, "0 to 9"), (CLIPS, ROWS + 1, "0 to 9"), (CLIPS, "nobody", "universal serves any other"),
-    ):  # fmt: skip
+        (
+            CLIPS,
+            ["digit"] * 4 + ["nobody"],
+            "sensor 'nobody' is not one of .*; universal serves any other",
+        ),
+        (CLIPS, ROWS - 1, "0 to 9"),
+        (CLIPS, ROWS + 1, "0 to 9"),
+        (CLIPS, "nobody", "universal serves any other"),
+    ):
         with pytest.raises(UserError, match=word):
             run(clips, sensor)
 
@@ -98,7 +121,11 @@ def test_wrong_touches_and_sensors_are_one_sentence(artefact):
 def test_a_damaged_artefact_is_refused(copied):
     whole = copied.read_bytes()
     middle = len(whole) // 2
-    for data in (whole[:-1], whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :], b""):
+    for data in (
+        whole[:-1],
+        whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :],
+        b"",
+    ):
         copied.write_bytes(data)
         with pytest.raises(UserError, match=r"model\.bin is damaged: its checksum"):
             load(copied)
@@ -118,8 +145,11 @@ def test_a_wrong_or_missing_description_is_refused(copied):
         load(copied)
 
 
-def test_an_artefact_that_differs_from_the_live_model_is_not_written(encoder, tmp_path, monkeypatch):
-    other, honest = random_encoder(encoder.config, seed=5), exports._artefact
+def test_an_artefact_that_differs_from_the_live_model_is_not_written(
+    encoder, tmp_path, monkeypatch
+):
+    other = random_encoder(encoder.config, seed=5)
+    honest = exports._artefact
     monkeypatch.setattr(exports, "_artefact", lambda _, *rest: honest(other, *rest))
     with pytest.raises(UserError, match="differs from the live model"):
         export(encoder, tmp_path / "m.bin", platforms=("cpu",))

@@ -10,7 +10,8 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits
 from experiments.real.trust import calibration_error
 
-CLASSES, WIDTH = 4, 8
+CLASSES = 4
+WIDTH = 8
 
 
 def touches(rng, groups, rows=6, sensor_shift=0.0):
@@ -29,10 +30,14 @@ def touches(rng, groups, rows=6, sensor_shift=0.0):
 
 
 def calibrated(x, y, groups, sensors, share=0.8, **options):
-    fit, val = (np.flatnonzero((groups < share * groups.max()) == is_fit) for is_fit in (True, False))
+    fit, val = (
+        np.flatnonzero((groups < share * groups.max()) == is_fit) for is_fit in (True, False)
+    )
     names, numbers = np.unique(y, return_inverse=True)
     (model,) = heads.linear_path(x[fit], numbers[fit], (0.01,))
-    head = heads.linear_head(model, names, label="shape", pooling="class", frames=1, fingerprint="f")
+    head = heads.linear_head(
+        model, names, label="shape", pooling="class", frames=1, fingerprint="f"
+    )
     folds = splits.group_folds(fit, groups, numbers, 4)
     return heads.calibrate(head, x, y, groups, sensors, fit, val, folds, 0.01, **options)
 
@@ -40,8 +45,10 @@ def calibrated(x, y, groups, sensors, share=0.8, **options):
 @pytest.mark.parametrize(("alike", "count", "above"), [(1.0, 30, 1 / 31), (0.0, 12, 0.0)])
 def test_a_limit_covers_new_groups_as_often_as_asked(alike, count, above):
     """Few groups are covered no more often than asked if their rows differ."""
-    rng, inside = np.random.default_rng(0), []
-    groups = np.repeat(np.arange(count), rng.integers(1, 9, count))  # of different sizes
+    rng = np.random.default_rng(0)
+    inside = []
+    # of different sizes
+    groups = np.repeat(np.arange(count), rng.integers(1, 9, count))
     for _ in range(600):
         scores = alike * rng.standard_normal(count)[groups] + 0.2 * rng.standard_normal(len(groups))
         new = alike * rng.standard_normal(1) + 0.2 * rng.standard_normal(20)
@@ -92,12 +99,18 @@ def test_a_head_is_calibrated_on_new_recordings():
 
 def test_few_recordings_of_wide_features_raise_no_more_false_alarms_than_asked():
     """Recordings that the whitening has seen look familiar, so they may not set the limit."""
-    rng, alarms = np.random.default_rng(9), []
+    rng = np.random.default_rng(9)
+    alarms = []
     for _ in range(4):
         group = np.repeat(np.arange(160), 4)
-        x = (rng.standard_normal((160, 20))[group] + 0.3 * rng.standard_normal((640, 20))).astype(np.float32)
-        y, known = np.array(list("abcd"))[group % 4], group < 80
-        head = calibrated(x[known], y[known], group[known], np.full(known.sum(), "digit"), false_alarms=0.06)
+        x = (rng.standard_normal((160, 20))[group] + 0.3 * rng.standard_normal((640, 20))).astype(
+            np.float32
+        )
+        y = np.array(list("abcd"))[group % 4]
+        known = group < 80
+        head = calibrated(
+            x[known], y[known], group[known], np.full(known.sum(), "digit"), false_alarms=0.06
+        )
         alarms.append(head.assess(x[~known]).novel.mean())
     assert 0.001 < np.mean(alarms) < 0.08, alarms
 
@@ -111,7 +124,8 @@ def test_a_sensor_that_was_not_named_is_reported():
     for name in ("digit", "gelsight"):
         assert known.sensor_warning(x[sensors == name], name) == ""
         assert f"not {name}" in known.sensor_warning(x[sensors != name], name)
-        assert known.sensor_warning(x[sensors != name][:3], name) == ""  # too few frames to say
+        # too few frames to say
+        assert known.sensor_warning(x[sensors != name][:3], name) == ""
     assert "not on duragel" in known.sensor_warning(x, "duragel")
     far = x[sensors == "digit"][:9] - 8  # away from both, nearer to digit
     assert "unlike every touch of digit" in known.sensor_warning(far, "digit")
@@ -120,7 +134,8 @@ def test_a_sensor_that_was_not_named_is_reported():
 def test_a_saved_head_keeps_its_calibration(tmp_path):
     head = calibrated(*touches(np.random.default_rng(6), 60))
     linear_head.save_head(tmp_path / "h.npz", head)
-    again, x = linear_head.load_head(tmp_path / "h.npz"), touches(np.random.default_rng(7), 20)[0]
+    again = linear_head.load_head(tmp_path / "h.npz")
+    x = touches(np.random.default_rng(7), 20)[0]
     for one, two in zip(head.assess(x), again.assess(x), strict=True):
         np.testing.assert_array_equal(one, two)
     assert (again.calibration.sensors == head.calibration.sensors).all()

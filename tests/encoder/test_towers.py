@@ -59,12 +59,18 @@ def test_towers_equal_those_of_training(encoder, stored):
 
 
 def test_similarity_is_a_cosine_and_a_softmax_at_the_learned_temperature(encoder, stored):
-    touch, texts = encoder.encode_touch(STILLS, "digit"), encoder.encode_text(TEXTS)
+    touch = encoder.encode_touch(STILLS, "digit")
+    texts = encoder.encode_text(TEXTS)
     cosine = encoder.similarity(touch, TEXTS)
     assert cosine.shape == (4, 3) and np.abs(cosine).max() <= 1
-    wanted = (touch @ texts.T) / np.linalg.norm(touch, axis=1)[:, None] / np.linalg.norm(texts, axis=1)[None]
+    wanted = (
+        (touch @ texts.T)
+        / np.linalg.norm(touch, axis=1)[:, None]
+        / np.linalg.norm(texts, axis=1)[None]
+    )
     np.testing.assert_allclose(cosine, wanted, atol=1e-5)
-    np.testing.assert_array_equal(encoder.similarity(touch, texts), cosine)  # embeddings serve as well
+    # embeddings serve as well
+    np.testing.assert_array_equal(encoder.similarity(touch, texts), cosine)
     np.testing.assert_allclose(np.diag(encoder.similarity(texts, texts)), 1, atol=1e-5)
     chances = encoder.similarity(touch, TEXTS, probabilities=True)
     scaled = cosine * np.exp(np.asarray(stored.params["logit_scale"]))
@@ -88,7 +94,10 @@ def test_absent_towers_and_wrong_types_are_one_sentence(encoder, stored, tiny_ru
         for part, call in (
             ("text tower", lambda other=other: other.encode_text(TEXTS)),
             ("image tower", lambda other=other: other.encode_image(PHOTOS)),
-            ("text tower", lambda other=other: other.similarity(np.ones((1, 12), np.float32), TEXTS)),
+            (
+                "text tower",
+                lambda other=other: other.similarity(np.ones((1, 12), np.float32), TEXTS),
+            ),
             ("matching head", lambda other=other: other.match(np.ones((1, 12)), np.ones((1, 12)))),
         ):
             with pytest.raises(UserError, match=f"has no {part}") as error:

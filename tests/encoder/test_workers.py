@@ -36,7 +36,8 @@ PICTURE = RNG.integers(0, 256, (40, 30, 3), np.uint8)
 @pytest.fixture(scope="module")
 def workers(tmp_path_factory):
     """What users send to workers, by name: the object, and a function of it that computes."""
-    folder, config = tmp_path_factory.mktemp("workers"), Config(full_model())
+    folder = tmp_path_factory.mktemp("workers")
+    config = Config(full_model())
     params = build(config.model).init(jax.random.key(0))
     touch = {"touch": params.pop("touch")}
     encoder = Encoder(base.touch_only(config), touch, "mine", whole=config.model, others=params)
@@ -50,7 +51,10 @@ def workers(tmp_path_factory):
         "family": (other, lambda one: one.encode_touch(np.stack([one.preprocess(PICTURE)] * 3))),
         "preprocess": (Preprocess(encoder, PICTURE), lambda one: one(PICTURE)),
         "preprocess of a family": (Preprocess(other), lambda one: one(PICTURE)),
-        "preprocess of an engine": (Preprocess(load_encoder(folder / "touch.onnx")), lambda one: one(PICTURE)),
+        "preprocess of an engine": (
+            Preprocess(load_encoder(folder / "touch.onnx")),
+            lambda one: one(PICTURE),
+        ),
         "exported": (load(folder / "touch.bin"), lambda one: one(FRAMES[:3])),
         "engine": (load_encoder(folder / "touch.onnx"), lambda one: one.encode_touch(FRAMES[:3])),
         "the folder": (folder, lambda one: load_encoder(one / "touch.onnx")),
@@ -61,23 +65,40 @@ def programs():
     """What else computes, by name."""
     config = tiny_config(1)
     params = build(config.model).init(jax.random.key(0))
-    x, y = RNG.standard_normal((20, 4)).astype("f4"), np.arange(20) % 3
-    state, tx, key, jitted = init_state(params, config), optimizer(config), jax.random.key(0), jax.jit(lambda x: x + 1)
+    x = RNG.standard_normal((20, 4)).astype("f4")
+    y = np.arange(20) % 3
+    state = init_state(params, config)
+    tx = optimizer(config)
+    key = jax.random.key(0)
+    jitted = jax.jit(lambda x: x + 1)
     step = make_step(lambda *_: (jnp.zeros(()), {}), tx, total_steps=2)
     return {
-        "head by gradients": lambda: fit_head(ProbeHead("gradient", (1,), recipe=GradientRecipe(1)), x, y, 3),
+        "head by gradients": lambda: fit_head(
+            ProbeHead("gradient", (1,), recipe=GradientRecipe(1)), x, y, 3
+        ),
         "first state": lambda: init_state(params, config),
         "step": lambda: step(state, (), key),
         "fit": lambda: fit(config, params=params, loss_fn=None, batches=None, run_dir="."),
         "pretrain": lambda: pretrain(config, "."),
         "simulated touch": lambda: simulate_touch(np.zeros((9, 9)), np.zeros(4)),
-        "panels": lambda: reconstruction_panels(params, None, None, net=build(config.model), config=config),
+        "panels": lambda: reconstruction_panels(
+            params, None, None, net=build(config.model), config=config
+        ),
         "your own program": lambda: jitted(np.ones(3)),
     }
 
 
-NAMES = ("encoder", "towers", "match", "family", "preprocess", "preprocess of a family", "preprocess of an engine",
-         "exported", "engine")  # fmt: skip
+NAMES = (
+    "encoder",
+    "towers",
+    "match",
+    "family",
+    "preprocess",
+    "preprocess of a family",
+    "preprocess of an engine",
+    "exported",
+    "engine",
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -85,10 +106,12 @@ def test_pickle_holds_the_same_before_and_after_the_first_call(workers, name):
     one, use = workers[name]
     fresh = pickle.dumps(pickle.loads(pickle.dumps(one)))
     wanted = use(one)
-    assert abs(len(pickle.dumps(one)) - len(fresh)) < 100  # compiled programs are not state
+    # compiled programs are not state
+    assert abs(len(pickle.dumps(one)) - len(fresh)) < 100
     np.testing.assert_array_equal(use(pickle.loads(pickle.dumps(one))), wanted)
     if "preprocess" in name:
-        assert len(fresh) < 10_000  # no parameters go to a worker that prepares frames
+        # no parameters go to a worker that prepares frames
+        assert len(fresh) < 10_000
 
 
 def test_a_forked_process_computes_or_says_why_it_cannot(workers):
@@ -119,7 +142,8 @@ def test_a_forked_process_computes_or_says_why_it_cannot(workers):
             if name == "engine" or "preprocess" in name:
                 assert answer.startswith("("), name
             elif name == "your own program":
-                assert "tracing" in answer and seconds < 1  # jax's word: it does not hang
+                # jax's word: it does not hang
+                assert "tracing" in answer and seconds < 1
             else:
                 assert "forked" in answer and "spawn" in answer and seconds < 1, (name, answer)
     finally:
@@ -129,15 +153,20 @@ def test_a_forked_process_computes_or_says_why_it_cannot(workers):
 
 @pytest.mark.parametrize("part", ["touch", "image", "text", "match", "exported"])
 def test_few_numbers_of_rows_are_compiled_and_features_are_equal(workers, part, monkeypatch):
-    encoder, exported = workers["encoder"][0], workers["exported"][0]
-    encoder, shapes = pickle.loads(pickle.dumps(encoder)), set()
+    encoder = workers["encoder"][0]
+    exported = workers["exported"][0]
+    encoder = pickle.loads(pickle.dumps(encoder))
+    shapes = set()
 
     def ids(texts, length):
-        return np.array([[int(one) % 9] * length for one in texts]), np.ones((len(texts), length), bool)
+        return np.array([[int(one) % 9] * length for one in texts]), np.ones(
+            (len(texts), length), bool
+        )
 
     words = SimpleNamespace(vocab_size=9, encode=ids)
     encoder.__dict__["tokenizer"] = words
-    pictures, z = RNG.integers(0, 256, (70, 28, 28, 3), np.uint8), RNG.standard_normal((2, 70, 12))
+    pictures = RNG.integers(0, 256, (70, 28, 28, 3), np.uint8)
+    z = RNG.standard_normal((2, 70, 12))
     run = {
         "touch": lambda n: encoder.encode_touch(FRAMES[:n], np.arange(n) % 3),
         "image": lambda n: encoder.encode_image(list(pictures[:n])),
@@ -149,7 +178,12 @@ def test_few_numbers_of_rows_are_compiled_and_features_are_equal(workers, part, 
 
     def counting(function, *args, **kwargs):
         def traced(*given):
-            shapes.add(tuple(x.shape[0] for x in jax.tree.leaves(given[1:] if part == "touch" else given[-1:])))
+            shapes.add(
+                tuple(
+                    x.shape[0]
+                    for x in jax.tree.leaves(given[1:] if part == "touch" else given[-1:])
+                )
+            )
             return function(*given)
 
         return plain(traced, *args, **kwargs)

@@ -45,12 +45,17 @@ def world(folder: Path, gel: int) -> Manifest:
     for i in ROWS:
         paint(folder / f"{i}.bmp", 100 + 20 * i)
     paint(folder / "background.bmp", gel)
-    manifests.write(manifests.from_columns(columns(3, **files), folder / "m.parquet"), folder / "m.parquet")
+    manifests.write(
+        manifests.from_columns(columns(3, **files), folder / "m.parquet"), folder / "m.parquet"
+    )
     return manifests.read(folder / "m.parquet")
 
 
 def test_packs_of_one_table_with_other_gels_share_no_features(tmp_path, subtracting):
-    one, two = (manifests.read(pack(world(tmp_path / str(gel), gel), tmp_path / f"packed{gel}")) for gel in (100, 40))
+    one, two = (
+        manifests.read(pack(world(tmp_path / str(gel), gel), tmp_path / f"packed{gel}"))
+        for gel in (100, 40)
+    )
     assert one.content_hash == two.content_hash
     shards = [one_of.file(0).parent for one_of in (one, two)]
     for shard in shards:
@@ -79,9 +84,18 @@ def test_the_cache_goes_by_content(encoder, pictures, tmp_path):
     store = encoder_features(encoder, pictures, **plain)
     files = {store.file(1), store.file(3)}
     other = random_encoder(tiny_config(), seed=1)
-    assert encoder_digest(other) != encoder_digest(encoder) == encoder_digest(random_encoder(tiny_config()))
+    assert (
+        encoder_digest(other)
+        != encoder_digest(encoder)
+        == encoder_digest(random_encoder(tiny_config()))
+    )
     files.add(encoder_features(other, pictures, **plain).file(1))
-    for change in ({"pooling": "mean"}, {"join": "concat"}, {"order": "shuffled"}, {"universal": True}):
+    for change in (
+        {"pooling": "mean"},
+        {"join": "concat"},
+        {"order": "shuffled"},
+        {"universal": True},
+    ):
         files.add(encoder_features(encoder, pictures, **plain | change).file(1))
     files.add(encoder_features(encoder, simulated(objects=8), **plain).file(1))
     assert len(files) == 8
@@ -89,7 +103,10 @@ def test_the_cache_goes_by_content(encoder, pictures, tmp_path):
     copied.mkdir()
     for name in ["ground.png", *pictures.column("path").to_pylist()]:
         shutil.copy2(pictures.files[0].parent / name, copied / name)
-    manifests.write(manifests.from_columns(pictures.table.to_pydict(), copied / "m.parquet"), copied / "m.parquet")
+    manifests.write(
+        manifests.from_columns(pictures.table.to_pydict(), copied / "m.parquet"),
+        copied / "m.parquet",
+    )
     moved = manifests.read(copied / "m.parquet")
     assert encoder_features(encoder, moved, **plain).file(1) == store.file(1)
     middle = copied / pictures.value(len(pictures) // 2 + 1, "path")
@@ -99,7 +116,8 @@ def test_the_cache_goes_by_content(encoder, pictures, tmp_path):
     (copied / pictures.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
     before = encoder_features(encoder, moved, **plain).file(1)
     assert before != rewritten  # an equal table of other pictures
-    cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))  # another photograph of the gel
+    # another photograph of the gel
+    cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))
     assert encoder_features(encoder, moved, **plain).file(1) != before
 
 
@@ -117,7 +135,9 @@ def test_the_order_of_frames(encoder, pictures):
     clips = np.arange(24).reshape(8, 3)
     rows = np.arange(8)
     np.testing.assert_array_equal(reorder_frames(clips, rows, "right"), clips)
-    np.testing.assert_array_equal(reorder_frames(clips, rows, "repeated"), np.repeat(clips[:, 2:], 3, 1))
+    np.testing.assert_array_equal(
+        reorder_frames(clips, rows, "repeated"), np.repeat(clips[:, 2:], 3, 1)
+    )
     mixed = reorder_frames(clips, rows, "shuffled")
     assert (np.sort(mixed, 1) == clips).all() and (mixed != clips).any(1).all()
     assert len({tuple(one - one.min()) for one in mixed}) > 2
@@ -126,7 +146,9 @@ def test_the_order_of_frames(encoder, pictures):
     with pytest.raises(UserError, match="backwards"):
         reorder_frames(clips, rows, "backwards")
     ends = pictures.clips(3)[:6, -1]
-    stores = {o: encoder_features(encoder, pictures, order=o) for o in ("right", "shuffled", "repeated")}
+    stores = {
+        o: encoder_features(encoder, pictures, order=o) for o in ("right", "shuffled", "repeated")
+    }
     values = {name: store.get(ends[:, None], 3) for name, store in stores.items()}
     stills = stores["right"].get(ends[:, None], 1)
     np.testing.assert_allclose(values["repeated"], stills, atol=2e-5)
@@ -142,20 +164,26 @@ def noise(count: int, height: int = 48, width: int = 64, seed: int = 0) -> np.nd
 
 
 def raw_pixels(frames: np.ndarray, backgrounds: np.ndarray) -> np.ndarray:
-    return np.stack([feature_cache.raw_pixels(*one) for one in zip(frames, backgrounds, strict=True)])
+    return np.stack(
+        [feature_cache.raw_pixels(*one) for one in zip(frames, backgrounds, strict=True)]
+    )
 
 
 def test_pixels_are_block_means_in_colour() -> None:
-    frames, backgrounds = noise(3), noise(3, seed=1)
+    frames = noise(3)
+    backgrounds = noise(3, seed=1)
     features = raw_pixels(frames, backgrounds)
     assert features.shape == (3, 2 * 24 * 32 * 3)
     pixels, behind = (
-        (one / 255).reshape(3, 24, 2, 32, 2, 3).mean((2, 4)).reshape(3, -1) for one in (frames, backgrounds)
+        (one / 255).reshape(3, 24, 2, 32, 2, 3).mean((2, 4)).reshape(3, -1)
+        for one in (frames, backgrounds)
     )
     np.testing.assert_allclose(features[:, :HALF], pixels, atol=1e-6)
     np.testing.assert_allclose(features[:, HALF:], pixels - behind, atol=1e-6)
     turned = raw_pixels(frames[..., ::-1], backgrounds)
-    assert np.abs(turned[:, :HALF] - features[:, :HALF]).mean() > 0.05, "colour depends on slope and must be used"
+    assert np.abs(turned[:, :HALF] - features[:, :HALF]).mean() > 0.05, (
+        "colour depends on slope and must be used"
+    )
 
 
 def test_components_are_those_of_train() -> None:
@@ -171,16 +199,23 @@ def test_components_are_those_of_train() -> None:
 
 
 def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):
-    values, rows = np.random.default_rng(0).normal(size=(9, 4)).astype(np.float32), np.arange(20, 2, -2)
+    values = np.random.default_rng(0).normal(size=(9, 4)).astype(np.float32)
+    rows = np.arange(20, 2, -2)
     np.savez(tmp_path / "f.npz", features=values, rows=rows)
     store = feature_cache.file_features(tmp_path / "f.npz", pictures)
     np.testing.assert_array_equal(store.get(np.array([[4], [20]]), 3), values[[8, 0]])
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"rows": np.arange(12) + 1000}, "rows"), ({"rows": np.zeros(12, int)}, "rows"), ({}, "lacks 3 "),
-    ({"key/path": np.array(["x.png"] * 12)}, "manifest"), ({"about/frames": np.array("3")}, "--frames 3"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rows": np.arange(12) + 1000}, "rows"),
+        ({"rows": np.zeros(12, int)}, "rows"),
+        ({}, "lacks 3 "),
+        ({"key/path": np.array(["x.png"] * 12)}, "manifest"),
+        ({"about/frames": np.array("3")}, "--frames 3"),
+    ],
+)
 def test_a_features_file_that_does_not_fit_is_refused(pictures, tmp_path, change, words):
     arrays = {"features": np.ones((12, 4)), "rows": np.arange(12)} | change
     np.savez(tmp_path / "odd.npz", **arrays)

@@ -6,7 +6,12 @@ import pytest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import statistics
 from anytouch_jax.evaluate.plots import alignment, describe, silhouette, tsne, uniformity
-from anytouch_jax.evaluate.statistics import GroupSums, classification_sums, mean_interval, regression_sums
+from anytouch_jax.evaluate.statistics import (
+    GroupSums,
+    classification_sums,
+    mean_interval,
+    regression_sums,
+)
 
 
 def noise(count: int, width: int = 8, seed: int = 0) -> Any:
@@ -14,8 +19,11 @@ def noise(count: int, width: int = 8, seed: int = 0) -> Any:
 
 
 def test_alignment_and_uniformity_by_hand() -> None:
-    right, up = np.array([[2.0, 0.0]]), np.array([[0.0, 0.5]])
-    assert alignment(right, up) == pytest.approx(2.0) and alignment(right, -right) == pytest.approx(4.0)
+    right = np.array([[2.0, 0.0]])
+    up = np.array([[0.0, 0.5]])
+    assert alignment(right, up) == pytest.approx(2.0) and alignment(right, -right) == pytest.approx(
+        4.0
+    )
     with pytest.raises(UserError, match="pairs"):
         alignment(right, np.ones((2, 2)))
     three = np.array([[1.0, 0.0], [0.0, 1.0], [-3.0, 0.0]])
@@ -36,18 +44,23 @@ def test_silhouettes_know_the_labels_that_made_the_space() -> None:
 
 def test_a_space_in_figures() -> None:
     """Two sensors feel thirty touches of ten objects: once the sensor decides where they lie, once the object."""
-    sensors, touches = np.repeat(["digit", "gelslim"], 30), np.tile(np.arange(30), 2)
+    sensors = np.repeat(["digit", "gelslim"], 30)
+    touches = np.tile(np.arange(30), 2)
     objects = touches // 3
     by_sensor = noise(60) * 0.3 + 5 * np.eye(8)[np.repeat([0, 1], 30)]
     by_object = noise(10, seed=1)[objects] + 0.01 * noise(60, seed=2)
-    first, second = (describe(x, sensors, objects, touches, name="x") for x in (by_sensor, by_object))
+    first, second = (
+        describe(x, sensors, objects, touches, name="x") for x in (by_sensor, by_object)
+    )
     assert first.silhouette_sensor > 0.8 > 0.1 > second.silhouette_sensor
     assert second.silhouette_object > 0.8 > 0.1 > first.silhouette_object
     assert second.alignment < 0.01 < 1.5 < first.alignment
     pairs = alignment(by_sensor[:30], by_sensor[30:])
     assert first.alignment == pytest.approx(pairs) and first.rows == 60
-    assert describe(by_sensor, ["digit"] * 60, objects, touches).alignment is None  # no pair by two sensors
-    names = np.where(objects < 5, objects.astype(str), "")  # rows of no known object are no object
+    # no pair by two sensors
+    assert describe(by_sensor, ["digit"] * 60, objects, touches).alignment is None
+    # rows of no known object are no object
+    names = np.where(objects < 5, objects.astype(str), "")
     some = describe(by_object, sensors, names, touches).silhouette_object
     assert some == pytest.approx(silhouette(by_object[objects < 5], objects[objects < 5]))
 
@@ -90,14 +103,22 @@ def test_the_interval_covers_the_truth_about_95_times_in_100() -> None:
     assert 180 <= hits <= 200
 
 
-def r2_interval(error: np.ndarray, truth: np.ndarray, groups: np.ndarray) -> tuple[float | None, float | None]:
-    return statistics._bootstrap_interval([regression_sums(error, truth - truth.mean(), groups)], statistics._r2_of)
+def r2_interval(
+    error: np.ndarray, truth: np.ndarray, groups: np.ndarray
+) -> tuple[float | None, float | None]:
+    return statistics._bootstrap_interval(
+        [regression_sums(error, truth - truth.mean(), groups)], statistics._r2_of
+    )
 
 
 def test_an_offset_changes_no_r2_interval() -> None:
     rng = np.random.default_rng(0)
-    truth, error, groups = rng.standard_normal(60), 0.1 * rng.standard_normal(60), np.arange(60) // 3
-    np.testing.assert_allclose(r2_interval(error, truth + 1.7e9, groups), r2_interval(error, truth, groups), atol=1e-5)
+    truth = rng.standard_normal(60)
+    error = 0.1 * rng.standard_normal(60)
+    groups = np.arange(60) // 3
+    np.testing.assert_allclose(
+        r2_interval(error, truth + 1.7e9, groups), r2_interval(error, truth, groups), atol=1e-5
+    )
     assert r2_interval(error, np.ones(60), groups) == (None, None)
 
 
@@ -118,8 +139,9 @@ def test_a_value_that_no_draw_has_has_no_interval() -> None:
 
 
 def test_values_from_sums() -> None:
-    truth, error = np.array([1.0, 2.0, 3.0, 6.0]), np.array([0.0, 0.5, 0.0, -1.0])
+    truth = np.array([1.0, 2.0, 3.0, 6.0])
+    error = np.array([0.0, 0.5, 0.0, -1.0])
     sums = regression_sums(error, truth, np.arange(4)).sums.sum(0)
-    assert statistics._r2_of(sums) == pytest.approx(1 - 1.25 / np.sum((truth - 3) ** 2)) and statistics._mae_of(
-        sums
-    ) == pytest.approx(1.5 / 4)
+    assert statistics._r2_of(sums) == pytest.approx(
+        1 - 1.25 / np.sum((truth - 3) ** 2)
+    ) and statistics._mae_of(sums) == pytest.approx(1.5 / 4)

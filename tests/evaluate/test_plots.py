@@ -38,12 +38,14 @@ def lines_of(run: Path, *lines: dict[str, Any]) -> Path:
 
 def test_loss_curves_hold_every_term(tmp_path: Path, drawn: list[Any]) -> None:
     steps = [
-        {"step": i, "loss": 3.0, "reconstruction": 1.0 / (i + 1)} | ({"next_frame": 0.5} if i % 2 else {})
+        {"step": i, "loss": 3.0, "reconstruction": 1.0 / (i + 1)}
+        | ({"next_frame": 0.5} if i % 2 else {})
         for i in range(60)
     ]
     steps[7]["reconstruction"] = None  # a skipped step
     short = [{"step": i, "loss": 2.0} for i in range(3)]
-    one, two = lines_of(tmp_path / "one", *steps), lines_of(tmp_path / "two", *short)
+    one = lines_of(tmp_path / "one", *steps)
+    two = lines_of(tmp_path / "two", *short)
     plots.loss_curves(tmp_path / "f" / "loss.png", {"stage 1": one, "other": two / "metrics.jsonl"})
     left, right = drawn[0].axes
     assert [t.get_text() for t in left.get_legend().get_texts()] == ["reconstruction", "next frame"]
@@ -51,7 +53,8 @@ def test_loss_curves_hold_every_term(tmp_path: Path, drawn: list[Any]) -> None:
     x, y = left.lines[0].get_data()
     assert 7 not in x and len(x) == 59 and y[0] == 1.0
     np.testing.assert_allclose(left.lines[1].get_ydata(), smoothed(y))
-    assert all(float(tick).is_integer() for tick in right.get_xticks())  # no half steps
+    # no half steps
+    assert all(float(tick).is_integer() for tick in right.get_xticks())
     assert list(left.lines[2].get_xdata()) == list(range(1, 60, 2))
     assert read(tmp_path / "f" / "loss.png").shape[1] > 600
 
@@ -63,9 +66,15 @@ def test_bars_with_intervals_and_chance(tmp_path: Path, drawn: list[Any]) -> Non
     }
     plots.bars(tmp_path / "b.png", series)
     left, right = drawn[0].axes
-    assert [patch.get_width() for patch in left.patches] == [20, 60] and [p.get_width() for p in right.patches] == [50]
-    assert left.lines[0].get_xdata() == pytest.approx([10, 35]) and left.lines[1].get_xdata() == pytest.approx([2, 2])
-    assert right.patches[0].get_y() == left.patches[1].get_y()  # one place for a name in all panels
+    assert [patch.get_width() for patch in left.patches] == [20, 60] and [
+        p.get_width() for p in right.patches
+    ] == [50]
+    assert left.lines[0].get_xdata() == pytest.approx([10, 35]) and left.lines[
+        1
+    ].get_xdata() == pytest.approx([2, 2])
+    # one place for a name in all panels
+    assert right.patches[0].get_y() == left.patches[1].get_y()
     assert left.get_xlim() == right.get_xlim() and left.yaxis_inverted()
-    assert left.get_xlim()[0] == 0 and left.get_xlim()[1] >= 90  # the interval of the last panel is inside
+    # the interval of the last panel is inside
+    assert left.get_xlim()[0] == 0 and left.get_xlim()[1] >= 90
     read(tmp_path / "b.png")

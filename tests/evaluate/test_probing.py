@@ -38,7 +38,9 @@ def labelled_features(world: Manifest, task: str, noise: float = 0.3) -> Any:
     rng = np.random.default_rng(0)
     values = np.zeros((len(world), max(12, code.shape[1])))
     values[rows.rows[:, 0], : code.shape[1]] = code
-    values = values @ np.linalg.qr(rng.normal(size=values.shape[1:] * 2))[0] + noise * rng.normal(size=values.shape)
+    values = values @ np.linalg.qr(rng.normal(size=values.shape[1:] * 2))[0] + noise * rng.normal(
+        size=values.shape
+    )
     return lambda ids: values[ids]
 
 
@@ -47,17 +49,32 @@ def noise(rows: Any) -> np.ndarray:
 
 
 def score_tasks(
-    of: Encoder | FeatureStore, world: Manifest, names: Any, *, cache: Any = None, head_names: Any = ("linear",),
-    protocols: Any = ("honest",), **options: Any,
-) -> list[dict[str, Any]]:  # fmt: skip
+    of: Encoder | FeatureStore,
+    world: Manifest,
+    names: Any,
+    *,
+    cache: Any = None,
+    head_names: Any = ("linear",),
+    protocols: Any = ("honest",),
+    **options: Any,
+) -> list[dict[str, Any]]:
     """Results of one source of features: an encoder or a store."""
     if isinstance(of, FeatureStore):
         source = FeatureSource("planted", of)
     else:
-        source = FeatureSource("encoder", feature_cache.encoder_features(of, world, folder=cache), of)
+        source = FeatureSource(
+            "encoder", feature_cache.encoder_features(of, world, folder=cache), of
+        )
     protocol = "published" if "published" in protocols else protocols[0]
     report = probe_tasks(
-        [source], world, names, heads=head_names, protocol=protocol, controls=False, log=str, **options
+        [source],
+        world,
+        names,
+        heads=head_names,
+        protocol=protocol,
+        controls=False,
+        log=str,
+        **options,
     )
     json.dumps(report, allow_nan=False)
     return report["results"]
@@ -70,7 +87,12 @@ def test_a_label_in_the_features_is_predicted(task, head):
     (one,) = score_tasks(store, MANY, [task], seeds=3, head_names=(head,))
     assert one["mean"] > 0.98 and one["high"] == 1.0
     assert one["chance"] < 0.75 and len(one["values"]) == 3
-    assert (one["task"], one["head"], one["protocol"], one["metric"]) == (task, head, "honest", "accuracy")
+    assert (one["task"], one["head"], one["protocol"], one["metric"]) == (
+        task,
+        head,
+        "honest",
+        "accuracy",
+    )
 
 
 @pytest.mark.parametrize("task", ["material", "twist", "slide"])
@@ -95,7 +117,9 @@ def test_a_split_that_shares_objects_is_not_honest():
     shared = simulated(objects=40, each=4, shared=True)
     names = shared.codes("object")
     store = planted(lambda rows: np.eye(40)[names[rows]])
-    honest, published = score_tasks(store, shared, ["material"], seeds=2, protocols=("honest", "published"))
+    honest, published = score_tasks(
+        store, shared, ["material"], seeds=2, protocols=("honest", "published")
+    )
     assert published["mean"] == 1.0 and honest["mean"] < 0.5
     assert any("groups" in note for note in honest["notes"])
     assert honest["test"] == 40 * 4 * 2 and published["test"] == 40 * 2
@@ -103,23 +127,32 @@ def test_a_split_that_shares_objects_is_not_honest():
 
 def test_sensors_and_units_learned_from_and_tested():
     store = planted(labelled_features(MANY, "material", 0.02))
-    (one,) = score_tasks(store, MANY, ["material"], seeds=1, train_sensors=["digit"], test_sensors=["duragel"])
+    (one,) = score_tasks(
+        store, MANY, ["material"], seeds=1, train_sensors=["digit"], test_sensors=["duragel"]
+    )
     assert one["test"] == 15 * 4
-    (one,) = score_tasks(store, MANY, ["material"], seeds=1, train_units=["*_0"], test_units=["digit_1"])
+    (one,) = score_tasks(
+        store, MANY, ["material"], seeds=1, train_units=["*_0"], test_units=["digit_1"]
+    )
     assert one["test"] == 15 * 2 and any("*_0" in note for note in one["notes"])
 
 
 def test_mistakes_are_refused():
-    train = table([row(path=f"{i}.png", sequence=f"{i}", label__material="ab"[i % 2]) for i in range(4)])
+    train = table(
+        [row(path=f"{i}.png", sequence=f"{i}", label__material="ab"[i % 2]) for i in range(4)]
+    )
     for word, world, task, options in (
-        ("seeds", WORLD, "material", {"seeds": 0}), ("max_rows", WORLD, "material", {"max_rows": -3}),
-        ("frames", WORLD, "material", {"frames": -1}), ("taste", WORLD, "taste", {}),
+        ("seeds", WORLD, "material", {"seeds": 0}),
+        ("max_rows", WORLD, "material", {"max_rows": -3}),
+        ("frames", WORLD, "material", {"frames": -1}),
+        ("taste", WORLD, "taste", {}),
         ("forest", WORLD, "material", {"head_names": ("forest",)}),
         ("lucky", WORLD, "material", {"protocols": ("lucky",)}),
-        ("'foam'", WORLD, Task("x", "label.material", classes=("foam",)), {}), ("test", train, "material", {}),
+        ("'foam'", WORLD, Task("x", "label.material", classes=("foam",)), {}),
+        ("test", train, "material", {}),
         ("gelsight", WORLD, "material", {"train_sensors": ["gelsight"]}),
         ("cam0_", WORLD, "material", {"test_units": ["cam0_*"]}),
-    ):  # fmt: skip
+    ):
         with pytest.raises(UserError) as error:
             score_tasks(planted(noise), world, [task], **{"seeds": 1} | options)
         assert word in str(error.value) and "\n" not in str(error.value)
@@ -132,20 +165,26 @@ def test_mistakes_are_refused():
 
 @pytest.fixture(scope="module")
 def touches(tmp_path_factory) -> Path:
-    return make_touches(tmp_path_factory.mktemp("touches"), touches={"train": 8, "val": 4, "test": 4}, each=1)
+    return make_touches(
+        tmp_path_factory.mktemp("touches"), touches={"train": 8, "val": 4, "test": 4}, each=1
+    )
 
 
 def test_nothing_is_encoded_twice(passes, encoder, pictures, tmp_path):
     first = score_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
-    assert passes == [32]  # one pass for both tasks: they take the same rows
+    # one pass for both tasks: they take the same rows
+    assert passes == [32]
     again = score_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
     assert passes == [32] and first == again
     score_tasks(encoder, pictures, ["material", "force"], cache=tmp_path, seeds=1, frames=1)
-    new = np.setdiff1d(select(pictures, TASKS["force"]).rows, select(pictures, TASKS["material"]).rows)
+    new = np.setdiff1d(
+        select(pictures, TASKS["force"]).rows, select(pictures, TASKS["material"]).rows
+    )
     assert passes == [32, len(new)]  # what is known is not read again
     assert len(list(tmp_path.iterdir())) == 1
     score_tasks(encoder, pictures, ["force"], cache=tmp_path, seeds=1)
-    assert len(passes) == 3 and len(list(tmp_path.iterdir())) == 2  # clips are something else
+    # clips are something else
+    assert len(passes) == 3 and len(list(tmp_path.iterdir())) == 2
 
 
 # The public benchmarks, on trees laid out like the originals.
@@ -159,7 +198,9 @@ def paint(root: Path) -> None:
 
 
 def touch_and_go(root: Path) -> None:
-    lists: dict[str, list[str]] = {name: [] for name in ("train", "test", "train_rough", "test_rough")}
+    lists: dict[str, list[str]] = {
+        name: [] for name in ("train", "test", "train_rough", "test_rough")
+    }
     for video in range(8):
         for frame in range(10, 22):
             name = f"v{video}/{frame:010d}.jpg"
@@ -176,7 +217,9 @@ def feel(root: Path) -> None:
     names = [f"thing{i}" for i in range(8)]
     for name in names:
         for phase in ("before", "during", "after"):
-            fill(root, [f"{name}/touch_{phase}/{n}_{finger}.png" for n in (0, 1) for finger in "AB"])
+            fill(
+                root, [f"{name}/touch_{phase}/{n}_{finger}.png" for n in (0, 1) for finger in "AB"]
+            )
     (root / "feel.csv").write_text("".join(f"{name},{n},{n}\n" for name in names for n in (0, 1)))
     (root / "split_3.json").write_text(json.dumps({"train": names[:6], "test": names[6:]}))
 
@@ -188,7 +231,10 @@ def objectfolder(root: Path) -> None:
         fill(root, [f"{place}/{one}/{n}.png" for n in range(4)])
     (root / "obj2.0").mkdir(exist_ok=True)
     (root / "obj2.0/label.json").write_text(json.dumps({str(one): one % 2 for one in ids}))
-    split = {"train": [[str(one), n] for one in ids for n in (0, 1, 2)], "test": [[str(one), 3] for one in ids]}
+    split = {
+        "train": [[str(one), n] for one in ids for n in (0, 1, 2)],
+        "test": [[str(one), 3] for one in ids],
+    }
     (root / "obj2.0/split.json").write_text(json.dumps(split))
 
 
@@ -198,9 +244,13 @@ MAKERS = {
     "objectfolder": (objectfolder, IndexOptions()),
 }
 SIZES = {  # (train, test) of the authors' own split
-    "touch_and_go_material": (80, 16), "touch_and_go_hardness": (80, 16), "touch_and_go_roughness": (76, 20),
-    "feel_grasp": (12, 4), "objectfolder1_material": (18, 6), "objectfolder2_material": (18, 6),
-}  # fmt: skip
+    "touch_and_go_material": (80, 16),
+    "touch_and_go_hardness": (80, 16),
+    "touch_and_go_roughness": (76, 20),
+    "feel_grasp": (12, 4),
+    "objectfolder1_material": (18, 6),
+    "objectfolder2_material": (18, 6),
+}
 
 
 @pytest.fixture(scope="module")
@@ -218,14 +268,21 @@ QUICK = ("feel_grasp", "objectfolder1_material")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in BENCHMARKS]
+    "name",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in BENCHMARKS],
 )
 def test_a_public_benchmark_is_one_call(name, trees, tiny_run, tmp_path):
-    out, data = tmp_path / "result.json", trees[next(one for one in MAKERS if name.startswith(one))]
-    report = probe_benchmark([tiny_run], [data], name, seeds=1, cache=tmp_path / "cache", out=out, log=str)
-    record, printed = json.loads(out.read_text()), probe_table(report["results"], report["paper"])
+    out = tmp_path / "result.json"
+    data = trees[next(one for one in MAKERS if name.startswith(one))]
+    report = probe_benchmark(
+        [tiny_run], [data], name, seeds=1, cache=tmp_path / "cache", out=out, log=str
+    )
+    record = json.loads(out.read_text())
+    printed = probe_table(report["results"], report["paper"])
     assert name in printed and "raw pixels" in printed and "paper" in printed
-    published = {one["features"]: one for one in record["results"] if one["protocol"] == "published"}
+    published = {
+        one["features"]: one for one in record["results"] if one["protocol"] == "published"
+    }
     assert {(one["train"], one["test"]) for one in published.values()} == {SIZES[name]}
     assert len(published) == 3  # the run, a random encoder, raw pixels
     assert {one["protocol"] for one in record["results"]} == {"published", "honest"}
@@ -234,11 +291,26 @@ def test_a_public_benchmark_is_one_call(name, trees, tiny_run, tmp_path):
 
 
 def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
-    out, data = tmp_path / "result.json", pictures.files[0]
-    np.savez(tmp_path / "f.npz", features=noise(np.arange(len(pictures))), rows=np.arange(len(pictures)))
-    options: dict[str, Any] = {"features": [tmp_path / "f.npz"], "heads": ("linear", "knn"), "test_units": ("*_1",)}
-    report = probe_tasks([tiny_run], [data], ("material", "force"), seeds=1, protocol="published", out=out, log=str,
-                         **options)  # fmt: skip
+    out = tmp_path / "result.json"
+    data = pictures.files[0]
+    np.savez(
+        tmp_path / "f.npz", features=noise(np.arange(len(pictures))), rows=np.arange(len(pictures))
+    )
+    options: dict[str, Any] = {
+        "features": [tmp_path / "f.npz"],
+        "heads": ("linear", "knn"),
+        "test_units": ("*_1",),
+    }
+    report = probe_tasks(
+        [tiny_run],
+        [data],
+        ("material", "force"),
+        seeds=1,
+        protocol="published",
+        out=out,
+        log=str,
+        **options,
+    )
     results = json.loads(out.read_text())["results"]
     assert {one["task"] for one in results} == {"material", "force"}
     assert {one["head"] for one in results} == {"linear", "knn"}
@@ -246,21 +318,37 @@ def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
     assert list(dict.fromkeys(one["features"] for one in results)) == names
     assert {one["protocol"] for one in results} == {"honest", "published"}
     assert " N" in probe_table(report["results"], report["paper"])
-    for word, change in (("--order", {"order": "shuffled"}), ("--join", {"join": "sum"}), ("probe", {"models": []})):
+    for word, change in (
+        ("--order", {"order": "shuffled"}),
+        ("--join", {"join": "sum"}),
+        ("probe", {"models": []}),
+    ):
         with pytest.raises(UserError, match=word):
-            probe_tasks(**{"models": [tiny_run], "data": [data], "tasks": ["material"], "controls": False} | change)
+            probe_tasks(
+                **{"models": [tiny_run], "data": [data], "tasks": ["material"], "controls": False}
+                | change
+            )
 
 
 def test_a_task_that_cannot_be_probed_leaves_the_others(tmp_path):
-    columns, lines = WORLD.table.to_pydict(), []
+    columns = WORLD.table.to_pydict()
+    lines = []
     slides = zip(columns["label.slide"], columns["split"], strict=True)
     columns["label.slide"] = [None if split == "test" else one for one, split in slides]
-    data, features = tmp_path / "m.parquet", tmp_path / "f.npz"
+    data = tmp_path / "m.parquet"
+    features = tmp_path / "f.npz"
     manifests.write(manifests.from_columns(columns, data), data)
     np.savez(features, features=noise(np.arange(len(WORLD))), rows=np.arange(len(WORLD)))
-    shared: dict[str, Any] = {"features": [features], "seeds": 1, "controls": False, "log": lines.append}
+    shared: dict[str, Any] = {
+        "features": [features],
+        "seeds": 1,
+        "controls": False,
+        "log": lines.append,
+    }
     results = probe_tasks([], [data], ("material", "slide"), frames=1, **shared)
-    assert {one["task"] for one in results["results"]} == {"material"} and list(results["left_out"]) == ["slide"]
+    assert {one["task"] for one in results["results"]} == {"material"} and list(
+        results["left_out"]
+    ) == ["slide"]
     assert any("slide" in line for line in lines)
     assert "grasp" in probe_tasks([], [data], "all", frames=1, **shared)["left_out"]
     with pytest.raises(UserError, match="slide"):
@@ -273,26 +361,45 @@ def test_a_task_that_cannot_be_probed_leaves_the_others(tmp_path):
 def test_a_label_probe_of_models_files_and_controls(touches, tiny_run, tmp_path):
     """Features of a file score as the run that made them; a saved head predicts what was scored."""
     table_ = manifests.read(touches)
-    features, head, out = tmp_path / "mine.npz", tmp_path / "head.npz", tmp_path / "r.json"
+    features = tmp_path / "mine.npz"
+    head = tmp_path / "head.npz"
+    out = tmp_path / "r.json"
     store = feature_cache.encoder_features(load_encoder(tiny_run), table_)
     values = store.get(np.arange(len(table_))[:, None], 1)
     np.savez(features, features=values, rows=np.arange(len(table_)))
-    results = probe_label([tiny_run], [touches], "hardness", features=[features], seeds=1, save=head, out=out, log=str)
+    results = probe_label(
+        [tiny_run], [touches], "hardness", features=[features], seeds=1, save=head, out=out, log=str
+    )
     names = [str(tiny_run), "random encoder", str(features), "raw pixels"]
-    assert [one.probe for one in results[:-1]] == [f"{name}: {kind}" for name in names for kind in ("linear", "kNN")]
-    assert [replace(one, probe="") for one in results[:2]] == [replace(one, probe="") for one in results[4:6]]
+    assert [one.probe for one in results[:-1]] == [
+        f"{name}: {kind}" for name in names for kind in ("linear", "kNN")
+    ]
+    assert [replace(one, probe="") for one in results[:2]] == [
+        replace(one, probe="") for one in results[4:6]
+    ]
     assert len(json.loads(out.read_text())) == len(results) == 9
-    outcome, rows = results[0].outcome, select(table_, label_task(table_, "hardness"))
+    outcome = results[0].outcome
+    rows = select(table_, label_task(table_, "hardness"))
     predicted = load_head(head)(values[rows.rows[outcome.rows, 0]])[0]
     np.testing.assert_array_equal(predicted == rows.labels[outcome.rows], outcome.correct)
 
 
-@pytest.mark.parametrize(("label", "options", "word"), [
-    ("object", {}, "train"), ("force", {}, "label.force"), ("split", {}, "train"),
-    ("hardness", {"controls": False}, "nothing"), ("hardness", {"leave_out": "sensor", "sensor": "digit"}, "digit"),
-    ("hardness", {"models": ["a", "b"], "save": "h.npz"}, "one"),
-])  # fmt: skip
-def test_a_label_that_cannot_be_probed_is_refused_before_the_work(touches, monkeypatch, label, options, word):
-    monkeypatch.setattr(feature_cache.FeatureStore, "get", lambda *_: pytest.fail("the work was begun"))
+@pytest.mark.parametrize(
+    ("label", "options", "word"),
+    [
+        ("object", {}, "train"),
+        ("force", {}, "label.force"),
+        ("split", {}, "train"),
+        ("hardness", {"controls": False}, "nothing"),
+        ("hardness", {"leave_out": "sensor", "sensor": "digit"}, "digit"),
+        ("hardness", {"models": ["a", "b"], "save": "h.npz"}, "one"),
+    ],
+)
+def test_a_label_that_cannot_be_probed_is_refused_before_the_work(
+    touches, monkeypatch, label, options, word
+):
+    monkeypatch.setattr(
+        feature_cache.FeatureStore, "get", lambda *_: pytest.fail("the work was begun")
+    )
     with pytest.raises(UserError, match=word):
         probe_label(**{"models": [], "data": [touches], "label": label, "log": str} | options)

@@ -10,7 +10,11 @@ from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.evaluate import reconstruction
-from anytouch_jax.evaluate.reconstruction import pixel_scores, plain_reconstruction, reconstruction_panels
+from anytouch_jax.evaluate.reconstruction import (
+    pixel_scores,
+    plain_reconstruction,
+    reconstruction_panels,
+)
 from anytouch_jax.objectives import normalise_touch, stage1_terms
 from anytouch_jax.ops.losses import normalise_patches, reconstruction_loss
 from anytouch_jax.ops.tokens import patchify, random_mask
@@ -50,19 +54,32 @@ def test_the_guesses_without_a_model(frames):
 @pytest.mark.parametrize("background", ["keep", "subtract"])
 def test_scores_are_means_over_clips(tmp_path, monkeypatch, background):
     """Five clips in batches of two, under one mask: the row that fills up the last batch does not count."""
-    manifest = manifests.read(make_touches(tmp_path, touches={"test": 5}, sensors=("digit",), frames=4, size=28))
+    manifest = manifests.read(
+        make_touches(tmp_path, touches={"test": 5}, sensors=("digit",), frames=4, size=28)
+    )
     config = tiny_config(1)
     config = replace(config, data=replace(config.data, batch_size=2, background=background))
-    net, params = compiled(config.model).net, compiled(config.model).params
-    ends, noise = manifest.clips(4, "test")[:, -1], np.random.default_rng(0).random((1, 16)).astype("f4")
+    net = compiled(config.model).net
+    params = compiled(config.model).params
+    ends = manifest.clips(4, "test")[:, -1]
+    noise = np.random.default_rng(0).random((1, 16)).astype("f4")
     monkeypatch.setattr(jax.random, "uniform", lambda *_: noise.repeat(2, 0))
-    result, *each = (pixel_scores(params, manifest, rows, net=net, config=config) for rows in (ends, *ends[:, None]))
-    assert result == pytest.approx({name: np.mean([one[name] for one in each]) for name in result}, rel=1e-4)
+    result, *each = (
+        pixel_scores(params, manifest, rows, net=net, config=config)
+        for rows in (ends, *ends[:, None])
+    )
+    assert result == pytest.approx(
+        {name: np.mean([one[name] for one in each]) for name in result}, rel=1e-4
+    )
     ((_, batch),) = evaluation(manifest, ends[:1], config, "clip", frames=4)
     clip = batch.clip[:1]
-    _, terms = stage1_terms(params, normalise_touch(clip), batch.sensor[:1], noise, net=net, config=config)
+    _, terms = stage1_terms(
+        params, normalise_touch(clip), batch.sensor[:1], noise, net=net, config=config
+    )
     assert each[0]["reconstruction"] == pytest.approx(float(terms["reconstruction"]), rel=1e-4)
-    assert ("untouched reconstruction" in result) == (background == "subtract") and "plain next_frame" in result
+    assert ("untouched reconstruction" in result) == (
+        background == "subtract"
+    ) and "plain next_frame" in result
     if background == "subtract":
         error = ((patches(clip) - patches(np.full_like(clip, 128))) ** 2).mean(-1)
         hidden = error[:, :, :3].mean(-1)[np.asarray(mask(noise, 4)[2])]
@@ -72,16 +89,22 @@ def test_scores_are_means_over_clips(tmp_path, monkeypatch, background):
 # Pictures
 
 CONFIG = tiny_config(1)
-NET, PARAMS = compiled(CONFIG.model).net, compiled(CONFIG.model).params
+NET = compiled(CONFIG.model).net
+PARAMS = compiled(CONFIG.model).params
 SENSOR = np.asarray([0, 1], np.int32)
-EDGE, TITLE = 4, 16
+EDGE = 4
+TITLE = 16
 
 
 def cells(image):
     """The tiles of a figure (rows, columns, 28, 28, 3), their white edges checked and cut off."""
-    side, title, image = 28 + EDGE, image[:TITLE], image[TITLE:]
+    side = 28 + EDGE
+    title = image[:TITLE]
+    image = image[TITLE:]
     assert 0.01 < (title < 128).mean() < 0.5  # dark words on a white strip
-    grid = image.reshape(image.shape[0] // side, side, image.shape[1] // side, side, 3).transpose(0, 2, 1, 3, 4)
+    grid = image.reshape(image.shape[0] // side, side, image.shape[1] // side, side, 3).transpose(
+        0, 2, 1, 3, 4
+    )
     assert (grid[:, :, 28:] == 255).all() and (grid[:, :, :, 28:] == 255).all()
     return grid[:, :, :28, :28]
 
@@ -89,11 +112,14 @@ def cells(image):
 def test_a_clip_is_shown_with_its_mask_reconstruction_and_next_frame():
     grid = cells(reconstruction_panels(PARAMS, CLIP, SENSOR, net=NET, config=CONFIG))
     assert grid.shape[:2] == (2, 3 + 3 + 3 + 2)
-    patch = np.asarray(mask(jax.random.uniform(jax.random.key(0), (2, 16)), 4)[2]).reshape(2, 4, 4)  # by the same draw
+    # by the same draw
+    patch = np.asarray(mask(jax.random.uniform(jax.random.key(0), (2, 16)), 4)[2]).reshape(2, 4, 4)
     hidden = np.repeat(np.repeat(patch, 7, axis=1), 7, axis=2)
     assert hidden.mean() == 0.75
     for sample in range(2):
-        original, masked, filled = grid[sample, :3], grid[sample, 3:6], grid[sample, 6:9]
+        original = grid[sample, :3]
+        masked = grid[sample, 3:6]
+        filled = grid[sample, 6:9]
         np.testing.assert_array_equal(original, CLIP[sample, :3])
         visible = ~hidden[sample]
         for panel in (masked, filled):

@@ -16,7 +16,15 @@ from touch_world import make_touches
 from anytouch_jax.config import from_json, to_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.report import LABELS, PIXELS, RANDOM, VECTOR, Section, demo_report, write_report
+from anytouch_jax.evaluate.report import (
+    LABELS,
+    PIXELS,
+    RANDOM,
+    VECTOR,
+    Section,
+    demo_report,
+    write_report,
+)
 from anytouch_jax.evaluate.statistics import as_text, markdown_table
 from anytouch_jax.weights import checkpoint
 
@@ -25,49 +33,81 @@ NAMES = (RANDOM, "stage 1", "stage 2")
 
 def pictures_of(report: Path) -> list[Path]:
     """The figures that a report shows; every one must be a readable picture beside it."""
-    found = [report.parent / one for one in re.findall(r"!\[[^]]*\]\(([^)]+)\)", report.read_text())]
+    found = [
+        report.parent / one for one in re.findall(r"!\[[^]]*\]\(([^)]+)\)", report.read_text())
+    ]
     assert all(cv2.imread(str(one)) is not None for one in found)
     return found
 
 
 HOSTILE = (
-    'a soft <img src=x onerror="document.title=1"> cup', "<script>alert(1)</script>", "edge a<b && b>a",
-    "a &lt;b&gt; c", "[here](javascript:alert(1)) and ![x](figures/secret.png)", "</title><b>x</b>",
-    "*a* __b__ `c` ~~d~~ my_cup e\\", "<!-- x -->", "<https://x.org>", "![x](figures/../secret.png)",
+    'a soft <img src=x onerror="document.title=1"> cup',
+    "<script>alert(1)</script>",
+    "edge a<b && b>a",
+    "a &lt;b&gt; c",
+    "[here](javascript:alert(1)) and ![x](figures/secret.png)",
+    "</title><b>x</b>",
+    "*a* __b__ `c` ~~d~~ my_cup e\\",
+    "<!-- x -->",
+    "<https://x.org>",
+    "![x](figures/../secret.png)",
     "two\nlines | and a bar",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_the_text_of_a_user_is_shown_as_text(text: str, tmp_path: Path) -> None:
     (tmp_path / "secret.png").write_bytes(b"of another folder")
     line = " ".join(text.split())
-    trusting = MarkdownIt("commonmark", {"html": True}).enable("table")  # as pages of the documentation are made
+    # as pages of the documentation are made
+    trusting = MarkdownIt("commonmark", {"html": True}).enable("table")
     assert trusting.render(f"1. {as_text(text)}") == f"<ol>\n<li>{escapeHtml(line)}</li>\n</ol>\n"
     table = trusting.render(markdown_table((text, "b"), [(text, 1)]))
     allowed = {"table", "thead", "tbody", "tr", "th", "td", "em", "strong", "code"}
     assert set(re.findall(r"</?([a-z!]+)", table)) <= allowed
-    write_report(tmp_path, [Section(text, text, markdown_table((text,), [(text,)]), notes=f"- {text}")], title=text)
+    write_report(
+        tmp_path,
+        [Section(text, text, markdown_table((text,), [(text,)]), notes=f"- {text}")],
+        title=text,
+    )
     page = (tmp_path / "report.html").read_text()
-    assert not re.search(r"<(script|b>|img [^>]*onerror|a [^>]*script|!--)", page) and "of another" not in page
+    assert (
+        not re.search(r"<(script|b>|img [^>]*onerror|a [^>]*script|!--)", page)
+        and "of another" not in page
+    )
     policy = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]+)">', page)
     assert policy and "default-src 'none'" in policy[1] and "script-src" not in policy[1]
 
 
 def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
-    out, elsewhere = tmp_path / "out", tmp_path / "run" / "shot.png"
+    out = tmp_path / "out"
+    elsewhere = tmp_path / "run" / "shot.png"
     for path in (elsewhere, out / "figures" / "mine.png"):
         path.parent.mkdir(parents=True)
         cv2.imwrite(str(path), np.zeros((4, 4, 3), np.uint8))
     parts = [
-        Section("First", "Words.", markdown_table(("a", "b|c"), [("1", "two\nlines")]), elsewhere, "After."),
+        Section(
+            "First",
+            "Words.",
+            markdown_table(("a", "b|c"), [("1", "two\nlines")]),
+            elsewhere,
+            "After.",
+        ),
         Section("Second", figure=out / "figures" / "mine.png"),
     ]
-    numbers = {"x": np.float32(0.5), "bad": float("nan"), "list": np.arange(2), "path": Path("a"), "part": parts[1]}
+    numbers = {
+        "x": np.float32(0.5),
+        "bad": float("nan"),
+        "list": np.arange(2),
+        "path": Path("a"),
+        "part": parts[1],
+    }
     path = write_report(out, parts, title="Title", numbers=numbers)
     html = (out / "report.html").read_text()
     assert html.count('src="data:image/png;base64,') == 2 and 'src="figures' not in html
-    assert "<td>two lines</td>" in html and "<title>Title</title>" in html and "<h2>First</h2>" in html
+    assert (
+        "<td>two lines</td>" in html and "<title>Title</title>" in html and "<h2>First</h2>" in html
+    )
     assert path.read_text() == (
         "# Title\n\n## First\n\nWords.\n\n![First](figures/shot.png)\n\n"
         "| a | b\\|c |\n| --- | --- |\n| 1 | two lines |\n\nAfter.\n\n## Second\n\n![Second](figures/mine.png)\n"
@@ -95,7 +135,10 @@ def later(tiny_run: Path, tmp_path_factory: Any) -> Path:
     """A run that calls itself one of stage 2, with the weights and the log of `tiny_run`."""
     run = tmp_path_factory.mktemp("later") / "stage2"
     params, config, about = checkpoint.load_params(tiny_run)
-    told = {"config_json": to_json(replace(from_json(config), stage=2)), "metadata": {"seen": about["seen"]}}
+    told = {
+        "config_json": to_json(replace(from_json(config), stage=2)),
+        "metadata": {"seen": about["seen"]},
+    }
     with contextlib.closing(checkpoint.Checkpoints(run / "checkpoints", keep=1, **told)) as out:
         out.save(2, {"trainable": params}, {"loss": 1.0})
     shutil.copy(tiny_run / "metrics.jsonl", run)
@@ -103,11 +146,15 @@ def later(tiny_run: Path, tmp_path_factory: Any) -> Path:
 
 
 @pytest.fixture(scope="module")
-def demo(touched: Path, tiny_run: Path, later: Path, tmp_path_factory: Any) -> tuple[Path, list[str]]:
+def demo(
+    touched: Path, tiny_run: Path, later: Path, tmp_path_factory: Any
+) -> tuple[Path, list[str]]:
     """The report of a tiny run on the small world; its weights stand for both stages."""
     said: list[str] = []
     out = tmp_path_factory.mktemp("report") / "new"
-    return demo_report(touched, tiny_run, later, out, said.append, touches=24, gallery_size=10), said
+    return demo_report(
+        touched, tiny_run, later, out, said.append, touches=24, gallery_size=10
+    ), said
 
 
 def test_the_demo_report_holds_everything(demo: tuple[Path, list[str]]) -> None:
@@ -115,17 +162,31 @@ def test_the_demo_report_holds_everything(demo: tuple[Path, list[str]]) -> None:
     text = path.read_text()
     titles = re.findall(r"^## (.+)$", text, re.MULTILINE)
     assert titles == [
-        "Data and runs", "Samples, coarse", "Samples, fine", "Losses", "Reconstructions and next frames",
-        "The space of touches", "Cross-sensor retrieval", "Cross-sensor matching", "Probes",
-    ]  # fmt: skip
+        "Data and runs",
+        "Samples, coarse",
+        "Samples, fine",
+        "Losses",
+        "Reconstructions and next frames",
+        "The space of touches",
+        "Cross-sensor retrieval",
+        "Cross-sensor matching",
+        "Probes",
+    ]
     names = [one.name for one in pictures_of(path)]
     assert names == [
-        "samples_coarse.png", "samples_fine.png", "losses.png", "reconstructions.png", "tsne.png", "retrieval.png",
+        "samples_coarse.png",
+        "samples_fine.png",
+        "losses.png",
+        "reconstructions.png",
+        "tsne.png",
+        "retrieval.png",
         "probes.png",
-    ]  # fmt: skip
+    ]
     assert "| test | 360 | 30 | 10 | digit, gelsight, gelslim |" in text
     assert re.search(r"^\| next frame \| \d\.\d{4} \| \d\.\d{4} \|$", text, re.MULTILINE)
-    assert str(path) in said[-1] and not any(one.name.startswith(".") for one in path.parent.rglob("*"))
+    assert str(path) in said[-1] and not any(
+        one.name.startswith(".") for one in path.parent.rglob("*")
+    )
     assert "roughness: the manifest has no column label.roughness" in text
     assert "**Stage 2 started from no run, so this stage 1 is no part of it.**" in text
     assert str(path.parent.parent) not in text  # no path of the machine
@@ -136,10 +197,15 @@ def test_the_numbers_of_the_demo_report(demo: tuple[Path, list[str]], touched: P
     numbers = json.loads((path.parent / "report.json").read_text())
     assert numbers["data"] == manifests.read(touched).content_hash and numbers["seconds"] > 0
     assert [one["name"] for one in numbers["space"]] == list(NAMES)
-    assert all(one["rows"] == 72 for one in numbers["space"])  # 24 of 30 touches by three sensors
-    pixels, text = numbers["pixels"], path.read_text()
+    # 24 of 30 touches by three sensors
+    assert all(one["rows"] == 72 for one in numbers["space"])
+    pixels = numbers["pixels"]
+    text = path.read_text()
     assert pixels["clips"] > 0 and f"error on {pixels['clips']} clips in contact" in text
-    assert f"| hidden patches | {pixels['reconstruction']:.4f} | {pixels['plain reconstruction']:.4f} |" in text
+    assert (
+        f"| hidden patches | {pixels['reconstruction']:.4f} | {pixels['plain reconstruction']:.4f} |"
+        in text
+    )
     kinds = numbers["retrieval"]["found"]
     assert set(kinds) == {"fine", "coarse"} and set(kinds["fine"]) == {"matched", "by chance"}
     everything = {*NAMES, *(f"{name} (patches)" for name in NAMES), PIXELS, VECTOR}
@@ -148,16 +214,23 @@ def test_the_numbers_of_the_demo_report(demo: tuple[Path, list[str]], touched: P
         assert {one["name"] for one in pooled} == everything and len(pooled) == 2 * len(everything)
         assert len(kind) == 7 * len(pooled) and all(one["gallery"] == 10 for one in kind)
         best = {one["name"]: one["top1"] for one in pooled if not one["centred"]}
-        assert best["stage 1"] == best["stage 2"]  # the same weights in both places
+        # the same weights in both places
+        assert best["stage 1"] == best["stage 2"]
         assert best[PIXELS] > 0.25  # the world's textures are plain to see
     assert numbers["retrieval"]["differences"]["fine"]["stage 1"] == [0, 0, 0]
     (note,) = numbers["matching"]["notes"]
-    assert numbers["matching"]["found"] == [] and "no matching head" in note and note in path.read_text()
+    assert (
+        numbers["matching"]["found"] == []
+        and "no matching head" in note
+        and note in path.read_text()
+    )
     probes = numbers["probes"]["found"]
     assert set(probes) == {"hardness", "indenter", "force"} and "indenter" in LABELS
     assert [one["probe"] for one in probes["hardness"]] == [*NAMES, PIXELS]
     assert all(one["n_train"] == 36 and one["test_groups"] <= 10 for one in probes["force"])
-    assert all("r2" in one for one in probes["force"]) and all("accuracy" in one for one in probes["indenter"])
+    assert all("r2" in one for one in probes["force"]) and all(
+        "accuracy" in one for one in probes["indenter"]
+    )
 
 
 def test_a_report_that_fails_leaves_the_one_before(
@@ -171,5 +244,7 @@ def test_a_report_that_fails_leaves_the_one_before(
 
     monkeypatch.setattr("anytouch_jax.evaluate.report._probes", fail)
     with pytest.raises(UserError, match="in the midst of it"):
-        demo_report(touched, tiny_run, later, folder, lambda _: None, touches=12, gallery_size=10, seed=1)
+        demo_report(
+            touched, tiny_run, later, folder, lambda _: None, touches=12, gallery_size=10, seed=1
+        )
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before

@@ -13,7 +13,9 @@ def rows(kind: str = "apart", **changes) -> RowRoles:
     test = {"apart": group % 4 == 3, "shared": np.arange(N) % 4 == 3, "new": group % 4 == 3}[kind]
     y = np.where(test, 3 + group // 4 % 3, group % 3) if kind == "new" else group // 4 % 3
     everything = np.ones(N, bool)
-    return RowRoles(y, np.array([f"g{one}" for one in group]), test, everything, everything)._replace(**changes)
+    return RowRoles(
+        y, np.array([f"g{one}" for one in group]), test, everything, everything
+    )._replace(**changes)
 
 
 @pytest.mark.parametrize("kind", ["apart", "shared", "new"])
@@ -23,7 +25,12 @@ def test_no_group_is_ever_on_two_sides(kind, seed):
     tested = []
     for cut in seeded_splits(roles, seed, "honest"):
         sides = [set(roles.groups[part]) for part in cut]
-        assert all(sides) and not sides[0] & sides[1] and not sides[0] & sides[2] and not sides[1] & sides[2]
+        assert (
+            all(sides)
+            and not sides[0] & sides[1]
+            and not sides[0] & sides[2]
+            and not sides[1] & sides[2]
+        )
         tested += cut.test.tolist()
     wanted = np.flatnonzero(roles.test) if kind != "shared" else np.arange(N)
     assert sorted(tested) == wanted.tolist()  # every row once
@@ -42,12 +49,16 @@ def test_a_split_that_parts_the_groups_is_kept():
 def test_a_sensor_of_test_alone_is_folded_within_test(protocol):
     """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its class has."""
     roles = rows()
-    roles = roles._replace(y=np.linspace(0, 1, N), measured=True, may_fit=roles.test, may_test=roles.test)
+    roles = roles._replace(
+        y=np.linspace(0, 1, N), measured=True, may_fit=roles.test, may_test=roles.test
+    )
     scheme, used, _ = split_scheme(roles)
     assert scheme == "folds"
     np.testing.assert_array_equal(used, roles.test)
     cuts = seeded_splits(roles, 0, protocol)
-    assert len(cuts) == FOLDS and all(len(cut.fit) and roles.test[one].all() for cut in cuts for one in cut)
+    assert len(cuts) == FOLDS and all(
+        len(cut.fit) and roles.test[one].all() for cut in cuts for one in cut
+    )
 
 
 def test_every_class_is_learned_in_every_fold():
@@ -85,7 +96,9 @@ def test_sensors_and_units_teach_and_are_tested_apart(kind, protocol):
 
 @pytest.mark.parametrize("count", [2, 5, 7, 100])
 def test_folds_keep_groups_whole_and_spread_classes(count):
-    groups, y, left_out = np.repeat(np.arange(30), 5), np.repeat(np.arange(30) % 3, 5), []
+    groups = np.repeat(np.arange(30), 5)
+    y = np.repeat(np.arange(30) % 3, 5)
+    left_out = []
     for fit, out in splits.group_folds(np.arange(150), groups, y, count):
         assert set(groups[fit]).isdisjoint(groups[out]) and len(fit) + len(out) == 150
         if count == 5:
@@ -96,9 +109,13 @@ def test_folds_keep_groups_whole_and_spread_classes(count):
 
 
 def test_bootstraps_draw_whole_groups():
-    groups, rows = np.arange(60) // 4, np.arange(12, 60)
+    groups = np.arange(60) // 4
+    rows = np.arange(12, 60)
     for drawn, weights in splits.group_bootstraps(rows, groups, 3):
         assert set(drawn) <= set(rows) and weights.sum() == len(rows)
         for group in np.unique(groups[drawn]):
-            assert np.sum(groups[drawn] == group) == 4 and len(set(weights[groups[drawn] == group])) == 1
+            assert (
+                np.sum(groups[drawn] == group) == 4
+                and len(set(weights[groups[drawn] == group])) == 1
+            )
     assert not list(splits.group_bootstraps(rows, groups, 0))

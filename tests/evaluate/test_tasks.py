@@ -20,13 +20,16 @@ def test_a_press_is_the_deepest_frame_of_each_recording():
     assert selected.rows.shape == (24 * 2 * 2, 1)
     assert len(set(cells(selected, "sequence"))) == 96 and set(FRAME[selected.rows[:, 0]]) == {2}
     np.testing.assert_array_equal(selected.labels, cells(selected, "label.material"))
-    np.testing.assert_array_equal(selected.groups, [f"object {name}" for name in cells(selected, "object")])
+    np.testing.assert_array_equal(
+        selected.groups, [f"object {name}" for name in cells(selected, "object")]
+    )
     np.testing.assert_array_equal(selected.split, cells(selected, "split"))
 
 
 def test_contact_is_what_presses_and_ends_a_clip():
     selected = select(WORLD, TASKS["force"])
-    assert set(FRAME[selected.rows[:, 0]]) == {2, 3, 4}  # frame 0 does not press, 0 and 1 end no clip of three
+    # frame 0 does not press, 0 and 1 end no clip of three
+    assert set(FRAME[selected.rows[:, 0]]) == {2, 3, 4}
     assert selected.labels.dtype == np.float64
     np.testing.assert_allclose(selected.labels, cells(selected, "label.force"))
     few = select(WORLD, Task("f", "label.force", "regression", which="contact"))
@@ -37,7 +40,8 @@ def test_moving_is_the_frame_that_slips_most_else_at_two_thirds():
     selected = select(WORLD, TASKS["twist"])
     twist = cells(selected, "label.twist")
     np.testing.assert_array_equal(selected.labels, twist)
-    assert set(twist) == {"clockwise", "counterclockwise"}  # "none" takes no part
+    # "none" takes no part
+    assert set(twist) == {"clockwise", "counterclockwise"}
     still = [WORLD.value(int(r), "label.slip") == 0 for r in selected.rows[:, 0]]
     assert any(still) and not all(still)
     assert set(FRAME[selected.rows[:, 0]]) == {3}  # 2/3 of 4 is 2.67
@@ -47,30 +51,53 @@ def test_moving_is_the_frame_that_slips_most_else_at_two_thirds():
 @pytest.mark.parametrize("name", ["slip", "force", "twist", "slide"])
 def test_stills_and_clips_of_a_dynamic_task_take_the_same_rows(name):
     for other in (1, 3):
-        np.testing.assert_array_equal(select(WORLD, TASKS[name]).rows, select(WORLD, TASKS[name], other).rows)
+        np.testing.assert_array_equal(
+            select(WORLD, TASKS[name]).rows, select(WORLD, TASKS[name], other).rows
+        )
     longer = select(WORLD, TASKS[name], 5)
     assert set(FRAME[longer.rows[:, 0]]) == {4}
 
 
 def test_slip_is_a_share_above_a_half_or_a_mark():
     selected = select(WORLD, TASKS["slip"])
-    np.testing.assert_array_equal(selected.labels == "yes", np.array(cells(selected, "label.slip")) > 0.5)
-    marked = table([row(sequence="a", frame_index=i, label__slip=1, label__contact_score=9.0) for i in range(3)])
+    np.testing.assert_array_equal(
+        selected.labels == "yes", np.array(cells(selected, "label.slip")) > 0.5
+    )
+    marked = table(
+        [
+            row(sequence="a", frame_index=i, label__slip=1, label__contact_score=9.0)
+            for i in range(3)
+        ]
+    )
     assert select(marked, TASKS["slip"]).labels.tolist() == ["yes"]
 
 
 def test_a_file_with_scores_takes_scored_contact_only():
     scores = (9.0, 7.0, None)
-    rows = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact_score=s)
-            for i, s in enumerate(scores)]  # fmt: skip
+    rows = [
+        row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact_score=s)
+        for i, s in enumerate(scores)
+    ]
     assert select(table(rows), TASKS["object"]).rows.tolist() == [[0]]
     plain = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball") for i in range(3)]
-    assert len(select(table(plain), TASKS["object"]).rows) == 3  # nothing is known of contact: all take part
-    marked = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact=i) for i in range(2)]
+    # nothing is known of contact: all take part
+    assert len(select(table(plain), TASKS["object"]).rows) == 3
+    marked = [
+        row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact=i)
+        for i in range(2)
+    ]
     assert select(table(marked), TASKS["object"]).rows.tolist() == [[1]]
     # A mark is what training goes by, whatever the score (it has a limit of its own for each sensor); words are marks.
-    both = [row(path=f"{i}.png", sequence=f"{i}", label__object="ball", label__contact=mark, label__contact_score=s)
-            for i, (mark, s) in enumerate((("True", 5.0), ("False", 9.0), ("1", 6.7)))]  # fmt: skip
+    both = [
+        row(
+            path=f"{i}.png",
+            sequence=f"{i}",
+            label__object="ball",
+            label__contact=mark,
+            label__contact_score=s,
+        )
+        for i, (mark, s) in enumerate((("True", 5.0), ("False", 9.0), ("1", 6.7)))
+    ]
     assert select(table(both), TASKS["object"]).rows.tolist() == [[0], [2]]
 
 
@@ -80,7 +107,11 @@ def test_groups_fall_back_to_the_recording():
         row(sequence="v/2", label__object="a", touch="t1"),
         row(sequence="v/3", label__object="a"),
     ]
-    assert select(table(rows), TASKS["object"]).groups.tolist() == ["grasp_group g1", "touch t1", "sequence v/3"]
+    assert select(table(rows), TASKS["object"]).groups.tolist() == [
+        "grasp_group g1",
+        "touch t1",
+        "sequence v/3",
+    ]
     rows += [row(sequence="w/1", label__object="b")]
     video = Task("x", "label.object", groups=("recording",))
     assert select(table(rows), video).groups.tolist() == ["recording v"] * 3 + ["recording w"]
@@ -99,9 +130,15 @@ def test_recordings_of_joined_files_are_never_one_group(tmp_path):
         columns = {name: [one.get(name) for one in some] for name in {**some[0], **some[1]}}
         manifests.write(manifests.from_columns(columns, file), file)
     both = manifests.read(files)
-    for groups, count in ((("grasp_group", "touch"), 6), (("recording",), 4), (("object",), 1), ((), 6)):
+    for groups, count in (
+        (("grasp_group", "touch"), 6),
+        (("recording",), 4),
+        (("object",), 1),
+        ((), 6),
+    ):
         selected = select(both, Task("x", "label.object", groups=groups)).groups
-        assert len(set(selected)) == count, groups  # an object's name is the same thing everywhere
+        # an object's name is the same thing everywhere
+        assert len(set(selected)) == count, groups
         assert len(set(selected[:3]) & set(selected[3:])) == (groups == ("object",))
 
 
@@ -129,11 +166,17 @@ def grasps() -> list[dict]:
         for finger in fingers:
             for phase in ("during", "after"):
                 if (grasp, finger, phase) != ("pan/0", "B", "after"):
-                    rows.append(row(
-                        path=f"{grasp}/{phase}{finger}.png", sequence=f"{grasp}/{phase}/{finger}", unit=finger,
-                        split="train" if phase == "during" else "unused", object=grasp[:3],
-                        touch=grasp if phase == "during" else None, label__success=1 if phase == "during" else None,
-                    ))  # fmt: skip
+                    rows.append(
+                        row(
+                            path=f"{grasp}/{phase}{finger}.png",
+                            sequence=f"{grasp}/{phase}/{finger}",
+                            unit=finger,
+                            split="train" if phase == "during" else "unused",
+                            object=grasp[:3],
+                            touch=grasp if phase == "during" else None,
+                            label__success=1 if phase == "during" else None,
+                        )
+                    )
     return rows
 
 
@@ -141,7 +184,10 @@ def test_two_fingers_of_a_grasp_stand_side_by_side():
     world = table(grasps())
     selected = select(world, TASKS["grasp"])
     names = [[world.value(int(one), "sequence") for one in pair] for pair in selected.rows]
-    assert sorted(names) == [["mug/0/during/A", "mug/0/during/B"], ["pan/0/during/A", "pan/0/during/B"]]
+    assert sorted(names) == [
+        ["mug/0/during/A", "mug/0/during/B"],
+        ["pan/0/during/A", "pan/0/during/B"],
+    ]
     assert len(selected.notes) == 1 and "1 grasps" in selected.notes[0]
     assert sorted(selected.groups) == ["object mug", "object pan"]
     one = table([grasps()[0]])
@@ -151,8 +197,14 @@ def test_two_fingers_of_a_grasp_stand_side_by_side():
 
 @pytest.mark.parametrize("empty", ["", " ", "n/a", "NaN", "None", "null", "-", "?"])
 def test_an_empty_label_takes_no_part(empty):
-    some, empties = ["Wood", "wood", *[empty] * (len(WORLD) - 2)], [empty] * len(WORLD)
-    selected = select(manifests.replace_column(WORLD, "label.kind", some), Task("kind", "label.kind", which="all"))
+    some = ["Wood", "wood", *[empty] * (len(WORLD) - 2)]
+    empties = [empty] * len(WORLD)
+    selected = select(
+        manifests.replace_column(WORLD, "label.kind", some), Task("kind", "label.kind", which="all")
+    )
     assert len(selected.rows) == 2 and "'Wood' and 'wood' differ only by" in selected.notes[-1]
     with pytest.raises(UserError, match=r"has a label|has no label"):
-        select(manifests.replace_column(WORLD, "label.kind", empties), Task("kind", "label.kind", which="all"))
+        select(
+            manifests.replace_column(WORLD, "label.kind", empties),
+            Task("kind", "label.kind", which="all"),
+        )

@@ -47,7 +47,12 @@ def test_a_record_and_a_table_of_a_workload(tiny, tmp_path, capsys):
 
 
 def test_mistakes(tiny, tmp_path, capsys):
-    cases = (("speed",), ("embed", "--rounds", 0), ("embed", "--batch", -2), ("embed", "--variants", "none"))
+    cases = (
+        ("speed",),
+        ("embed", "--rounds", 0),
+        ("embed", "--batch", -2),
+        ("embed", "--variants", "none"),
+    )
     for words in cases:
         assert run(*words, "--out", tmp_path / "a.jsonl") == 2
         error = capsys.readouterr().err.splitlines()[-1]
@@ -74,7 +79,9 @@ def test_the_simulator_is_measured_and_stored(tmp_path):
     assert simulator.main([*options.split(), str(out)]) == 0
     fast, exact = (read_records(out)[f"cpu, 28, 2, digit, {name}"] for name in ("fast", "exact"))
     assert 0 < fast["mm"] < 0.1 and 0 < fast["levels"] < 10 and "mm" not in exact
-    assert min(fast[name] for name in ("frames_s", "processor_ms", "mflop", "mbyte", "roofline")) > 0
+    assert (
+        min(fast[name] for name in ("frames_s", "processor_ms", "mflop", "mbyte", "roofline")) > 0
+    )
     rows = simulated_table(tmp_path).rows
     assert [row[1] for row in rows] == ["28 pixels, clips, exact", "28 pixels, clips, fast"]
     assert rows[1][5] == fast["mm"]
@@ -98,18 +105,29 @@ def noise_of(work):
     return jnp.zeros((work.samples, work.config.model.patches))
 
 
-@pytest.mark.parametrize("work", [
-    Workload("stage1 clips", shallow(preset("small")), 2, 4),
-    pytest.param(Workload("stage1 stills", shallow(preset("small")), 2, 1), marks=pytest.mark.slow),
-    Workload("stage2 align", shallow(preset("small", stage=2)), 4, 3),
-    pytest.param(Workload("stage2 match", shallow(preset("small", stage=2)), 4, 3), marks=pytest.mark.slow),
-    Workload("embed", shallow(preset("small")), 2, 3),
-], ids=lambda work: work.name)  # fmt: skip
+@pytest.mark.parametrize(
+    "work",
+    [
+        Workload("stage1 clips", shallow(preset("small")), 2, 4),
+        pytest.param(
+            Workload("stage1 stills", shallow(preset("small")), 2, 1), marks=pytest.mark.slow
+        ),
+        Workload("stage2 align", shallow(preset("small", stage=2)), 4, 3),
+        pytest.param(
+            Workload("stage2 match", shallow(preset("small", stage=2)), 4, 3),
+            marks=pytest.mark.slow,
+        ),
+        Workload("embed", shallow(preset("small")), 2, 3),
+    ],
+    ids=lambda work: work.name,
+)
 @pytest.mark.slow
 def test_useful_operations_are_nearly_all_that_xla_counts(work):
-    batch, net = normalised(make_batch(work)), build(work.config.model)
+    batch = normalised(make_batch(work))
+    net = build(work.config.model)
     one, two = (
-        partial(terms, net=net, config=work.config) for terms in (objectives.stage1_terms, objectives.stage2_terms)
+        partial(terms, net=net, config=work.config)
+        for terms in (objectives.stage1_terms, objectives.stage2_terms)
     )
     if work.name == "embed":
         run = lambda p: net.encode_touch(p, batch.clip, batch.sensor)  # noqa: E731
@@ -117,7 +135,8 @@ def test_useful_operations_are_nearly_all_that_xla_counts(work):
         run = jax.grad(lambda p: one(p, batch.clip, batch.sensor, noise_of(work))[0])
     else:
         run = jax.grad(lambda p: two(p, batch, None)[0])
-    assert 1 < counted(run, net.abstract()) / work.operations < 1.06  # the rest: norms, softmax, GELU, the loss
+    # the rest: norms, softmax, GELU, the loss
+    assert 1 < counted(run, net.abstract()) / work.operations < 1.06
 
 
 @pytest.mark.slow
@@ -125,8 +144,12 @@ def test_what_does_not_run_here_is_a_row_with_a_note():
     work = Workload("stage1 clips", tiny_config(1), 4, 4)
     tried = [variants.BASELINE, variants.Variant("remat", {"remat": True})]
     tried.append(variants.Variant("seven bits", {"dtype": "float7"}))
-    rows = base, remat, absent = speed.measure(work, tried, rounds=2, with_errors=False, peak_size=64)
-    assert base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
+    rows = base, remat, absent = speed.measure(
+        work, tried, rounds=2, with_errors=False, peak_size=64
+    )
+    assert (
+        base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
+    )
     assert remat.peak_bytes > remat.temp_bytes > 0 and remat.ratio > 0
     assert absent.note and np.isnan(absent.ratio) and absent.variant == "seven bits"
     json.dumps([speed.record_of(row) for row in rows], allow_nan=False)
@@ -148,8 +171,15 @@ print("OURS", *ours)
 @pytest.mark.slow
 def test_the_accelerator_benchmark_needs_jax_flax_optax_and_numpy_alone(tmp_path):
     out = tmp_path / "gpu.jsonl"
-    code = _BARE.format(out=str(out), root=str(ROOT), script=str(ROOT / "experiments" / "benchmarks" / "run.py"))
+    code = _BARE.format(
+        out=str(out), root=str(ROOT), script=str(ROOT / "experiments" / "benchmarks" / "run.py")
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "anytouch_jax.weights.checkpoint" not in done.stdout and "| float32 | 1 |" in done.stdout
-    assert next(iter(read_records(out).values()))["results"]["embed one still, preset tiny"][0]["variant"] == "float32"
+    assert (
+        next(iter(read_records(out).values()))["results"]["embed one still, preset tiny"][0][
+            "variant"
+        ]
+        == "float32"
+    )

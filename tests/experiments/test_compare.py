@@ -24,7 +24,9 @@ def encoder(tmp_path_factory):
     return mae(tmp_path_factory.mktemp("file") / "mae")
 
 
-def test_files_are_probed_by_both_protocols_and_the_page_is_the_users_own(encoder, tmp_path, capsys, monkeypatch):
+def test_files_are_probed_by_both_protocols_and_the_page_is_the_users_own(
+    encoder, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     data = make_touches(tmp_path / "data", touches={"train": 4, "val": 2, "test": 4}, each=1)
     out = tmp_path / "runs" / "compare" / "compare.jsonl"
@@ -34,7 +36,11 @@ def test_files_are_probed_by_both_protocols_and_the_page_is_the_users_own(encode
     assert {record.get("protocol") for record in records.values()} == {"honest", "published", None}
     text = out.with_suffix(".md").read_text()
     assert not (tmp_path / "experiments").exists()
-    assert "linear, honest, %" in text and "kNN, published, %" in text and "| mine | 1 | 28 x 28 |" in text
+    assert (
+        "linear, honest, %" in text
+        and "kNN, published, %" in text
+        and "| mine | 1 | 28 x 28 |" in text
+    )
     refused("add DATA", run.run, run.Options(encoders=("mine=x",), out=out))
     refused("NAME=FILE", run.run, run.Options(encoders=("mine",), data=(data,), out=out))
     refused("no family", run.run, run.Options(only=("Nothing",), out=out))
@@ -45,7 +51,9 @@ STILLS = RNG.integers(0, 256, (2, 28, 28, 3), np.uint8)
 
 
 def stored(folder, config, params):
-    saver = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=to_json(config), metadata={})
+    saver = checkpoint.Checkpoints(
+        folder / "checkpoints", keep=1, config_json=to_json(config), metadata={}
+    )
     saver.save(1, {"trainable": params}, {"loss": 1.0})
     saver.close()
     return folder
@@ -58,12 +66,17 @@ def test_a_still_gives_the_towers_own_embedding(tmp_path, rank):
     net = build(config.model)
     params = net.init(jax.random.key(3))
     if rank:  # LoRA as if trained: it must be merged
-        params["lora"] = jax.tree.map(lambda x: np.asarray(RNG.standard_normal(x.shape), np.float32), params["lora"])
+        params["lora"] = jax.tree.map(
+            lambda x: np.asarray(RNG.standard_normal(x.shape), np.float32), params["lora"]
+        )
     encoder = image_tower_encoder(stored(tmp_path, config, params))
     wanted = net.encode_image(params, normalise_touch(STILLS))
     np.testing.assert_allclose(encoder.encode_touch(STILLS, "digit"), wanted, atol=2e-5)
-    for sensor in ("universal", "gelsight"):  # it knows no sensors
-        np.testing.assert_array_equal(encoder.encode_touch(STILLS, sensor), encoder.encode_touch(STILLS, "digit"))
+    # it knows no sensors
+    for sensor in ("universal", "gelsight"):
+        np.testing.assert_array_equal(
+            encoder.encode_touch(STILLS, sensor), encoder.encode_touch(STILLS, "digit")
+        )
     assert "image tower" in encoder.source
 
 
@@ -73,7 +86,9 @@ def test_the_tower_of_clip_weights(tmp_path):
     full = convert.to_release(params, model)
     keys = release_names(model, "clip")
     file = tmp_path / "clip.safetensors"
-    safetensors.write_safetensors(file, {key: full[key] for key in keys}, {safetensors.MODEL_KEY: to_json(model)})
+    safetensors.write_safetensors(
+        file, {key: full[key] for key in keys}, {safetensors.MODEL_KEY: to_json(model)}
+    )
     wanted = build(model).encode_image(params, normalise_touch(STILLS))
     np.testing.assert_allclose(image_tower_encoder(file).encode_touch(STILLS), wanted, atol=2e-5)
 

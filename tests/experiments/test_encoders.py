@@ -16,9 +16,14 @@ def test_a_stage_is_understood_and_its_encoder_keeps_its_size():
     for stage in (1, 2):
         config = configure(stage, ["a.csv"], 3, {"data.batch_size": 16})
         assert config.stage == stage and config.run.seed == 3 and config.data.batch_size == 16
-        assert config.data.manifests == (SIMULATED, "a.csv") and from_json(to_json(config)) == config
+        assert (
+            config.data.manifests == (SIMULATED, "a.csv") and from_json(to_json(config)) == config
+        )
         params = build(config.model).abstract()
-        millions = {name: sum(leaf.size for leaf in flatten(part).values()) / 1e6 for name, part in params.items()}
+        millions = {
+            name: sum(leaf.size for leaf in flatten(part).values()) / 1e6
+            for name, part in params.items()
+        }
         assert millions["touch"] < 4 and millions["fields"] < 2
 
 
@@ -29,7 +34,8 @@ RNG = np.random.default_rng(0)
 def test_it_learns_a_field_that_no_mean_shows(monkeypatch):
     """The first two values of a token change with the field of a turn, whose mean over the picture is zero."""
     monkeypatch.setattr(motion, "EPOCHS", 30)
-    n, side = 300, 4
+    n = 300
+    side = 4
     y, x = np.mgrid[:side, :side].reshape(2, -1) / side - 0.375
     sign = RNG.choice([-1.0, 1.0], n)
     tokens = RNG.standard_normal((n, 2, side * side, 6)).astype(np.float32)
@@ -59,5 +65,9 @@ def test_a_perfect_encoder_finds_every_touch_and_noise_finds_chance(tmp_path, mo
     assert scores["a"] == 1.0 and scores["b"] < 0.1
     write_record(tmp_path / "lookalikes.jsonl", "fine", record | {"encoders": {"a": "mark"}})
     made = page(tmp_path)
-    assert made.tables[0][0][:2] == ("fine alignment", "a") and made.readme["a"].mean == pytest.approx(100)
-    assert made.findings == [f"fine alignment: `a` finds 100 %, and pixels {100 * scores['pixels']:.0f} %."]
+    assert made.tables[0][0][:2] == ("fine alignment", "a") and made.readme[
+        "a"
+    ].mean == pytest.approx(100)
+    assert made.findings == [
+        f"fine alignment: `a` finds 100 %, and pixels {100 * scores['pixels']:.0f} %."
+    ]

@@ -16,23 +16,31 @@ def test_a_committed_notebook_has_its_outputs(file):
     cells = nbformat.read(file, as_version=4).cells
     outputs = [out for one in cells if one.cell_type == "code" for out in one.outputs]
     assert any("image/png" in out.get("data", {}) for out in outputs), "make notebooks"
-    assert {kind for out in outputs for kind in out.get("data", {})} <= {"image/png", "text/plain"}  # no HTML
+    # no HTML
+    assert {kind for out in outputs for kind in out.get("data", {})} <= {"image/png", "text/plain"}
     assert not any(out.output_type == "error" or out.get("name") == "stderr" for out in outputs)
     assert file.stat().st_size < 1e6
     assert cells[0].source.startswith("# ") and cells[0].source.splitlines()[0].endswith("?")
     assert cells[-2].source == "## Finding" and cells[-1].outputs[0].text.strip()
 
 
-@pytest.mark.parametrize("name", ["<img src=x onerror=alert(1)>", "```\n<img src=x onerror=alert(1)>\n```"])
+@pytest.mark.parametrize(
+    "name", ["<img src=x onerror=alert(1)>", "```\n<img src=x onerror=alert(1)>\n```"]
+)
 def test_what_a_notebook_shows_of_a_name_is_text(name, tmp_path):
     html = nbformat.v4.new_output("display_data", {"text/html": name})
     printed = nbformat.v4.new_output("stream", text=name)
     cell = nbformat.v4.new_code_cell("print(name)", outputs=[printed, html])
     nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "mine.ipynb")
-    page = MarkdownIt("commonmark", {"html": True}).render(tutorial(tmp_path / "mine.ipynb", tmp_path))
+    page = MarkdownIt("commonmark", {"html": True}).render(
+        tutorial(tmp_path / "mine.ipynb", tmp_path)
+    )
     assert "&lt;img src=x" in page and "<img" not in page
-    for one in (at.Manifest, at.Encoder, at.Preprocess, at.FamilyEncoder, at.Config):  # a notebook shows their `repr`
-        assert not {"_repr_html_", "_repr_markdown_", "_repr_svg_", "_repr_javascript_"} & {*dir(one)}
+    # a notebook shows their `repr`
+    for one in (at.Manifest, at.Encoder, at.Preprocess, at.FamilyEncoder, at.Config):
+        assert not {"_repr_html_", "_repr_markdown_", "_repr_svg_", "_repr_javascript_"} & {
+            *dir(one)
+        }
 
 
 def test_every_public_name_has_a_place_in_the_reference():
@@ -49,7 +57,10 @@ def few_scenes(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "file",
-    [pytest.param(path, marks=[] if path.name.startswith("01") else pytest.mark.slow) for path in FILES],
+    [
+        pytest.param(path, marks=[] if path.name.startswith("01") else pytest.mark.slow)
+        for path in FILES
+    ],
     ids=lambda path: path.stem,
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -61,5 +72,9 @@ def test_a_notebook_runs_from_top_to_bottom(file, monkeypatch, request, capsys):
     exec("\n".join(cell.source for cell in cells), {"__name__": "__main__"})
     printed = capsys.readouterr().out
     assert printed.strip()
-    if file.name.startswith("01"):  # needs no scenes: what is committed is what today's encoder gives
-        assert printed == "".join(out.get("text", "") for one in cells for out in one.outputs), "make notebooks"
+    if file.name.startswith(
+        "01"
+    ):  # needs no scenes: what is committed is what today's encoder gives
+        assert printed == "".join(out.get("text", "") for one in cells for out in one.outputs), (
+            "make notebooks"
+        )

@@ -48,16 +48,24 @@ def test_every_page_has_one_figure_and_every_file_of_data_a_page(committed):
     assert data == {name for one in committed for name in one.record["data"]}
 
 
-@pytest.mark.parametrize("name", ["<img src=x onerror=alert(1)>", "[x](javascript:alert(1))", "x { onclick=alert(1) }"])
+@pytest.mark.parametrize(
+    "name", ["<img src=x onerror=alert(1)>", "[x](javascript:alert(1))", "x { onclick=alert(1) }"]
+)
 def test_a_name_of_the_data_is_text_on_a_page(name):
     value = Value(2.0, 1.0, 3.0)
     findings = [Finding(name, name, value, name), f"{name} is best."]
     table = page.Table(name, (name, page.Measure("score")), [(name, value)])
     made = Page("trust", [table], findings, answer=(name, "2"), words={"units": name})
-    trusting = MarkdownIt("commonmark", {"html": True}).enable("table")  # as pages of the documentation are made
+    # as pages of the documentation are made
+    trusting = MarkdownIt("commonmark", {"html": True}).enable("table")
     for text in (page.text(made), results.index([made])):
         shown = trusting.render(text)
-        assert "<img src=x" not in shown and 'href="javascript' not in shown and "{" not in text and "alert(1)" in shown
+        assert (
+            "<img src=x" not in shown
+            and 'href="javascript' not in shown
+            and "{" not in text
+            and "alert(1)" in shown
+        )
 
 
 def test_a_study_starts_only_as_a_script():
@@ -66,11 +74,15 @@ def test_a_study_starts_only_as_a_script():
         text = path.read_text()
         for node in ast.parse(text).body if "# %%" not in text else ():
             line = ast.unparse(node)
-            harmless = isinstance(node, ast.Import | ast.ImportFrom | ast.FunctionDef | ast.ClassDef | ast.Assign)
+            harmless = isinstance(
+                node, ast.Import | ast.ImportFrom | ast.FunctionDef | ast.ClassDef | ast.Assign
+            )
             harmless |= isinstance(node, ast.AnnAssign | ast.AugAssign) or isinstance(
                 getattr(node, "value", 0), ast.Constant
             )
-            assert harmless or line.startswith(("if __name__ ==", "if TYPE_CHECKING", "sys.path.insert(")), (path, line)
+            assert harmless or line.startswith(
+                ("if __name__ ==", "if TYPE_CHECKING", "sys.path.insert(")
+            ), (path, line)
 
 
 @pytest.mark.parametrize(
@@ -78,8 +90,16 @@ def test_a_study_starts_only_as_a_script():
     [
         (Value(4.2, 1.5, 6.9), "form: A is above B", "+4.2 [+1.5, +6.9] points"),
         (Value(-4.2, -6.9, -1.5), "form: A is below B", "-4.2 [-6.9, -1.5] points"),
-        (Value(4.2, -1.5, 6.9), "form: no difference is shown between A and B", "+4.2 [-1.5, +6.9] points"),
-        (Value(4.2, 1.5, 6.9, seeds=2), "form: no difference is shown between A and B", "+4.2 [+1.5, +6.9] points"),
+        (
+            Value(4.2, -1.5, 6.9),
+            "form: no difference is shown between A and B",
+            "+4.2 [-1.5, +6.9] points",
+        ),
+        (
+            Value(4.2, 1.5, 6.9, seeds=2),
+            "form: no difference is shown between A and B",
+            "+4.2 [+1.5, +6.9] points",
+        ),
         (Value(4.2), "form: no difference is shown between A and B", "+4.2 points"),
         (None, "form: no difference is shown between A and B", ""),
     ],
@@ -90,18 +110,30 @@ def test_what_is_said_of_a_difference(change, words, figure):
 
 
 def test_an_interval_over_seeds():
-    assert over_seeds([1.0, 3.0]) == (2.0, 1.0, 3.0, 2)  # of two seeds the two values
+    # of two seeds the two values
+    assert over_seeds([1.0, 3.0]) == (2.0, 1.0, 3.0, 2)
     mean, low, high, seeds = over_seeds([1.0, 2.0, 3.0])
-    assert (mean, seeds) == (2.0, 3) and high - 2 == 2 - low == pytest.approx(4.303 / 3**0.5, rel=1e-3)
+    assert (mean, seeds) == (2.0, 3) and high - 2 == 2 - low == pytest.approx(
+        4.303 / 3**0.5, rel=1e-3
+    )
     assert over_seeds([1.0]) == (1.0, None, None, 1)
-    assert shared_difference({0: 1.0, 1: 5.0, 2: 9.0}, {1: 1.0, 2: 2.0, 3: 0.0}) == (5.5, 4.0, 7.0, 2)
+    assert shared_difference({0: 1.0, 1: 5.0, 2: 9.0}, {1: 1.0, 2: 2.0, 3: 0.0}) == (
+        5.5,
+        4.0,
+        7.0,
+        2,
+    )
     assert shared_difference({0: 1.0}, {1: 1.0}) is None
 
 
 SMALL = Page(
-    "motion", [[("ours", "x", Value(2.0, 1.0, 3.0), 7.4), ("theirs", "x", None, None)]],
-    [Finding("A", "B", Value(0.2, -1, 1)), *(Finding(f"A{i}", "B", Value(2.0, 1.0, 3.0)) for i in range(9))],
-)  # fmt: skip
+    "motion",
+    [[("ours", "x", Value(2.0, 1.0, 3.0), 7.4), ("theirs", "x", None, None)]],
+    [
+        Finding("A", "B", Value(0.2, -1, 1)),
+        *(Finding(f"A{i}", "B", Value(2.0, 1.0, 3.0)) for i in range(9)),
+    ],
+)
 
 
 def test_a_page_has_at_most_five_findings_and_counts_the_others():
@@ -109,7 +141,10 @@ def test_a_page_has_at_most_five_findings_and_counts_the_others():
         *(f"A{i} is above B, +2.0 [+1.0, +3.0] points." for i in range(4)),
         "1 of 10 comparisons show no difference.",
     ]
-    assert page.answer(SMALL) == ("No difference is shown between A and B.", "+0.2 [-1.0, +1.0] points")
+    assert page.answer(SMALL) == (
+        "No difference is shown between A and B.",
+        "+0.2 [-1.0, +1.0] points",
+    )
 
 
 def test_the_pages_are_few_and_short_and_so_are_the_studies(committed):
@@ -140,7 +175,10 @@ def of(tmp_path, question, gain=lambda question, name: 0.0) -> Page:
 def test_planted_differences_are_reported(tmp_path):
     made = of(tmp_path, "ablations", lambda question, name: 0.05 * (name != "no_text"))
     (text,) = [one for one in page.sentences(made) if "material: without text is" in one.lower()]
-    assert "below AnyTouch" in text and page.sentences(made)[-1] == "14 of 16 comparisons show no difference."
+    assert (
+        "below AnyTouch" in text
+        and page.sentences(made)[-1] == "14 of 16 comparisons show no difference."
+    )
     row = next(row for row in made.tables[0] if row[0] == "without text")
     assert row[2].high < 0 and row[2].mean == pytest.approx(-5, abs=0.5)
 
@@ -148,7 +186,10 @@ def test_planted_differences_are_reported(tmp_path):
 def test_runs_that_differ_give_no_page(tmp_path):
     of(tmp_path, "ablations")
     settings = plan.settings(plan.FULL) | {"steps1": 999}
-    for change, words in (({"simulator": 1}, "simulator version 1"), ({"settings": settings}, "steps1 400 and 999")):
+    for change, words in (
+        ({"simulator": 1}, "simulator version 1"),
+        ({"settings": settings}, "steps1 400 and 999"),
+    ):
         synthetic.change(tmp_path / "matrix.jsonl", "ablations-no_text-1", **change)
         refused(words, results.pages, tmp_path)
 
@@ -168,7 +209,10 @@ def test_records_that_do_not_belong_together_give_no_page(name, key, values, tmp
         shutil.copy(file, tmp_path)
     path = tmp_path / f"{name}.jsonl"
     record = read_records(path)[key]
-    merged = {field: record[field] | new if isinstance(new, dict) else new for field, new in values.items()}
+    merged = {
+        field: record[field] | new if isinstance(new, dict) else new
+        for field, new in values.items()
+    }
     write_record(path, key, record | merged)
     with pytest.raises(UserError):
         results.PAGES[name][1](tmp_path)
@@ -187,7 +231,9 @@ def test_processes_lose_no_record(tmp_path):
     path = tmp_path / "study.jsonl"
     code = "import sys; from pathlib import Path; from experiments.records import write_record\n"
     code += "for number in range(10): write_record(Path(sys.argv[1]), f'{sys.argv[2]}{number}', {'value': number})"
-    writers = [subprocess.Popen([sys.executable, "-c", code, str(path), name], cwd=ROOT) for name in "abc"]
+    writers = [
+        subprocess.Popen([sys.executable, "-c", code, str(path), name], cwd=ROOT) for name in "abc"
+    ]
     assert [writer.wait() for writer in writers] == [0, 0, 0]
     assert len(read_records(path)) == 30
 

@@ -26,11 +26,19 @@ def test_one_stage_1_serves_all_that_start_from_it():
     for name in ("anytouch", "no_text", "no_vision", "no_text_aligned", "no_matching", "no_stage2"):
         assert stages("ablations", name)[1] == whole[1], name
     assert stages("q2", "masked") == {1: whole[1]} and stages("q2", "matched") == whole
-    assert stages("q3", "static_only") == stages("ablations", "no_dynamic")  # one model under the names of two tables
-    for other in (stages("ablations", "no_universal"), stages("ablations", "no_dynamic"), stages("q3", "t3")):
+    # one model under the names of two tables
+    assert stages("q3", "static_only") == stages("ablations", "no_dynamic")
+    for other in (
+        stages("ablations", "no_universal"),
+        stages("ablations", "no_dynamic"),
+        stages("q3", "t3"),
+    ):
         assert other[1] != whole[1]
     assert stages("q3", "anytouch", 1)[1] != whole[1]
-    second = {stages("ablations", name)[2] for name in ("anytouch", "no_text", "no_vision", "no_matching", "no_stage1")}
+    second = {
+        stages("ablations", name)[2]
+        for name in ("anytouch", "no_text", "no_vision", "no_matching", "no_stage1")
+    }
     assert len(second) == 5
 
 
@@ -41,7 +49,9 @@ def test_the_unseen_sensor_is_in_no_training():
             assert not any(plan.UNSEEN in name for name in names), leaf.key
 
 
-def test_an_identity_is_of_one_run_and_hangs_on_the_simulator_and_not_on_the_name_of_a_size(monkeypatch):
+def test_an_identity_is_of_one_run_and_hangs_on_the_simulator_and_not_on_the_name_of_a_size(
+    monkeypatch,
+):
     again = {leaf.key: leaf.identity for leaf in plan.leaves(plan.FULL)}
     assert len(again) == len(set(again.values())) == len(LEAVES)
     assert again == {leaf.key: leaf.identity for leaf in LEAVES}
@@ -61,11 +71,19 @@ def write_data(folder, text):
     """Both sensors' manifests with a row of `text`, and every data set marked as made."""
     for name in LEAF.model.manifests:
         path = folder / f"{name}.parquet"
-        columns = {"path": ["a.jpg"], "sensor": ["digit"], "sequence": ["a"], "frame_index": [0], "split": ["train"]}
+        columns = {
+            "path": ["a.jpg"],
+            "sensor": ["digit"],
+            "sequence": ["a"],
+            "frame_index": [0],
+            "split": ["train"],
+        }
         manifests.write(manifests.from_columns(columns | {"text": [text]}, path), path)
     for one in plan.scenes(LEAF.size):
         (folder / one.name).mkdir(exist_ok=True)
-        (folder / one.name / DONE).write_text(json.dumps({"of": works._of(one, LEAF.size), "seconds": 1}))
+        (folder / one.name / DONE).write_text(
+            json.dumps({"of": works._of(one, LEAF.size), "seconds": 1})
+        )
 
 
 def test_a_training_on_other_data_is_not_finished_and_starts_again(tmp_path, monkeypatch):
@@ -78,7 +96,8 @@ def test_a_training_on_other_data_is_not_finished_and_starts_again(tmp_path, mon
 
     monkeypatch.setattr(works, "pretrain", pretrain)
     write_data(tmp_path, "one")
-    work, sets = Work(tmp_path, log=(lines := []).append), {"own", "fine", "coarse", "other"}
+    work = Work(tmp_path, log=(lines := []).append)
+    sets = {"own", "fine", "coarse", "other"}
     assert work.ready(LEAF) == sets
     for one in LEAF.trainings:
         work.train(one)
@@ -96,7 +115,10 @@ def test_tables_are_rendered_from_the_files_alone(tmp_path, capsys):
     synthetic.write(tmp_path / "matrix.jsonl", leaves)
     assert matrix.main(["--render", "--out", str(tmp_path), "--work", str(tmp_path / "never")]) == 0
     text = (tmp_path / "sensors.md").read_text()
-    assert str(tmp_path / "sensors.md") in capsys.readouterr().out and not (tmp_path / "never").exists()
+    assert (
+        str(tmp_path / "sensors.md") in capsys.readouterr().out
+        and not (tmp_path / "never").exists()
+    )
     assert "| material | gelsight | 50.0 [50.0, 50.0] | - | - |" in text
 
 
@@ -123,7 +145,9 @@ def test_objects_held_out_of_one_data_set_are_held_out_of_the_other(tmp_path, ca
         words = ["--work", str(tmp_path / "work"), "--set", *changes]
         assert matrix.main(words) == 2
         error = capsys.readouterr().err
-        assert re.search(r"the object .* would be in \w+ of own and in \w+ of (fine|coarse): give both", error)
+        assert re.search(
+            r"the object .* would be in \w+ of own and in \w+ of (fine|coarse): give both", error
+        )
         assert len(error.splitlines()) == 1 and not (tmp_path / "work").exists()
         mended = int(re.search(r"--set objects=(\d+)", error).group(1))
         works.check_objects(matrix.size_of(False, [*changes, f"objects={mended}"]))
@@ -131,7 +155,8 @@ def test_objects_held_out_of_one_data_set_are_held_out_of_the_other(tmp_path, ca
 
 def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(tmp_path, capsys):
     words = ["--quick", "--work", str(tmp_path / "work"), "--out", str(tmp_path)]
-    path, leaves = tmp_path / "matrix.jsonl", plan.leaves(plan.QUICK)
+    path = tmp_path / "matrix.jsonl"
+    leaves = plan.leaves(plan.QUICK)
     settings = plan.settings(plan.QUICK)
     for change in ({"simulator": 1}, {"settings": settings | {"steps1": 999}}):
         synthetic.write(path, leaves[:2])
@@ -146,7 +171,16 @@ def test_results_of_another_simulator_or_size_are_never_mixed_nor_written_over(t
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_whole_way_at_the_smallest_size(tmp_path, capsys):
-    sizes = {"own": 24, "fine": 24, "coarse": 24, "other": 24, "objects": 24, "frames": 6, "steps1": 2, "steps2": 2}
+    sizes = {
+        "own": 24,
+        "fine": 24,
+        "coarse": 24,
+        "other": 24,
+        "objects": 24,
+        "frames": 6,
+        "steps1": 2,
+        "steps2": 2,
+    }
     words = ["--quick", "--set", *(f"{name}={number}" for name, number in sizes.items())]
     words += ["--only", "q2", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
     assert matrix.main(words) == 0, capsys.readouterr().err
@@ -154,9 +188,13 @@ def test_the_whole_way_at_the_smallest_size(tmp_path, capsys):
     ways = ("aligned", "contact", "masked", "matched", "matched_mlp", "pixels", "untrained")
     assert [*records] == [f"q2-{way}-0" for way in ways]
     stored = records["q2-matched-0"]
-    assert [one["stage"] for one in stored["trained"]] == [1, 2] and stored["trained"][0]["config"]["run"]["steps"] == 2
+    assert [one["stage"] for one in stored["trained"]] == [1, 2] and stored["trained"][0]["config"][
+        "run"
+    ]["steps"] == 2
     assert all(len(value) == 64 for value in stored["data"].values()) and stored["machine"]
-    assert {row["task"] for row in stored["rows"]} >= {"top-1", "silhouette by sensor"} and len(stored["points"]) > 4
+    assert {row["task"] for row in stored["rows"]} >= {"top-1", "silhouette by sensor"} and len(
+        stored["points"]
+    ) > 4
     assert records["q2-untrained-0"]["untrained"]["model"]["embed"] == 32
     assert records["q2-pixels-0"]["untrained"] is None
     trained = sorted((tmp_path / "work" / "trained").iterdir())
@@ -164,4 +202,6 @@ def test_the_whole_way_at_the_smallest_size(tmp_path, capsys):
     capsys.readouterr()
     assert matrix.main(words) == 0  # all is there
     assert "0 runs made, 7 were there, 0 failed" in capsys.readouterr().out
-    assert (tmp_path / "out" / "space.md").exists() and (tmp_path / "out" / "figures" / "space.png").exists()
+    assert (tmp_path / "out" / "space.md").exists() and (
+        tmp_path / "out" / "figures" / "space.png"
+    ).exists()

@@ -20,27 +20,39 @@ def step_of(markers, half, away):
 @pytest.mark.parametrize(
     ("name", "ball_mm", "dots", "noise", "most"),
     [
-        ("gelslim", 6.35, 1.0, 1.5, 0.15), ("9dtact", 6.35, 0.0, 0.5, 0.15), ("gelsight_mini", 6.35, 0.0, 0.6, 0.15),
-        ("digit", None, 0.0, 0.5, 0.3), ("gelsight_mini", None, 1.0, 1.0, 0.3),
+        ("gelslim", 6.35, 1.0, 1.5, 0.15),
+        ("9dtact", 6.35, 0.0, 0.5, 0.15),
+        ("gelsight_mini", 6.35, 0.0, 0.6, 0.15),
+        ("digit", None, 0.0, 0.5, 0.3),
+        ("gelsight_mini", None, 1.0, 1.0, 0.3),
     ],
-)  # fmt: skip
+)
 def test_hidden_parameters_of_a_device_are_found(tmp_path, name, ball_mm, dots, noise, most):
     hidden = hidden_pictures(name, 2, 16, ball_mm=ball_mm, marked=dots, noise=noise)
-    fitted = fit_sensor(list(hidden.frames), "mine", hidden.width, tmp_path / "mine.sensor", ball_mm=ball_mm)
-    sensor, numbers = find_sensor(str(fitted.folder)), fitted.numbers
+    fitted = fit_sensor(
+        list(hidden.frames), "mine", hidden.width, tmp_path / "mine.sensor", ball_mm=ball_mm
+    )
+    sensor = find_sensor(str(fitted.folder))
+    numbers = fitted.numbers
     assert abs(numbers.noise / noise - 1) < 0.2
     if dots:
-        true, grown = SENSORS[name].markers, float(hidden.unit.marker_pitch)
+        true = SENSORS[name].markers
+        grown = float(hidden.unit.marker_pitch)
         own_half, half = (float(np.hypot(*one.field)) / 2 for one in (sensor, SENSORS[name]))
         for away in (0.0, 0.3 * hidden.width, 0.5 * hidden.width):
             wanted = grown * step_of(true, grown * half, away)
             assert abs(step_of(sensor.markers, own_half, away) / wanted - 1) < 0.03
         if name == "gelsight_mini":  # the others are as small as pixels
-            assert abs(sensor.markers.radius / (true.radius * float(hidden.unit.marker_size)) - 1) < 0.25
+            assert (
+                abs(sensor.markers.radius / (true.radius * float(hidden.unit.marker_size)) - 1)
+                < 0.25
+            )
     else:
         assert sensor.markers is None
-    found, true = colours_of_dents(look(sensor), sensor.halo), true_colours(hidden)
-    part = np.s_[2:] if name == "9dtact" else np.s_[:2]  # it shows depth, and no slope
+    found = colours_of_dents(look(sensor), sensor.halo)
+    true = true_colours(hidden)
+    # it shows depth, and no slope
+    part = np.s_[2:] if name == "9dtact" else np.s_[:2]
     assert np.linalg.norm((found - true)[part]) < most * np.linalg.norm(true[part])
 
 
@@ -55,17 +67,27 @@ GOOD = {"pictures": pictures(), "name": "mine", "width_mm": 18.6, "out": "mine.s
     ("change", "named"),
     [
         ({"pictures": pictures(depth=0.0)}, "no picture shows a press"),
-        ({"pictures": pictures(places=[0] * 6) + pictures(places=[1] * 3)}, "no picture shows a press|same place"),
+        (
+            {"pictures": pictures(places=[0] * 6) + pictures(places=[1] * 3)},
+            "no picture shows a press|same place",
+        ),
         ({"pictures": pictures()[:4]}, "4 pictures are too few"),
-        ({"pictures": pictures() + [np.minimum(one, 225) + 30 for one in pictures(seed=50)]}, "another unit"),
+        (
+            {"pictures": pictures() + [np.minimum(one, 225) + 30 for one in pictures(seed=50)]},
+            "another unit",
+        ),
         ({"pictures": [*pictures(), pictures()[0][:, :100]]}, "have 2 sizes"),
-        ({"width_mm": 0.5}, "the sides of a gel are 4 to 40 mm"), ({"width_mm": 120.0}, "4 to 40 mm"),
-        ({"ball_mm": 60.0}, "a ball of 60 mm"), ({"name": "allsight"}, "is not flat"),
-        ({"name": "tac3d"}, "measures a field"), ({"name": "digit"}, "sensor of the table"),
-        ({"name": "gelsigth"}, "did you mean gelsight"), ({"out": "mine"}, r"must end in \.sensor"),
+        ({"width_mm": 0.5}, "the sides of a gel are 4 to 40 mm"),
+        ({"width_mm": 120.0}, "4 to 40 mm"),
+        ({"ball_mm": 60.0}, "a ball of 60 mm"),
+        ({"name": "allsight"}, "is not flat"),
+        ({"name": "tac3d"}, "measures a field"),
+        ({"name": "digit"}, "sensor of the table"),
+        ({"name": "gelsigth"}, "did you mean gelsight"),
+        ({"out": "mine"}, r"must end in \.sensor"),
         ({"background": np.zeros((50, 50, 3), np.uint8)}, "other proportions"),
     ],
-)  # fmt: skip
+)
 def test_wrong_input_gets_a_sentence(tmp_path, change, named):
     options = GOOD | change
     options["out"] = tmp_path / options["out"]
@@ -83,6 +105,8 @@ def test_a_round_picture_is_of_a_sensor_that_is_not_flat(tmp_path):
 
 def test_the_classifier_sees_a_difference_only_where_there_is_one():
     rng = np.random.default_rng(0)
-    one, other, stronger = ([rng.normal(0, size, (32, 32, 3)).astype(np.float32) for _ in range(40)]
-                            for size in (3, 3, 4))  # fmt: skip
+    one, other, stronger = (
+        [rng.normal(0, size, (32, 32, 3)).astype(np.float32) for _ in range(40)]
+        for size in (3, 3, 4)
+    )
     assert separable(one, other) < 0.7 and separable(one, stronger) > 0.95

@@ -24,18 +24,30 @@ from anytouch_jax.weights.tree import flatten
 def felt(key, world, *, size):
     """Touches of random patterns. Your sensor shows their negative."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    seen = rng.integers(80, 176, (tokens.COUNT, 1, 1, 4, 4, 3)).repeat(size // 4, 3).repeat(size // 4, 4)
+    seen = (
+        rng.integers(80, 176, (tokens.COUNT, 1, 1, 4, 4, 3))
+        .repeat(size // 4, 3)
+        .repeat(size // 4, 4)
+    )
     clip = np.concatenate([seen, 255 - seen], 1).astype(np.uint8)
-    sensor = np.stack([1 + np.arange(tokens.COUNT) % 2, np.zeros(tokens.COUNT, int)], 1).astype(np.int32)
+    sensor = np.stack([1 + np.arange(tokens.COUNT) % 2, np.zeros(tokens.COUNT, int)], 1).astype(
+        np.int32
+    )
     none = np.zeros(tokens.COUNT, np.int32)
-    return SimulatedTouches(clip, np.full_like(clip[:, :, 0], 128), sensor, none, none, None, None, None, None, {})
+    return SimulatedTouches(
+        clip, np.full_like(clip[:, :, 0], 128), sensor, none, none, None, None, None, None, {}
+    )
 
 
 @pytest.fixture
 def mine(tmp_path):
     gel = np.full((1, 30, 40, 3), 90, np.uint8)
-    return write_sensor(tmp_path / "mine.sensor", OwnSensor("mine", 18.0, 13.5, (24, 32), 0.7, sure={}), gel,
-                        look(SENSORS["digit"]))  # fmt: skip
+    return write_sensor(
+        tmp_path / "mine.sensor",
+        OwnSensor("mine", 18.0, 13.5, (24, 32), 0.7, sure={}),
+        gel,
+        look(SENSORS["digit"]),
+    )
 
 
 @pytest.fixture
@@ -43,12 +55,17 @@ def run(tmp_path, monkeypatch):
     monkeypatch.setattr(tokens, "own_touches", felt)
     monkeypatch.setattr(tokens, "own_world", lambda *_: None)
     ticks = count()
-    monkeypatch.setattr(tokens, "time", SimpleNamespace(monotonic=lambda: 0.1 * next(ticks)))  # a step takes 0.1 s
+    # a step takes 0.1 s
+    monkeypatch.setattr(tokens, "time", SimpleNamespace(monotonic=lambda: 0.1 * next(ticks)))
     config = run_config(tmp_path / "none.csv").with_settings({"data.background": "subtract"})
     params = build(config.model).init(jax.random.key(0))
     params["touch"]["sensor_tokens"] = params["touch"]["sensor_tokens"] * 20
-    store = checkpoint.Checkpoints(tmp_path / "run" / "checkpoints", keep=1, config_json=to_json(config),
-                                   metadata={"seen": ["gelsight", "digit"]})  # fmt: skip
+    store = checkpoint.Checkpoints(
+        tmp_path / "run" / "checkpoints",
+        keep=1,
+        config_json=to_json(config),
+        metadata={"seen": ["gelsight", "digit"]},
+    )
     store.save(3, {"trainable": params}, {"loss": 1.0})
     store.close()
     return tmp_path / "run"
@@ -75,7 +92,17 @@ def stopping(monkeypatch, steps):
 def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_it_may(
     run, mine, tmp_path, monkeypatch, capsys, deep
 ):
-    words = ["adapt", "--model", str(run), "--sensor", str(mine), "--minutes", "0.05", "--out", str(tmp_path / "out")]
+    words = [
+        "adapt",
+        "--model",
+        str(run),
+        "--sensor",
+        str(mine),
+        "--minutes",
+        "0.05",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     words += ["--deep"] * deep
     with monkeypatch.context() as stopped:
         stopping(stopped, 18)
@@ -87,7 +114,9 @@ def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_
     assert app.main(words) == 0 and not state.exists()
     assert "continued after 18 steps of 30" in capsys.readouterr().err
     assert app.main([*words[: -1 - deep], str(tmp_path / "undisturbed"), *["--deep"] * deep]) == 0
-    resumed, undisturbed = (flatten(checkpoint.load_params(tmp_path / name)[0]) for name in ("out", "undisturbed"))
+    resumed, undisturbed = (
+        flatten(checkpoint.load_params(tmp_path / name)[0]) for name in ("out", "undisturbed")
+    )
     assert all(np.array_equal(values, undisturbed[name]) for name, values in resumed.items())
     before, after = (flatten(checkpoint.load_params(path)[0]) for path in (run, tmp_path / "out"))
     moved = {name for name, values in before.items() if not np.array_equal(values, after[name])}
@@ -95,9 +124,12 @@ def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_
     assert {name.split("/")[1] for name in moved} == (
         {"sensor_tokens", "patch", "blocks"} if deep else {"sensor_tokens"}
     )
-    table, old = after["touch/sensor_tokens"], before["touch/sensor_tokens"]
+    table = after["touch/sensor_tokens"]
+    old = before["touch/sensor_tokens"]
     np.testing.assert_array_equal(table[: len(old)], old)
-    assert len(table) == len(old) + 1 and load_encoder(tmp_path / "out").trained_sensors[-1] == "mine"
+    assert (
+        len(table) == len(old) + 1 and load_encoder(tmp_path / "out").trained_sensors[-1] == "mine"
+    )
 
 
 def test_tokens_that_find_fewer_touches_are_not_saved(run, mine, tmp_path, monkeypatch):

@@ -27,7 +27,9 @@ SECONDS = 60  # of one command
 MEMORY = 1 << 30  # bytes that a command may take more
 _LIMIT = 6 << 30  # bytes of address space that it gets, so that a bomb hurts nobody
 _TICK = 2  # seconds from one look at a command to the next
-LETTERS, LINES = 600, 60  # of one line of a message, of a message
+# of one line of a message, of a message
+LETTERS = 600
+LINES = 60
 # How `info` and `contact` report what they could not use, with status 0.
 _DAMAGE = re.compile("cannot be used|cannot embed|cannot be read|frames can be read|is damaged")
 _RULE = re.compile(r"[-|: ]*[╭╰─╮╯│]")  # the option parser draws boxes
@@ -57,13 +59,20 @@ def try_all(kind: str, make: Make, count: int, folder: Path, things: Any, capfd:
 
     Each input has its own random numbers: input 7 is the same in a run of 10 and of 1000.
     """
-    first, lines = int(os.environ.get("FUZZ_FIRST", 0)), []
+    first = int(os.environ.get("FUZZ_FIRST", 0))
+    lines = []
     for number in range(first, first + count):
         place = folder / str(number)
         place.mkdir()
-        case = make(np.random.default_rng([zlib.crc32(f"test_{kind}".encode()), number]), place, things)
+        case = make(
+            np.random.default_rng([zlib.crc32(f"test_{kind}".encode()), number]), place, things
+        )
         if found := faults(case, capfd):
-            words = case.words if callable(case.words) else " ".join(str(word)[:150] for word in case.words)
+            words = (
+                case.words
+                if callable(case.words)
+                else " ".join(str(word)[:150] for word in case.words)
+            )
             lines += [f"{number} ({case.name}): {fault}\n    {words}" for fault in found]
         shutil.rmtree(place, ignore_errors=True)
     return lines
@@ -71,15 +80,23 @@ def try_all(kind: str, make: Make, count: int, folder: Path, things: Any, capfd:
 
 def faults(case: Case, capfd: pytest.CaptureFixture[str]) -> list[str]:
     """Run the command of a case in this process, as `anytouch` does, and return its faults."""
-    status, trace, before = None, "", _memory("VmRSS")
+    status = None
+    trace = ""
+    before = _memory("VmRSS")
     capfd.readouterr()
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")  # forget the largest memory so far
+        # forget the largest memory so far
+        Path("/proc/self/clear_refs").write_text("5")
     with warnings.catch_warnings(), _bounded():
-        warnings.simplefilter("default")  # as in a command; pytest makes errors of warnings
+        # as in a command; pytest makes errors of warnings
+        warnings.simplefilter("default")
         try:
             words = case.words
-            status = guarded("anytouch", words) if callable(words) else main([str(word) for word in words])
+            status = (
+                guarded("anytouch", words)
+                if callable(words)
+                else main([str(word) for word in words])
+            )
         except _HangError:
             pass
         except BaseException as error:
@@ -93,19 +110,23 @@ def faults(case: Case, capfd: pytest.CaptureFixture[str]) -> list[str]:
     last = (out.strip().splitlines() or [""])[-1]
     wrong = case.check() if status == 0 and not case.corrupt and case.check is not None else None
     found = [
-        (status is None, f"no answer within {SECONDS} s"), (status not in (None, 0, 1, 2), f"status {status}"),
-        (memory > MEMORY, f"{memory >> 20} MB of memory"), (wrong, wrong),
+        (status is None, f"no answer within {SECONDS} s"),
+        (status not in (None, 0, 1, 2), f"status {status}"),
+        (memory > MEMORY, f"{memory >> 20} MB of memory"),
+        (wrong, wrong),
         ("not enough memory" in err, "it asked for more memory than there is"),
         (len(long) > LETTERS, f"a line of {len(long)} letters: {long[:160]}"),
         (len(lines) > LINES, f"{len(lines)} lines: {lines[-1:]}"),
         (status == 2 and not err.strip(), "status 2 without a sentence"),
         (status == 0 and case.corrupt and not _DAMAGE.search(out), f"accepted: {last[:160]}"),
-    ]  # fmt: skip
+    ]
     return [str(fault) for is_fault, fault in found if is_fault]
 
 
 def _memory(name: str) -> int:
-    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name))
+    line = next(
+        line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name)
+    )
     return int(line.split()[1]) << 10
 
 
@@ -122,12 +143,17 @@ def _waits() -> dict[str, float]:
 def _bounded() -> Iterator[None]:
     """Raise `_HangError` after `SECONDS`, end the process long after that, and limit its memory."""
 
-    start, waited, before_tick = time.monotonic(), 0.0, _waits()
+    start = time.monotonic()
+    waited = 0.0
+    before_tick = _waits()
 
     def stop(*_: Any) -> None:
         nonlocal waited, before_tick
-        waits = _waits()  # a busy machine is no fault of the command, nor of the threads that it starts one by one
-        waited += max((wait - before_tick.get(thread, 0.0) for thread, wait in waits.items()), default=0.0)
+        # a busy machine is no fault of the command, nor of the threads that it starts one by one
+        waits = _waits()
+        waited += max(
+            (wait - before_tick.get(thread, 0.0) for thread, wait in waits.items()), default=0.0
+        )
         before_tick = waits
         if time.monotonic() - start - waited >= SECONDS:
             raise _HangError
@@ -152,7 +178,9 @@ def pick(rng: np.random.Generator, choices: Any) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
-def flipped(rng: np.random.Generator, data: bytes, start: int = 0, stop: int | None = None, count: int = 1) -> bytes:
+def flipped(
+    rng: np.random.Generator, data: bytes, start: int = 0, stop: int | None = None, count: int = 1
+) -> bytes:
     """The same bytes, of which `count` between `start` and `stop` differ."""
     changed = bytearray(data)
     for at in rng.integers(start, len(data) if stop is None else stop, count):

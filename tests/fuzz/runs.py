@@ -9,17 +9,49 @@ from tests.fuzz.harness import Case, cut, flipped, pick
 from tests.fuzz.json_files import spoiled
 
 ODD: tuple[Any, ...] = (
-    None, True, -1, 0, 1.5, 10**10, 1 << 60, 10**30, "", "x", "y" * 100_000, [], {}, [1], [[]], {"a": 1}, [None] * 3,
-    [[[]]], ["a", 3],
-)  # fmt: skip
+    None,
+    True,
+    -1,
+    0,
+    1.5,
+    10**10,
+    1 << 60,
+    10**30,
+    "",
+    "x",
+    "y" * 100_000,
+    [],
+    {},
+    [1],
+    [[]],
+    {"a": 1},
+    [None] * 3,
+    [[[]]],
+    ["a", 3],
+)
 NAMES = ("x", "", "trainable/", "trainable/touch", "../../x", "trainable//a", "n" * 10_000)
 DTYPES = ("int8", "object", "U3", "float32 ", "bool", "complex64", "V8", "M8[s]")
 OUTSIDE = ("../checkpoint.json", "/etc/passwd", "/dev/zero", "a\0b", "x" * 5000, ".")
 LINES = (
-    "", "{", "[]", "null", '{"step": 3}', '{"loss": 1}', '{"step": "x", "loss": 1}', '{"step": 1, "loss": "y"}', "NaN",
-    '{"step": 1, "loss": NaN}', '{"step": 1, "loss": [1]}', "[" * 100_000, "\0" * 500, "3", '"text"',
-    '{"step": 1, "loss": ' + "9" * 5000 + "}", '{"step": 1e400, "loss": 1}', '{"step": true, "loss": {}}',
-)  # fmt: skip
+    "",
+    "{",
+    "[]",
+    "null",
+    '{"step": 3}',
+    '{"loss": 1}',
+    '{"step": "x", "loss": 1}',
+    '{"step": 1, "loss": "y"}',
+    "NaN",
+    '{"step": 1, "loss": NaN}',
+    '{"step": 1, "loss": [1]}',
+    "[" * 100_000,
+    "\0" * 500,
+    "3",
+    '"text"',
+    '{"step": 1, "loss": ' + "9" * 5000 + "}",
+    '{"step": 1e400, "loss": 1}',
+    '{"step": true, "loss": {}}',
+)
 
 
 def odd_for(rng, value: Any) -> Any:
@@ -45,10 +77,19 @@ def shape(rng, record):
     name = pick(rng, [one for one in arrays if one.startswith("trainable/")])
     sides, dtype = arrays.pop(name)
     forms = {
-        "huge": ([10**10], dtype), "many": ([1 << 20] * 3, dtype), "negative": ([-1], dtype), "float": ([1.5], dtype),
-        "zero": ([0, *sides], dtype), "more": ([*sides, 2], dtype), "none": (None, dtype), "text": ("12", dtype),
-        "type": (sides, pick(rng, ODD)), "dtype": (sides, pick(rng, DTYPES)), "renamed": (sides, dtype), "lost": None,
-    }  # fmt: skip
+        "huge": ([10**10], dtype),
+        "many": ([1 << 20] * 3, dtype),
+        "negative": ([-1], dtype),
+        "float": ([1.5], dtype),
+        "zero": ([0, *sides], dtype),
+        "more": ([*sides, 2], dtype),
+        "none": (None, dtype),
+        "text": ("12", dtype),
+        "type": (sides, pick(rng, ODD)),
+        "dtype": (sides, pick(rng, DTYPES)),
+        "renamed": (sides, dtype),
+        "lost": None,
+    }
     kind = pick(rng, forms)
     if kind != "lost":
         arrays[pick(rng, NAMES) if kind == "renamed" else name] = list(forms[kind])
@@ -67,24 +108,36 @@ def sizes(rng, record):
     config = json.loads(record["config"])
     is_touch = rng.random() < 0.5
     part = config["model"]["touch"] if is_touch else config["model"]
-    names = ("width", "depth", "heads", "mlp") if is_touch else ("image_size", "patch", "frames", "sensor_tokens")
+    names = (
+        ("width", "depth", "heads", "mlp")
+        if is_touch
+        else ("image_size", "patch", "frames", "sensor_tokens")
+    )
     name = pick(rng, [one for one in names if one in part])
-    part[name] = int(pick(rng, [one for one in (0, -1, 3, 5, 64, 10**5, 10**9, 1 << 40) if one != part[name]]))
+    part[name] = int(
+        pick(rng, [one for one in (0, -1, 3, 5, 64, 10**5, 10**9, 1 << 40) if one != part[name]])
+    )
     record["config"] = json.dumps(config)
     return f"{name} is {part[name]}", False, name != "frames"
 
 
 def metadata(rng, record):
     inner = pick(rng, ("metadata", "metrics", "files"))
-    values, value = record[inner], pick(rng, ODD)
+    values = record[inner]
+    value = pick(rng, ODD)
     name = pick(rng, values if inner == "files" else (*values, "seen", "source", "data", "loss"))
     values[name] = value
     if inner == "files" and rng.random() < 0.5:
         del values[name]
         values[pick(rng, OUTSIDE)] = [3, 4]
-    wrong = inner == "files" or (inner == "metrics" and not (value is None or type(value) in (int, float)))
-    wrong |= inner == "metadata" and not isinstance(value, {"seen": list, "source": dict}.get(name, object))
-    return f"{inner}.{name[:20]} is {str(value)[:20]}", wrong, wrong  # most metadata are for the reader alone
+    wrong = inner == "files" or (
+        inner == "metrics" and not (value is None or type(value) in (int, float))
+    )
+    wrong |= inner == "metadata" and not isinstance(
+        value, {"seen": list, "source": dict}.get(name, object)
+    )
+    # most metadata are for the reader alone
+    return f"{inner}.{name[:20]} is {str(value)[:20]}", wrong, wrong
 
 
 def bytes_damaged(rng, folder: Path):
@@ -95,7 +148,9 @@ def bytes_damaged(rng, folder: Path):
     if kind == "folder":
         file.mkdir()
     elif kind != "lost":
-        changed = {"cut": cut, "flipped": flipped}.get(kind, lambda *_: b"<html></html>" * (kind == "text"))
+        changed = {"cut": cut, "flipped": flipped}.get(
+            kind, lambda *_: b"<html></html>" * (kind == "text")
+        )
         file.write_bytes(changed(rng, data))
     # `info` describes a damaged checkpoint too; a flipped bit of the record's white space is no damage.
     return f"{file.name} {kind}", False, file.name != "checkpoint.json" or kind != "flipped"
@@ -107,11 +162,15 @@ def make(rng, folder: Path, things) -> Case:
     run = folder / "run"
     shutil.copytree(things.run, run)
     record_file = run / "checkpoints" / "00000001" / "checkpoint.json"
-    change = pick(rng, (field, field, shape, shape, settings, settings, sizes, metadata, bytes_damaged, spoiled))
+    change = pick(
+        rng,
+        (field, field, shape, shape, settings, settings, sizes, metadata, bytes_damaged, spoiled),
+    )
     if change is spoiled:
         name, data, described = spoiled(rng, record_file.read_text())
         record_file.write_bytes(data)
-        name, used = f"record: {name}", described
+        name = f"record: {name}"
+        used = described
     elif change is bytes_damaged:
         name, described, used = change(rng, record_file.parent)
     else:
@@ -121,11 +180,40 @@ def make(rng, folder: Path, things) -> Case:
         text = f'{{"checksum": {zlib.crc32(body.encode())}, "record": {body}}}'
         record_file.write_text(text, encoding="utf-8", errors="surrogatepass")
     place = pick(rng, (run, run, run / "checkpoints", record_file.parent))
-    export = ("export", "--to", "safetensors", "--model", place, "--out", folder / "out.safetensors")
+    export = (
+        "export",
+        "--to",
+        "safetensors",
+        "--model",
+        place,
+        "--out",
+        folder / "out.safetensors",
+    )
     embed = ("embed", "--model", place, "--data", things.frames, "--out", folder / "f.npz")
-    adapt = ("adapt", "--model", place, "--data", things.manifest, "--sensor", "gelslim", "--frames", "0")
+    adapt = (
+        "adapt",
+        "--model",
+        place,
+        "--data",
+        things.manifest,
+        "--sensor",
+        "gelslim",
+        "--frames",
+        "0",
+    )
     adapt += ("--out", folder / "new")
-    words = pick(rng, (("info", place), ("info", place), export, export, export, embed if used else export, adapt))
+    words = pick(
+        rng,
+        (
+            ("info", place),
+            ("info", place),
+            export,
+            export,
+            export,
+            embed if used else export,
+            adapt,
+        ),
+    )
     return Case(f"{name}, {words[0]}", words, described if words[0] == "info" else used)
 
 
@@ -137,4 +225,6 @@ def metrics(rng, folder: Path) -> Case:
     if rng.random() < 0.3:
         data = pick(rng, (cut(rng, data), b"", data + b"\xff\xfe", b"\xef\xbb\xbf" + data))
     (folder / "metrics.jsonl").write_bytes(data)
-    return Case(f"metrics: {bad[:30]!r}", lambda: (loss_curves(folder / "f.png", {"run": folder}), 0)[1])
+    return Case(
+        f"metrics: {bad[:30]!r}", lambda: (loss_curves(folder / "f.png", {"run": folder}), 0)[1]
+    )

@@ -9,10 +9,15 @@ from tests.fuzz.harness import try_all
 
 # name -> what makes an input, how many are quick, the share of all in a long run
 KINDS = {
-    "arrays": (arrays.make, 40, 0.14), "json": (json_files.make, 30, 0.08), "manifests": (manifests.make, 25, 0.2),
-    "pictures": (pictures.make, 25, 0.24), "runs": (runs.make, 25, 0.11), "server": (server.make, 8, 0.04),
-    "vectors": (vectors.make, 60, 0.04), "weights": (weights.make, 25, 0.14),
-}  # fmt: skip
+    "arrays": (arrays.make, 40, 0.14),
+    "json": (json_files.make, 30, 0.08),
+    "manifests": (manifests.make, 25, 0.2),
+    "pictures": (pictures.make, 25, 0.24),
+    "runs": (runs.make, 25, 0.11),
+    "server": (server.make, 8, 0.04),
+    "vectors": (vectors.make, 60, 0.04),
+    "weights": (weights.make, 25, 0.14),
+}
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -50,14 +50,23 @@ def ranks(x: Any) -> Any:
 FUNCTIONS = {
     "normalise": (lambda x, _: np.asarray(normalise(x)), lambda x: unit(x, 1e-12)),
     "unit rows": (lambda x, _: unit_rows(x), unit),
-    "similarity": (lambda x, things: load(things.run).similarity(x, x), lambda x: unit(x, 1e-12) @ unit(x, 1e-12).T),
-    "search": (searched, cosines), "recall": (ranked, ranks),
-    "alignment": (lambda x, _: alignment(x, x[::-1]), lambda x: np.square(unit(x) - unit(x)[::-1]).sum(1).mean()),
+    "similarity": (
+        lambda x, things: load(things.run).similarity(x, x),
+        lambda x: unit(x, 1e-12) @ unit(x, 1e-12).T,
+    ),
+    "search": (searched, cosines),
+    "recall": (ranked, ranks),
+    "alignment": (
+        lambda x, _: alignment(x, x[::-1]),
+        lambda x: np.square(unit(x) - unit(x)[::-1]).sum(1).mean(),
+    ),
     "uniformity": (
         lambda x, _: uniformity(x),
-        lambda x: np.log(np.mean(np.exp(2 * np.minimum(cosines(x)[np.triu_indices(len(x), 1)] - 1, 0) * 2))),
+        lambda x: np.log(
+            np.mean(np.exp(2 * np.minimum(cosines(x)[np.triu_indices(len(x), 1)] - 1, 0) * 2))
+        ),
     ),
-}  # fmt: skip
+}
 
 
 def make(rng, folder: Path, things) -> Case:
@@ -76,9 +85,16 @@ def make(rng, folder: Path, things) -> Case:
 
     def check():
         if bad:
-            return "a value for a vector that is not finite" if np.isfinite(results[0]).all() else None
+            if np.isfinite(results[0]).all():
+                return "a value for a vector that is not finite"
+            return None
         expected = FUNCTIONS[name][1](x)
         error = np.abs(results[0] - expected).max()
-        return None if error < 1e-5 else f"an error of {error:.2g}"  # NaN is an error, too
+        # NaN is an error, too
+        if error < 1e-5:
+            return None
+        return f"an error of {error:.2g}"
 
-    return Case(f"{name}, lengths {lengths.ravel().tolist()}, {'not ' * bad}finite", compute, False, check)
+    return Case(
+        f"{name}, lengths {lengths.ravel().tolist()}, {'not ' * bad}finite", compute, False, check
+    )

@@ -45,12 +45,18 @@ def test_lerobot_finds_the_camera_and_its_pictures_are_oriented_and_subtracted(p
     kind = lerobot_interface.CameraConfig.known["anytouch"]
     config = kind(index_or_path=0, width=40, height=60, rotate=90)
     camera = lerobot_interface.device_class(config)(config)
-    assert not camera.is_connected and (camera._camera.config.width, camera._camera.config.height) == (60, 40)
+    assert not camera.is_connected and (
+        camera._camera.config.width,
+        camera._camera.config.height,
+    ) == (60, 40)
     with camera_open(camera):
         assert camera.is_connected and (camera.width, camera.height, camera.fps) == (40, 60, 30)
-        first, second, latest = camera.read(), camera.async_read(100), camera.read_latest()
+        first = camera.read()
+        second = camera.async_read(100)
+        latest = camera.read_latest()
         assert first.shape == (60, 40, 3) and first.dtype == np.uint8
-        assert first[0, -1].tolist() == [148] * 3 and first[-1, 0].tolist() == [128] * 3  # turned clockwise
+        # turned clockwise
+        assert first[0, -1].tolist() == [148] * 3 and first[-1, 0].tolist() == [128] * 3
         assert second[0, -1].tolist() == [168] * 3 and np.array_equal(latest, second)
         camera.async_read(100)
         with pytest.raises(TimeoutError):
@@ -71,22 +77,30 @@ def camera_open(camera):
 
 def test_features_are_those_of_the_encoder(plugin, film, tmp_path):
     file = mae(tmp_path / "mae")
-    camera = plugin.AnyTouchCamera(plugin.AnyTouchCameraConfig(index_or_path=0, encoder=str(file), subtract=False))
+    camera = plugin.AnyTouchCamera(
+        plugin.AnyTouchCameraConfig(index_or_path=0, encoder=str(file), subtract=False)
+    )
     with camera_open(camera):
-        frame, encoder = camera.read(), load_encoder(file)
+        frame = camera.read()
+        encoder = load_encoder(file)
         assert np.array_equal(frame, film[1])  # not subtracted
-        np.testing.assert_array_equal(camera.features(), encoder.encode_touch(encoder.preprocess(film[1]))[0])
+        np.testing.assert_array_equal(
+            camera.features(), encoder.encode_touch(encoder.preprocess(film[1]))[0]
+        )
 
 
 def test_a_film_never_ends_and_its_depth_is_a_grey_picture(plugin, tmp_path):
     """LeRobot's own camera reads a film as fast as it can, and then its thread is over."""
-    path, weights = tmp_path / "film.avi", measuring_weights(tmp_path / "weights.safetensors")
+    path = tmp_path / "film.avi"
+    weights = measuring_weights(tmp_path / "weights.safetensors")
     frames = [gel() for _ in range(4)]
     for number, picture in enumerate(frames):
         picture[10:30, 10 : 20 + 8 * number] += 60
     write_film(path, (picture[..., ::-1] for picture in frames), 100)
     settings = {"index_or_path": path, "encoder": str(weights), "sensor": "tacto", "width_mm": 12.0}
-    camera = plugin.AnyTouchCamera(plugin.AnyTouchCameraConfig(**settings, depth=True, white_mm=0.1, rotate=90))
+    camera = plugin.AnyTouchCamera(
+        plugin.AnyTouchCameraConfig(**settings, depth=True, white_mm=0.1, rotate=90)
+    )
     with camera_open(camera):
         assert (camera.width, camera.height, camera.fps) == (48, 64, 100)
         pictures = [camera.read() for _ in range(6)] + [camera.async_read(), camera.read_latest()]
@@ -96,7 +110,9 @@ def test_a_film_never_ends_and_its_depth_is_a_grey_picture(plugin, tmp_path):
         measured = camera.fields()
         assert measured.width_mm == 12 and measured.force.shape == (1, 3) and not measured.faults
     assert not camera.is_connected
-    camera = plugin.AnyTouchCamera(plugin.AnyTouchCameraConfig(**settings | {"width_mm": None}, depth=True))
+    camera = plugin.AnyTouchCamera(
+        plugin.AnyTouchCameraConfig(**settings | {"width_mm": None}, depth=True)
+    )
     with pytest.raises(ValueError, match="width_mm"):
         camera.connect()
 

@@ -16,7 +16,11 @@ class Ros:
     """What the node sees of ROS: parameters keep the type of their default, and nothing is published after the end."""
 
     def __init__(self, given: dict, frames: int) -> None:
-        self.given, self.frames, self.sent, self.destroyed, self.is_on = given, frames, [], False, False
+        self.given = given
+        self.frames = frames
+        self.sent = []
+        self.destroyed = False
+        self.is_on = False
 
     def modules(self) -> dict[str, ModuleType]:
         ros = self
@@ -27,7 +31,9 @@ class Ros:
 
             def declare_parameter(self, name, value=None, descriptor=None, ignore_override=False):
                 override = ros.given.get(name, value)
-                if type(override) is not type(value) and not (descriptor and descriptor.dynamic_typing):
+                if type(override) is not type(value) and not (
+                    descriptor and descriptor.dynamic_typing
+                ):
                     raise TypeError(f"InvalidParameterTypeException: {name}")
                 return SimpleNamespace(value=override)
 
@@ -54,39 +60,67 @@ class Ros:
 
             return type(title, (), {"__init__": init, "FLOAT32": 7})
 
-        Bool, Float32MultiArray = message("Bool", data=bool), message("Float32MultiArray", data=list)
+        Bool = message("Bool", data=bool)
+        Float32MultiArray = message("Float32MultiArray", data=list)
         three = dict.fromkeys("xyz", float)
-        Vector3, Header = message("Vector3", **three), message("Header", stamp=str, frame_id=str)
+        Vector3 = message("Vector3", **three)
+        Header = message("Header", stamp=str, frame_id=str)
         Wrench = message("Wrench", force=Vector3, torque=Vector3)
         WrenchStamped = message("WrenchStamped", header=Header, wrench=Wrench)
         PointField = message("PointField", name=str, offset=int, datatype=int, count=int)
         PointCloud2 = message(
-            "PointCloud2", header=Header, height=int, width=int, fields=list, is_bigendian=bool, point_step=int,
-            row_step=int, data=bytes, is_dense=bool,
-        )  # fmt: skip
+            "PointCloud2",
+            header=Header,
+            height=int,
+            width=int,
+            fields=list,
+            is_bigendian=bool,
+            point_step=int,
+            row_step=int,
+            data=bytes,
+            is_dense=bool,
+        )
 
         def ok() -> bool:  # Ctrl-C comes after some frames
-            self.is_on = self.is_on and sum(topic == "touch/features" for topic, _ in self.sent) < self.frames
+            self.is_on = (
+                self.is_on
+                and sum(topic == "touch/features" for topic, _ in self.sent) < self.frames
+            )
             return self.is_on
 
         def switch(on: bool):
             return lambda: setattr(self, "is_on", on)
 
         content = {
-            "rclpy": {"init": switch(True), "ok": ok, "try_shutdown": switch(False)}, "rclpy.node": {"Node": Node},
+            "rclpy": {"init": switch(True), "ok": ok, "try_shutdown": switch(False)},
+            "rclpy.node": {"Node": Node},
             "rcl_interfaces.msg": {"ParameterDescriptor": SimpleNamespace},
-            "std_msgs.msg": {"Bool": Bool, "Float32MultiArray": Float32MultiArray, "Header": Header},
-            "geometry_msgs.msg": {"Vector3": Vector3, "Wrench": Wrench, "WrenchStamped": WrenchStamped},
+            "std_msgs.msg": {
+                "Bool": Bool,
+                "Float32MultiArray": Float32MultiArray,
+                "Header": Header,
+            },
+            "geometry_msgs.msg": {
+                "Vector3": Vector3,
+                "Wrench": Wrench,
+                "WrenchStamped": WrenchStamped,
+            },
             "sensor_msgs.msg": {"PointCloud2": PointCloud2, "PointField": PointField},
-        }  # fmt: skip
-        modules = {part: ModuleType(part) for name in content for part in (name.partition(".")[0], name)}
+        }
+        modules = {
+            part: ModuleType(part) for name in content for part in (name.partition(".")[0], name)
+        }
         for name, values in content.items():
             vars(modules[name]).update(values)
         return modules
 
 
-@pytest.mark.parametrize(("frames", "background", "measures"), [(99, True, False), (2, False, False), (99, True, True)])
-def test_what_every_frame_publishes_until_ros_ends(monkeypatch, tmp_path, tiny_run, frames, background, measures):
+@pytest.mark.parametrize(
+    ("frames", "background", "measures"), [(99, True, False), (2, False, False), (99, True, True)]
+)
+def test_what_every_frame_publishes_until_ros_ends(
+    monkeypatch, tmp_path, tiny_run, frames, background, measures
+):
     monkeypatch.chdir(tmp_path)
     gel = np.tile(np.array([90, 110, 140], np.uint8), (48, 48, 1))
     press = gel.copy()
@@ -96,23 +130,38 @@ def test_what_every_frame_publishes_until_ros_ends(monkeypatch, tmp_path, tiny_r
     (tmp_path / "7.avi").rename("7")  # a number, as camera:=0 is for ROS
     model = measuring_weights(tmp_path / "weights.safetensors") if measures else tiny_run
     given = {
-        "model": str(model), "width_mm": 10.0, "sensor": "tacto" if measures else "digit", "camera": 7,
+        "model": str(model),
+        "width_mm": 10.0,
+        "sensor": "tacto" if measures else "digit",
+        "camera": 7,
         "background": "gel.png" if background else "",
-    }  # fmt: skip
+    }
     ros = Ros(given, frames)
     for name, module in ros.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
-    spec = importlib.util.spec_from_file_location("touch_node", ROOT / "integrations" / "ros2" / "touch_node.py")
+    spec = importlib.util.spec_from_file_location(
+        "touch_node", ROOT / "integrations" / "ros2" / "touch_node.py"
+    )
     node = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(node)
     node.main()
     features = [data for topic, data in ros.sent if topic == "touch/features"]
-    assert len(features) == min(frames, 2 if measures else 4) and len({len(one) for one in features}) == 1
+    assert (
+        len(features) == min(frames, 2 if measures else 4)
+        and len({len(one) for one in features}) == 1
+    )
     contact = [data for topic, data in ros.sent if topic == "touch/contact"]
     assert contact == ([False, False, True, True] if background else [])[-len(features) :]
     wrenches = [one.wrench for topic, one in ros.sent if topic == "touch/wrench"]
-    clouds = [np.frombuffer(data, "<f4").reshape(14, 14, 3) for topic, data in ros.sent if topic == "touch/points"]
+    clouds = [
+        np.frombuffer(data, "<f4").reshape(14, 14, 3)
+        for topic, data in ros.sent
+        if topic == "touch/points"
+    ]
     assert len(wrenches) == len(clouds) == (2 if measures else 0)
-    for force, points in zip(wrenches, clouds, strict=True):  # N, N m and metres
-        assert abs(force.force.z) > abs(force.torque.z) and np.ptp(points[..., 0]) == pytest.approx(0.01 * 13 / 14)
+    # N, N m and metres
+    for force, points in zip(wrenches, clouds, strict=True):
+        assert abs(force.force.z) > abs(force.torque.z) and np.ptp(points[..., 0]) == pytest.approx(
+            0.01 * 13 / 14
+        )
     assert ros.destroyed and not ros.is_on

@@ -13,20 +13,27 @@ FOLDER = ROOT / "integrations"
 
 
 def example():
-    spec = importlib.util.spec_from_file_location("touch_socket", FOLDER / "unix_socket" / "touch_socket.py")
+    spec = importlib.util.spec_from_file_location(
+        "touch_socket", FOLDER / "unix_socket" / "touch_socket.py"
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 def test_every_client_gets_whole_lines_and_a_lost_one_stops_nothing(tmp_path):
-    path, stop = str(tmp_path / "touch.sock"), threading.Event()
+    path = str(tmp_path / "touch.sock")
+    stop = threading.Event()
 
     def frames():
         number = 0
         while not stop.is_set():
             contact = (1.0, 0.0, float("nan"))[number % 3]
-            fields = SimpleNamespace(summary=lambda: {"force_z": 1.5, "centre_x": None}) if number else None
+            fields = (
+                SimpleNamespace(summary=lambda: {"force_z": 1.5, "centre_x": None})
+                if number
+                else None
+            )
             about = {"contact": contact, "estimated": False, "fields": fields}
             yield SimpleNamespace(number=number, time=0.1 * number, values=np.arange(3.0), **about)
             number += 1
@@ -57,7 +64,8 @@ def test_every_client_gets_whole_lines_and_a_lost_one_stops_nothing(tmp_path):
 
 
 def test_a_dead_socket_is_replaced_and_nothing_else_is(tmp_path):
-    serve, path = example().serve, tmp_path / "touch.sock"
+    serve = example().serve
+    path = tmp_path / "touch.sock"
     with socket.socket(socket.AF_UNIX) as killed:
         killed.bind(str(path))  # closed without unlink, as by kill -9
     serve([], str(path))

@@ -15,17 +15,38 @@ from anytouch_jax.cli.app import COMMANDS, GROUPS
 from tests.laws.test_readme import TEXT
 
 NAMES = (
-    "DATA", "SCENES", "DEMO", "DEMO_STEPS", "DEMO_STEPS1", "RUN", "INIT", "PRESET", "STEPS", "STOP_AFTER", "SAVE",
-    "LABEL", "GOLDEN", "PYTHON", "MAKEFLAGS",
-)  # fmt: skip
-TARGETS = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
+    "DATA",
+    "SCENES",
+    "DEMO",
+    "DEMO_STEPS",
+    "DEMO_STEPS1",
+    "RUN",
+    "INIT",
+    "PRESET",
+    "STEPS",
+    "STOP_AFTER",
+    "SAVE",
+    "LABEL",
+    "GOLDEN",
+    "PYTHON",
+    "MAKEFLAGS",
+)
+TARGETS = (
+    re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
+)
 
 
 def make(*words: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run make without the variables of the outer make, which may be running this test."""
     assert shutil.which("make") is not None
-    clean = {key: value for key, value in os.environ.items() if key not in (*NAMES, "MAKELEVEL", "MFLAGS")}
-    return subprocess.run(["make", *words], cwd=folder, env=clean, capture_output=True, text=True, check=False)
+    clean = {
+        key: value
+        for key, value in os.environ.items()
+        if key not in (*NAMES, "MAKELEVEL", "MFLAGS")
+    }
+    return subprocess.run(
+        ["make", *words], cwd=folder, env=clean, capture_output=True, text=True, check=False
+    )
 
 
 def planned(*words: str) -> list[list[str]]:
@@ -50,13 +71,34 @@ def test_a_target_can_be_planned(target: str) -> None:
 
 
 def test_variables_reach_the_options() -> None:
-    words = ["DATA=a.parquet b.csv", "RUN=r", "PRESET=large", "STEPS=4", "STOP_AFTER=2", "SAVE=1", "BATCH=3"]
+    words = [
+        "DATA=a.parquet b.csv",
+        "RUN=r",
+        "PRESET=large",
+        "STEPS=4",
+        "STOP_AFTER=2",
+        "SAVE=1",
+        "BATCH=3",
+    ]
     options, config = parsed(planned("train-stage1", *words, "ARGS=--data.flip 0")[-1])
-    assert (options.stage, options.data, options.run) == (1, (Path("a.parquet"), Path("b.csv")), Path("r"))
-    assert (options.preset, config.run.steps, options.stop_after, config.run.save_every) == ("large", 4, 2, 1)
+    assert (options.stage, options.data, options.run) == (
+        1,
+        (Path("a.parquet"), Path("b.csv")),
+        Path("r"),
+    )
+    assert (options.preset, config.run.steps, options.stop_after, config.run.save_every) == (
+        "large",
+        4,
+        2,
+        1,
+    )
     assert config.data.batch_size == 3 and config.data.flip == 0
-    spaces = parsed(planned("train-stage1", "DATA='my folder/a.parquet' b.csv", "RUN='my runs/one'")[-1]).options
-    assert spaces.data == (Path("my folder/a.parquet"), Path("b.csv")) and spaces.run == Path("my runs/one")
+    spaces = parsed(
+        planned("train-stage1", "DATA='my folder/a.parquet' b.csv", "RUN='my runs/one'")[-1]
+    ).options
+    assert spaces.data == (Path("my folder/a.parquet"), Path("b.csv")) and spaces.run == Path(
+        "my runs/one"
+    )
     for init, given in (("runs/stage1", []), ("w.pth", ["INIT=w.pth"])):
         options = parsed(planned("train-stage2", "DATA=a.csv", *given)[-1]).options
         assert (options.stage, options.init, options.run) == (2, Path(init), Path("runs/stage2"))
@@ -65,7 +107,9 @@ def test_variables_reach_the_options() -> None:
 
 
 def test_what_targets_take_by_default_is_in_the_repository() -> None:
-    default = re.search(r"^GOLDEN +\?= (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1)
+    default = re.search(
+        r"^GOLDEN +\?= (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE
+    ).group(1)
     folder = (ROOT / default).resolve()
     assert folder.is_relative_to(ROOT) and list(folder.glob("A_*.npz"))
 
@@ -73,8 +117,11 @@ def test_what_targets_take_by_default_is_in_the_repository() -> None:
 def test_plain_make_lists_every_target() -> None:
     done = make()
     assert done.returncode == 0
-    assert [line.split()[0] for line in done.stdout.splitlines() if re.match(r"  [a-z]", line)] == TARGETS
-    assert """DATA="'my folder/a.parquet' b.csv\"\n""" in done.stdout  # as the test above has it
+    assert [
+        line.split()[0] for line in done.stdout.splitlines() if re.match(r"  [a-z]", line)
+    ] == TARGETS
+    # as the test above has it
+    assert """DATA="'my folder/a.parquet' b.csv\"\n""" in done.stdout
 
 
 def test_without_data_touches_are_simulated(tmp_path: Path) -> None:
@@ -94,7 +141,8 @@ def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
     commands = planned("demo", "DEMO=d")
     simulate, contact, stage1, stage2, report = map(parsed, commands)
     assert simulate.out == Path("d/scenes") and contact.out == Path("d/scenes/contact.parquet")
-    assert "test -e d/scenes/contact.parquet || " in make("-n", "demo", "DEMO=d").stdout  # marked once only
+    # marked once only
+    assert "test -e d/scenes/contact.parquet || " in make("-n", "demo", "DEMO=d").stdout
     for stage, (options, config) in enumerate((stage1, stage2), 1):
         assert options.stage == config.stage == stage and options.data == (contact.out,)
         assert config.data.contact_only and config.data.background == "subtract"
@@ -103,15 +151,24 @@ def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
 
 
 def test_a_longer_demo_continues_from_the_scenes_and_stage_1_of_the_plain_one() -> None:
-    plain, longer = planned("demo", "DEMO=d"), planned("demo", "DEMO=d", "DEMO_STEPS=600")
+    plain = planned("demo", "DEMO=d")
+    longer = planned("demo", "DEMO=d", "DEMO_STEPS=600")
     longest = planned("demo", "DEMO=d", "DEMO_STEPS1=3000", "DEMO_STEPS=600")
     assert plain[:-2] == longer[:-2] and plain[:-3] == longest[:-3]
     options, config = parsed(longer[-2])
-    assert (options.run, options.init, config.run.steps) == (Path("d/stage2-600"), Path("d/stage1"), 600)
-    assert (parsed(longer[-1]).stage2, parsed(longer[-1]).out) == (Path("d/stage2-600"), Path("d/report-600"))
+    assert (options.run, options.init, config.run.steps) == (
+        Path("d/stage2-600"),
+        Path("d/stage1"),
+        600,
+    )
+    assert (parsed(longer[-1]).stage2, parsed(longer[-1]).out) == (
+        Path("d/stage2-600"),
+        Path("d/report-600"),
+    )
     options, config = parsed(longest[-3])
     assert (options.run, config.run.steps) == (Path("d/stage1-3000"), 3000)
-    options, report = parsed(longest[-2]).options, parsed(longest[-1])
+    options = parsed(longest[-2]).options
+    report = parsed(longest[-1])
     assert (options.run, options.init) == (Path("d/stage2-3000-600"), Path("d/stage1-3000"))
     assert (report.stage1, report.out) == (Path("d/stage1-3000"), Path("d/report-3000-600"))
 
@@ -119,10 +176,13 @@ def test_a_longer_demo_continues_from_the_scenes_and_stage_1_of_the_plain_one() 
 def test_an_old_python_is_one_sentence(tmp_path: Path) -> None:
     for name in ("Makefile", "requirements.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path / name)
-    (tmp_path / "python-old").write_text("#!/bin/sh\nexit 1\n")  # what `sys.exit(version < 3.11)` answers there
+    # what `sys.exit(version < 3.11)` answers there
+    (tmp_path / "python-old").write_text("#!/bin/sh\nexit 1\n")
     (tmp_path / "python-old").chmod(0o755)
     done = make("setup", f"PYTHON={tmp_path}/python-old", folder=tmp_path)
-    assert done.returncode != 0 and done.stderr.startswith("This project needs Python 3.11 or newer")
+    assert done.returncode != 0 and done.stderr.startswith(
+        "This project needs Python 3.11 or newer"
+    )
     assert not (tmp_path / ".venv").exists()
 
 
@@ -132,9 +192,16 @@ def test_pins_cover_the_declared_dependencies() -> None:
     from packaging.requirements import Requirement
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = [line for line in (ROOT / "requirements.txt").read_text().splitlines() if not line.startswith("#")]
+    lines = [
+        line
+        for line in (ROOT / "requirements.txt").read_text().splitlines()
+        if not line.startswith("#")
+    ]
     assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.+]+", line) for line in lines)
-    pins = {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in (line.split("==") for line in lines)}
+    pins = {
+        re.sub(r"[-_.]+", "-", name).lower(): version
+        for name, version in (line.split("==") for line in lines)
+    }
     declared = [
         *project["dependencies"],
         *(one for extra in project["optional-dependencies"].values() for one in extra),
@@ -146,15 +213,20 @@ def test_pins_cover_the_declared_dependencies() -> None:
 
 # Targets that pages name and that are not run here, with the reason.
 NOT_RUN = {
-    "setup": "CI begins with it, in a fresh clone", "test": "it is running", "test-all": "it is running",
+    "setup": "CI begins with it, in a fresh clone",
+    "test": "it is running",
+    "test-all": "it is running",
     "demo": "it trains for minutes, and the tests above read its commands",
     "bench": "it measures for minutes, and tests/experiments/test_benchmarks.py runs its parts",
     "compare": "it measures encoders of full size, and test_compare.py runs a small one",
     "docs": "it installs packages from the network",
     "train-stage2": "the tests above read its command, which is that of train-stage1",
-}  # fmt: skip
+}
 SMALL = " ".join(f"--{name} {value}" for name, value in SIZES.items())
-RUN = {"parity": [], "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"]}
+RUN = {
+    "parity": [],
+    "train-stage1": ["STEPS=1", "BATCH=2", f"ARGS={SMALL}", "RUN={folder}/run", "DATA={world}"],
+}
 
 
 def test_every_target_of_the_pages_is_run_or_has_a_reason() -> None:

@@ -40,16 +40,24 @@ from tests.laws.test_readme import PAGES
 
 pytestmark = pytest.mark.slow
 PART = re.compile(
-    r"^```(python|text)\n(.*?)^```$|^ {4}(anytouch [^\n]*)$|^\|[^\n]*?`(anytouch [^`\n]*)`", re.MULTILINE | re.DOTALL
+    r"^```(python|text)\n(.*?)^```$|^ {4}(anytouch [^\n]*)$|^\|[^\n]*?`(anytouch [^`\n]*)`",
+    re.MULTILINE | re.DOTALL,
 )
 # What a page writes for a large machine or for addresses in a network, and what is typed here.
 HERE = {
-    "--steps 3000": "--steps 2", "--steps 600": "--steps 2", "--batch 4096 --data.parts 64":
-    "--batch 4 --data.parts 2", "hf://datasets/yxma/gelsight-mini-pretrain": "memory://far",
-    "s3://bucket/touches": "memory://tars", "verify FILE": "verify manifest.parquet", "only OUT": "only free.parquet",
-    "tacquad.parquet": "tacquad.parquet --yes", "observation.images.tactile ": f"{test_lerobot.FILM} ",
-    "--out report": "--out report --touches 40", " ...": "", "info FILE": "info runs/stage1",
-}  # fmt: skip
+    "--steps 3000": "--steps 2",
+    "--steps 600": "--steps 2",
+    "--batch 4096 --data.parts 64": "--batch 4 --data.parts 2",
+    "hf://datasets/yxma/gelsight-mini-pretrain": "memory://far",
+    "s3://bucket/touches": "memory://tars",
+    "verify FILE": "verify manifest.parquet",
+    "only OUT": "only free.parquet",
+    "tacquad.parquet": "tacquad.parquet --yes",
+    "observation.images.tactile ": f"{test_lerobot.FILM} ",
+    "--out report": "--out report --touches 40",
+    " ...": "",
+    "info FILE": "info runs/stage1",
+}
 # Two need files of the size of ViT-L or ViT-B: tests of weights and of `train --init` run them with small ones.
 # The viewer serves until it is stopped: it has tests that stop it. So has a user's own sensor.
 ELSEWHERE = ("--preset large", "--preset base", "anytouch view", "mine.sensor", "--sensor mine ")
@@ -60,12 +68,19 @@ FREE = re.compile(
     r"|(?<=^frame to features )[\d. ]+$|\d+(?= frames embedded)"
 )
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?")
-STAGE1 = {name: value for name, value in SIZES.items() if "clip-share" not in name} | {"batch": 8, "data.threads": 1}
-STAGE2 = STAGE1 | {
-    f"model.{tower}.{name}": value
-    for tower in ("image", "text.stack")
-    for name, value in {"width": 16, "depth": 1, "heads": 2, "mlp": 32}.items()
-} | {"model.text.vocab": 2048, "model.text.length": 8}  # fmt: skip
+STAGE1 = {name: value for name, value in SIZES.items() if "clip-share" not in name} | {
+    "batch": 8,
+    "data.threads": 1,
+}
+STAGE2 = (
+    STAGE1
+    | {
+        f"model.{tower}.{name}": value
+        for tower in ("image", "text.stack")
+        for name, value in {"width": 16, "depth": 1, "heads": 2, "mlp": 32}.items()
+    }
+    | {"model.text.vocab": 2048, "model.text.length": 8}
+)
 
 
 def small(words: list[str]) -> list[str]:
@@ -84,29 +99,58 @@ def run(line: str) -> str:
     for shown, typed in HERE.items():
         line = line.replace(shown, typed)
     line = line.partition(" | ")[0]  # the other program is the user's
-    words = small([str(Path(word).expanduser()) if "~" in word else word for word in shlex.split(line)[1:]])
+    words = small(
+        [str(Path(word).expanduser()) if "~" in word else word for word in shlex.split(line)[1:]]
+    )
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         status = main(words)
-    assert status == 0 or (status == 1 and "--health" in words), f"{line}\n{printed.getvalue()}"  # 1: a fault is found
-    return re.sub(r"(?<=\"features\": )\[[^]]*\]", "[...]", printed.getvalue().replace(f"{Path.cwd()}/", ""))
+    # 1: a fault is found
+    assert status == 0 or (status == 1 and "--health" in words), f"{line}\n{printed.getvalue()}"
+    return re.sub(
+        r"(?<=\"features\": )\[[^]]*\]", "[...]", printed.getvalue().replace(f"{Path.cwd()}/", "")
+    )
 
 
 def make_recordings(file: Path) -> None:
     """Three objects of different textures, pressed ever deeper by two sensors, twelve times each."""
-    rng, rows = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    rows = []
     for thing in ("coin", "cup", "key"):
         texture = rng.uniform(-1, 1, (8, 8))
         for number in range(12):
-            place, split = rng.uniform(-1, 1, 2), "train" if number < 7 else "val" if number < 9 else "test"
+            place = rng.uniform(-1, 1, 2)
+            split = "train" if number < 7 else "val" if number < 9 else "test"
             for sensor in ("digit", "gelsight"):
                 for frame in range(4):
-                    pixels = picture(texture, place, 2 + 2 * frame, tint(("digit", "gelsight"), sensor), 32)
+                    pixels = picture(
+                        texture, place, 2 + 2 * frame, tint(("digit", "gelsight"), sensor), 32
+                    )
                     path = f"{thing}{number}_{sensor}_{frame}.png"
                     cv2.imwrite(path, pixels + rng.integers(0, 5, pixels.shape, np.uint8))
                     name = f"{thing} {number}"
-                    rows.append((path, sensor, f"{name} {sensor}", frame, split, name, thing, f"{sensor}.png"))
-    names = ("path", "sensor", "sequence", "frame_index", "split", "touch", "object", "background_path")
+                    rows.append(
+                        (
+                            path,
+                            sensor,
+                            f"{name} {sensor}",
+                            frame,
+                            split,
+                            name,
+                            thing,
+                            f"{sensor}.png",
+                        )
+                    )
+    names = (
+        "path",
+        "sensor",
+        "sequence",
+        "frame_index",
+        "split",
+        "touch",
+        "object",
+        "background_path",
+    )
     columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
     manifests.write(manifests.from_columns(columns, file), file)
 
@@ -114,30 +158,40 @@ def make_recordings(file: Path) -> None:
 def make_units(folder: Path) -> None:
     """Two DIGIT, pressed at changing places: the right one upright, the left one upside down."""
     folder.mkdir()
-    rng, rows = np.random.default_rng(0), []
-    (y, x), looks = np.mgrid[:160, :120], bases(SENSORS["digit"])
+    rng = np.random.default_rng(0)
+    rows = []
+    (y, x) = np.mgrid[:160, :120]
+    looks = bases(SENSORS["digit"])
     for unit, look in (("left", looks[0]), ("right", looks[1])):
         gel = cv2.resize(255 * look[..., ::-1], (120, 160))  # OpenCV writes BGR
         for recording in range(9):
             cy, cx = rng.uniform((30, 30), (130, 90))
             dent = np.exp(-((y - cy) ** 2 + (x - cx) ** 2) / 160)[..., None] * (60, -40, 30)
             for frame in range(6):
-                pixels = np.clip(gel + frame / 5 * dent + rng.normal(0, 1.5, gel.shape), 0, 255).astype(np.uint8)
+                pixels = np.clip(
+                    gel + frame / 5 * dent + rng.normal(0, 1.5, gel.shape), 0, 255
+                ).astype(np.uint8)
                 file = f"{unit}_{recording}_{frame}.png"
                 cv2.imwrite(str(folder / file), pixels[::-1, ::-1] if unit == "left" else pixels)
-                rows.append((file, "digit", f"{unit} {recording}", frame, "train", unit, f"{unit}.png"))
+                rows.append(
+                    (file, "digit", f"{unit} {recording}", frame, "train", unit, f"{unit}.png")
+                )
         pixels = np.clip(gel, 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / f"{unit}.png"), pixels[::-1, ::-1] if unit == "left" else pixels)
     names = ("path", "sensor", "sequence", "frame_index", "split", "unit", "background_path")
     columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
-    manifests.write(manifests.from_columns(columns, folder / "manifest.parquet"), folder / "manifest.parquet")
+    manifests.write(
+        manifests.from_columns(columns, folder / "manifest.parquet"), folder / "manifest.parquet"
+    )
 
 
 class Camera:
     """A camera that sees the frames of some touches. Then the program is stopped."""
 
     def __init__(self) -> None:
-        self.frames = [cv2.imread(f"cup{touch}_digit_{frame}.png") for touch in range(10) for frame in range(4)]
+        self.frames = [
+            cv2.imread(f"cup{touch}_digit_{frame}.png") for touch in range(10) for frame in range(4)
+        ]
         self.count = 0
 
     def grab(self) -> bool:
@@ -167,25 +221,44 @@ def optimised() -> Any:
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the files that the pages name."""
-    folder, rng = tmp_path_factory.mktemp("base"), np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("base")
+    rng = np.random.default_rng(0)
     with contextlib.chdir(folder):
-        make_touches(folder, touches={"train": 12, "val": 10, "test": 51}, sensors=("digit", "gelsight"), frames=4)
+        make_touches(
+            folder,
+            touches={"train": 12, "val": 10, "test": 51},
+            sensors=("digit", "gelsight"),
+            frames=4,
+        )
         columns: dict[str, Any] = manifests.read("manifest.parquet").table.to_pydict()
         count = len(columns["path"])
-        columns["label.material"] = [("steel", "wool")[one == "hard"] for one in columns["label.hardness"]]
-        columns["label.roughness"] = columns["label.slip"] = [float(one > 3) for one in columns["label.force"]]
+        columns["label.material"] = [
+            ("steel", "wool")[one == "hard"] for one in columns["label.hardness"]
+        ]
+        columns["label.roughness"] = columns["label.slip"] = [
+            float(one > 3) for one in columns["label.force"]
+        ]
         columns["license"] = ["MIT"] * count
         for name in ("manifest.parquet", "manifest.csv", "mine.parquet"):
             manifests.write(manifests.from_columns(columns, Path(name)), Path(name))
         make_recordings(Path("recordings.parquet"))
         columns["sensor"] = ["my_gel" if one == "digit" else one for one in columns["sensor"]]
         manifests.write(manifests.from_columns(columns, Path("mine.csv")), Path("mine.csv"))
-        tac = {name: values[:8] for name, values in columns.items() if name not in ("text", "object")}
-        tac |= {"sensor": ["gelsight"] * 8, "image_path": ["photo.png"] * 8, "dataset": ["tacquad"] * 8}
-        manifests.write(manifests.from_columns(tac, Path("tacquad.parquet")), Path("tacquad.parquet"))
+        tac = {
+            name: values[:8] for name, values in columns.items() if name not in ("text", "object")
+        }
+        tac |= {
+            "sensor": ["gelsight"] * 8,
+            "image_path": ["photo.png"] * 8,
+            "dataset": ["tacquad"] * 8,
+        }
+        manifests.write(
+            manifests.from_columns(tac, Path("tacquad.parquet")), Path("tacquad.parquet")
+        )
         for place in (f"mine/{thing}/pour_{i}" for thing in ("mug", "sponge") for i in (1, 2, 3)):
             Path(place).mkdir(parents=True)
-            for i in range(4):  # no two pictures are equal
+            # no two pictures are equal
+            for i in range(4):
                 pixels = press(20 * i % 120) // 2 + rng.integers(0, 9, (48, 48, 3), np.uint8)
                 cv2.imwrite(f"{place}/{i:03d}.png", pixels)
         for parent in "classes/a", "classes/b", "data/train/a", "data/valid/a", "data/Test_Set/b":
@@ -199,7 +272,9 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for i in range(24):
                 shutil.copy(f"cup{i // 4}_{sensor}_{i % 4}.png", f"{folder_of}/{i:03d}.png")
         shutil.copy("digit.png", "gel.png")
-        film = cv2.VideoWriter("press.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 25, cv2.imread("gel.png").shape[1::-1])
+        film = cv2.VideoWriter(
+            "press.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 25, cv2.imread("gel.png").shape[1::-1]
+        )
         for i in range(4):
             film.write(cv2.imread(f"cup0_digit_{i}.png"))
         film.release()
@@ -226,7 +301,9 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run("anytouch train --stage 1 --data manifest.parquet --run runs/stage1")
         run("anytouch train --stage 2 --data manifest.parquet --run runs/stage2 --init runs/stage1")
         run("anytouch embed --data manifest.parquet --out mine.npz")
-        run("anytouch probe label --data recordings.parquet --label object --save recordings/head.npz")
+        run(
+            "anytouch probe label --data recordings.parquet --label object --save recordings/head.npz"
+        )
     return folder
 
 
@@ -243,8 +320,11 @@ def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.setattr(dataset, "Recorder", BlankRecorder)
     monkeypatch.setattr(streams, "open_source", lambda *_: (Camera(), True))
-    monkeypatch.setattr(streams, "Mailbox", lambda replace: Mailbox(replace=False))  # the encoder keeps up
-    test_corpora.write_corpus(tmp_path / "far", "gelslam", "train", [{"capture": "a", "frame_idx": 0, "value": 1}])
+    # the encoder keeps up
+    monkeypatch.setattr(streams, "Mailbox", lambda replace: Mailbox(replace=False))
+    test_corpora.write_corpus(
+        tmp_path / "far", "gelslam", "train", [{"capture": "a", "frame_idx": 0, "value": 1}]
+    )
     for number in range(4):
         samples = {f"{number}-{i}": (i, {"contact": i}) for i in range(4)}
         test_corpora.write_tar(tmp_path / "tars" / "train" / f"{number}.tar", samples)
@@ -265,10 +345,12 @@ def line_of(text: str) -> str:
 
 def is_equal(shown: str, printed: str) -> bool:
     """Whether two lines agree. A number with decimals may differ by one in its last shown digit."""
-    a, b = line_of(shown), line_of(printed)
+    a = line_of(shown)
+    b = line_of(printed)
     pairs = [*zip(NUMBER.findall(a), NUMBER.findall(b), strict=False)]
     return NUMBER.sub("0", a) == NUMBER.sub("0", b) and all(
-        x == y or ("." in x and abs(float(x) - float(y)) < 1.01 * 10.0 ** -len(x.partition(".")[2])) for x, y in pairs
+        x == y or ("." in x and abs(float(x) - float(y)) < 1.01 * 10.0 ** -len(x.partition(".")[2]))
+        for x, y in pairs
     )
 
 
@@ -279,7 +361,9 @@ def missing(block: str, printed: str) -> list[str]:
     """
     if all(Path(line).is_file() for line in block.splitlines()):
         return []
-    lines, start, lost = printed.splitlines(), 0, list[str]()
+    lines = printed.splitlines()
+    start = 0
+    lost = list[str]()
     for part in re.split(r"^\.\.\.\n", block, flags=re.MULTILINE):
         wanted = part.splitlines()
         ends = [
@@ -299,7 +383,10 @@ def measured(block: str, printed: str) -> str:
     def form(line: str) -> str:
         return NUMBER.sub("0", line_of(line))
 
-    pairs = [(line, next((one for one in lines if form(one) == form(line)), line)) for line in block.splitlines()]
+    pairs = [
+        (line, next((one for one in lines if form(one) == form(line)), line))
+        for line in block.splitlines()
+    ]
     return "".join(f"{line if is_equal(line, one) else one}\n" for line, one in pairs)
 
 
@@ -308,7 +395,9 @@ NAMES = [name for name, text in PAGES.items() if PART.search(text)]
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_page_runs_and_prints_what_it_shows(name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_runs_and_prints_what_it_shows(
+    name: str, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With WRITE_PAGES=1 the numbers of the page become those that are printed."""
     if "health" in name:
         shutil.copytree("units", ".", dirs_exist_ok=True)
@@ -318,10 +407,19 @@ def test_a_page_runs_and_prints_what_it_shows(name: str, place: Path, monkeypatc
         Path("config.json").write_text('{"num_attention_heads": 3}')
     if "equations" in name:  # the same step on a network that compiles fast
         monkeypatch.setattr("anytouch_jax.config.preset", lambda *_, **__: tiny_config(1))
-    names: dict[str, Any] = {"rows": np.zeros(2, np.int32), "manifest": manifests.read("manifest.parquet")}
+    names: dict[str, Any] = {
+        "rows": np.zeros(2, np.int32),
+        "manifest": manifests.read("manifest.parquet"),
+    }
     names["clips"] = np.zeros((2, 4, 28, 28, 3), np.uint8)
-    names["frames"] = np.zeros((2, 3, 112, 112, 3) if "export" in name else (2, 112, 112, 3), np.uint8)
-    text, earlier, printed, problems, is_shown = PAGES[name], "", "", [], False
+    names["frames"] = np.zeros(
+        (2, 3, 112, 112, 3) if "export" in name else (2, 112, 112, 3), np.uint8
+    )
+    text = PAGES[name]
+    earlier = ""
+    printed = ""
+    problems = []
+    is_shown = False
     for match in PART.finditer(PAGES[name]):
         kind, block, *lines = match.groups()
         if kind == "text":
@@ -332,14 +430,18 @@ def test_a_page_runs_and_prints_what_it_shows(name: str, place: Path, monkeypatc
             is_shown = True
             continue
         if is_shown:  # blocks show what was printed since the blocks before
-            earlier, printed, is_shown = earlier + printed, "", False
+            earlier = earlier + printed
+            printed = ""
+            is_shown = False
         if kind == "python":
             if "encoder." in block and "encoder =" not in block:
                 names["encoder"] = at.load_encoder("anytouch-tiny")
             with contextlib.redirect_stdout(out := io.StringIO()):
                 exec(block, names)
             printed += out.getvalue()
-        elif not any(size in (line := next(filter(None, lines), "")) for size in ELSEWHERE) and line:
+        elif (
+            not any(size in (line := next(filter(None, lines), "")) for size in ELSEWHERE) and line
+        ):
             if "--run" in line:
                 shutil.rmtree(re.search(r"--run (\S+)", line)[1], ignore_errors=True)
             printed += run(line)
@@ -353,5 +455,12 @@ def test_scripts_and_modules_of_the_pages_are_there() -> None:
     """They have tests of their own."""
     text = "\n".join(PAGES.values())
     scripts = re.findall(r"python (integrations/\S+\.py)", text)
-    modules = [f"{one.replace('.', '/')}.py" for one in re.findall(r"python -m ((?:experiments|tests)\.[\w.]+)", text)]
-    assert len(scripts) > 1 and len(modules) > 2 and all((ROOT / file).is_file() for file in (*scripts, *modules))
+    modules = [
+        f"{one.replace('.', '/')}.py"
+        for one in re.findall(r"python -m ((?:experiments|tests)\.[\w.]+)", text)
+    ]
+    assert (
+        len(scripts) > 1
+        and len(modules) > 2
+        and all((ROOT / file).is_file() for file in (*scripts, *modules))
+    )

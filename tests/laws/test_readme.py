@@ -12,8 +12,14 @@ from anytouch_jax.config import preset
 from anytouch_jax.nn.functional import build
 
 MAKEFILE = (ROOT / "Makefile").read_text()
-FILES = ["README.md", *(file.relative_to(ROOT).as_posix() for file in sorted((ROOT / "docs").rglob("*.md")))]
-MADE = tuple(f"docs/{name}" for name in ("results/", "tutorials/", "reference/", "contributing.md", "changelog.md"))
+FILES = [
+    "README.md",
+    *(file.relative_to(ROOT).as_posix() for file in sorted((ROOT / "docs").rglob("*.md"))),
+]
+MADE = tuple(
+    f"docs/{name}"
+    for name in ("results/", "tutorials/", "reference/", "contributing.md", "changelog.md")
+)
 PAGES = {name: (ROOT / name).read_text() for name in FILES if not name.startswith(MADE)}
 TEXT = "\n".join(PAGES.values())
 
@@ -22,7 +28,9 @@ def typed(program: str) -> list[str]:
     """What these pages show to be typed after `program`: lines of code and table cells, without comments."""
     lines = re.findall(rf"^ {{4}}{program} (.*)$", TEXT, re.MULTILINE)
     cells = re.findall(rf"^\|.*?`{program} ([^`]*)`", TEXT, re.MULTILINE)
-    return [re.split(r"\s+#|\s\|", line)[0].replace(" ...", "").strip() for line in (*lines, *cells)]
+    return [
+        re.split(r"\s+#|\s\|", line)[0].replace(" ...", "").strip() for line in (*lines, *cells)
+    ]
 
 
 @pytest.mark.parametrize("line", typed("anytouch"))
@@ -52,8 +60,12 @@ def test_a_target_of_the_readme_is_there_and_heeds_its_variables(line: str) -> N
 @pytest.mark.parametrize("name", ["tiny", "small", "base", "large"])
 def test_the_table_of_presets_has_their_sizes(name: str) -> None:
     model = preset(name).model
-    count = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(build(model).abstract()["touch"]))
-    row = f"| {model.image_size} | {model.touch.width} x {model.touch.depth} | {count / 1e6:.1f} M |"
+    count = sum(
+        int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(build(model).abstract()["touch"])
+    )
+    row = (
+        f"| {model.image_size} | {model.touch.width} x {model.touch.depth} | {count / 1e6:.1f} M |"
+    )
     assert re.search(rf"^\| `{name}`[^|]* {re.escape(row)}$", TEXT, re.MULTILINE), row
 
 
@@ -67,7 +79,9 @@ def test_links_lead_somewhere(name: str) -> None:
         result = (ROOT / name).parent / file if file else ROOT / name
         assert result.is_file(), target
         titles = re.findall(r"^#+ (.*)$", result.read_text(), re.MULTILINE) if heading else []
-        assert not heading or heading in [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
+        assert not heading or heading in [
+            re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles
+        ]
 
 
 STOP = re.compile(r"^\*\*(\d)\. `([\w/]+\.py)`\*\*(.*)$", re.MULTILINE)
@@ -80,7 +94,9 @@ def test_the_stops_exist_in_order_and_hold_what_the_page_names(page: str, count:
     assert [int(number) for number, _, _ in stops] == list(range(1, count + 1))
     for _, name, text in stops:
         tree = ast.parse((ROOT / "src" / "anytouch_jax" / name).read_text())
-        defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        defined = {
+            node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)
+        }
         named = {word.rpartition(".")[2] for word in re.findall(r"`(\w+\.?\w+)`", text)}
         assert named - ELSEWHERE <= defined, (name, named - ELSEWHERE - defined)
         assert named & defined, name

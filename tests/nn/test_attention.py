@@ -61,7 +61,9 @@ def test_equal_keys_average_the_values_and_nan_stays_in_its_sample():
     q, k, v, _ = draw((3, 5, 2, 4))
     run = jax.jit(mapped)
     out = run(q, np.broadcast_to(k[:, :1], k.shape), v)
-    np.testing.assert_allclose(out, np.broadcast_to(v.mean(1, keepdims=True), v.shape), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        out, np.broadcast_to(v.mean(1, keepdims=True), v.shape), rtol=1e-5, atol=1e-6
+    )
     q[1, 0] = np.nan
     out = np.asarray(run(q, k, v))
     assert np.isnan(out[1, 0]).all() and np.isfinite(out[0]).all() and np.isfinite(out[2]).all()
@@ -79,8 +81,16 @@ def test_a_masked_or_causal_call_takes_the_plain_form(monkeypatch):
     monkeypatch.setattr(module, "mapped", lambda *_: pytest.fail("mapped knows no mask"))
     q, k, v, _ = draw((2, 5, 2, 4))
     run = jax.jit(attention, static_argnames=("implementation", "causal"))
-    out = run(q, k, v, implementation="mapped", mask=np.asarray([[True] * 5, [True, True, False, False, False]]))
-    np.testing.assert_allclose(out[1], jax.jit(plain)(q[1:], k[1:, :2], v[1:, :2])[0], rtol=1e-5, atol=1e-6)
+    out = run(
+        q,
+        k,
+        v,
+        implementation="mapped",
+        mask=np.asarray([[True] * 5, [True, True, False, False, False]]),
+    )
+    np.testing.assert_allclose(
+        out[1], jax.jit(plain)(q[1:], k[1:, :2], v[1:, :2])[0], rtol=1e-5, atol=1e-6
+    )
     causal = run(q, k, v, implementation="auto", causal=True)
     np.testing.assert_allclose(causal[:, 0], v[:, 0], rtol=1e-6)
 
@@ -108,8 +118,11 @@ def test_auto_maps_on_one_cpu_and_nowhere_else(monkeypatch):
 def test_cudnn_does_what_it_can_and_xla_the_rest(monkeypatch, dtype, length, masked, asked):
     reported = []
     monkeypatch.setattr(
-        jax.nn, "dot_product_attention", lambda q, *_, implementation, **__: reported.append(implementation) or q
+        jax.nn,
+        "dot_product_attention",
+        lambda q, *_, implementation, **__: reported.append(implementation) or q,
     )
-    q, mask = np.zeros((1, length, 2, 4), dtype), np.ones((1, length), bool) if masked else None
+    q = np.zeros((1, length, 2, 4), dtype)
+    mask = np.ones((1, length), bool) if masked else None
     jax.eval_shape(lambda q: attention(q, q, q, implementation="cudnn", mask=mask), q)
     assert reported == [asked]

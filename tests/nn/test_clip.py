@@ -30,7 +30,8 @@ def test_text_is_causal():
     def state(embedded):
         params = PARAMS | {"text": PARAMS["text"] | {"position": embedded}}
         hidden = NET.bind(params).text.hidden(IDS)[0, 3]
-        return hidden @ np.arange(1.0, len(hidden) + 1)  # the plain sum of what a norm gives is always 0
+        # the plain sum of what a norm gives is always 0
+        return hidden @ np.arange(1.0, len(hidden) + 1)
 
     grad = np.asarray(jax.jit(jax.grad(state))(PARAMS["text"]["position"]))
     assert not grad[4:].any() and (np.abs(grad[:4]).max(axis=1) > 0).all()
@@ -39,7 +40,8 @@ def test_text_is_causal():
 def test_padding_behind_the_end_token_changes_nothing():
     mask = np.asarray([[1, 1, 1, 1, 0, 0, 0, 0], [1] * 8], bool)
     other = changed(IDS, (0, slice(4, None)), 3)
-    a, b = NET.encode_text(PARAMS, IDS, mask), NET.encode_text(PARAMS, other, mask)
+    a = NET.encode_text(PARAMS, IDS, mask)
+    b = NET.encode_text(PARAMS, other, mask)
     np.testing.assert_allclose(a, b, atol=1e-6)
     np.testing.assert_allclose(a, NET.encode_text(PARAMS, IDS), atol=1e-6)
 
@@ -54,7 +56,9 @@ def test_the_pooled_token_is_the_largest_id_or_the_end_token_named():
     hidden, pooled = map(np.asarray, read(IDS))
     np.testing.assert_allclose(pooled, hidden[[0, 1], [3, 6]], rtol=1e-5, atol=1e-6)
     named = compiled(replace(NET.net.model, text=replace(NET.net.model.text, end_token=8)))
-    pooled = jax.jit(lambda ids: named.bind(PARAMS).text.pooled(ids))(ids := changed(IDS, (0, 1), 8))
+    pooled = jax.jit(lambda ids: named.bind(PARAMS).text.pooled(ids))(
+        ids := changed(IDS, (0, 1), 8)
+    )
     np.testing.assert_allclose(pooled[0], read(ids)[0][0, 1], rtol=1e-5, atol=1e-6)
 
 
@@ -68,7 +72,9 @@ def test_lora_starts_as_no_change_and_is_added_to_the_kernels():
 
     params["lora"]["value"]["b"] = np.ones_like(params["lora"]["value"]["b"])
     merged = jax.jit(merge_lora, static_argnums=1)(params, 6.0)
-    kernel, old = (tree["image"]["blocks"]["attention"]["value"]["kernel"] for tree in (merged, params))
+    kernel, old = (
+        tree["image"]["blocks"]["attention"]["value"]["kernel"] for tree in (merged, params)
+    )
     change = 3.0 * params["lora"]["value"]["a"].sum(axis=-1, keepdims=True) * np.ones((1, 1, 16))
     np.testing.assert_allclose(np.asarray(kernel) - old, change, rtol=1e-4, atol=1e-6)
     after = np.asarray(net.encode_image(params, image))

@@ -13,7 +13,8 @@ from anytouch_jax.nn.fields import convolved
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.layers import gelu, read_blocks, run_blocks, stacked_blocks, stored
 
-CLIP, ROWS = np.random.default_rng(2).standard_normal((2, 1, 28, 28, 3)).astype("f4"), np.asarray([0, 1], np.int32)
+CLIP = np.random.default_rng(2).standard_normal((2, 1, 28, 28, 3)).astype("f4")
+ROWS = np.asarray([0, 1], np.int32)
 X = np.linspace(-6, 6, 241, dtype="f4")
 
 
@@ -38,14 +39,18 @@ def reference_block(x, p, heads, eps):
     """A pre-norm block in plain numpy."""
 
     def norm(x, p):
-        return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + eps) * p["scale"] + p["bias"]
+        return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + eps) * p[
+            "scale"
+        ] + p["bias"]
 
     def dense(x, p):
         return x @ p["kernel"] + p["bias"]
 
     y = norm(x, p["norm1"])
     b, s, d = y.shape
-    q, k, v = (dense(y, p["attention"][n]).reshape(b, s, heads, -1) for n in ("query", "key", "value"))
+    q, k, v = (
+        dense(y, p["attention"][n]).reshape(b, s, heads, -1) for n in ("query", "key", "value")
+    )
     logits = np.einsum("bqhd,bkhd->bhqk", q, k) / np.sqrt(d // heads)
     weights = np.exp(logits - logits.max(-1, keepdims=True))
     weights /= weights.sum(-1, keepdims=True)
@@ -55,11 +60,16 @@ def reference_block(x, p, heads, eps):
 
 def test_the_stack_equals_a_loop_over_plain_blocks():
     net = compiled(touch_model())
-    start, last = jax.jit(lambda p: ((t := net.bind(p).touch).tokens(CLIP, ROWS), t.hidden(CLIP, ROWS)))(net.params)
-    x, blocks = np.asarray(start, np.float64), jax.device_get(net.params["touch"]["blocks"])
+    start, last = jax.jit(
+        lambda p: ((t := net.bind(p).touch).tokens(CLIP, ROWS), t.hidden(CLIP, ROWS))
+    )(net.params)
+    x = np.asarray(start, np.float64)
+    blocks = jax.device_get(net.params["touch"]["blocks"])
     x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + net.net.model.norm_eps)
     for layer in range(STACK.depth):
-        x = reference_block(x, jax.tree.map(lambda p, i=layer: p[i].astype(np.float64), blocks), 2, 1e-5)
+        x = reference_block(
+            x, jax.tree.map(lambda p, i=layer: p[i].astype(np.float64), blocks), 2, 1e-5
+        )
     np.testing.assert_allclose(last, x, atol=2e-5)
 
 
@@ -67,10 +77,13 @@ def test_the_stack_equals_a_loop_over_plain_blocks():
 @pytest.mark.parametrize("depth", [1, 3])
 def test_what_is_read_alone_is_what_the_whole_stack_gives_there(depth, remat):
     """Values and gradients."""
-    model, stack = touch_model(), replace(STACK, depth=depth)
+    model = touch_model()
+    stack = replace(STACK, depth=depth)
     blocks = stacked_blocks(stack, model, 1e-5, gelu)
     for number, (_, p) in enumerate(nnx.to_flat_state(nnx.state(blocks))):
-        p[...] = jax.device_put(0.3 * np.random.default_rng(number).standard_normal(p.shape).astype("f4"))
+        p[...] = jax.device_put(
+            0.3 * np.random.default_rng(number).standard_normal(p.shape).astype("f4")
+        )
     x = np.random.default_rng(99).standard_normal((3, 7, STACK.width)).astype("f4")
 
     def whole(blocks, x):
@@ -99,7 +112,10 @@ def test_the_last_block_works_for_the_token_that_is_read():
         net = build(replace(model, touch=replace(STACK, depth=depth)))
         return jax.jit(lambda p: read(net.bind(p))).lower(net.abstract()), net.abstract()
 
-    methods = (lambda module: module.encode_touch(*args)), (lambda module: module.touch.hidden(*args))
+    methods = (
+        (lambda module: module.encode_touch(*args)),
+        (lambda module: module.touch.hidden(*args)),
+    )
 
     read, whole = (program(1, method)[0].cost_analysis()["flops"] for method in methods)
     tokens = 70
@@ -135,7 +151,8 @@ def test_rematerialised_stacks_give_the_same_gradient_from_work_done_again(metho
         "encode_image": (CLIP[:, 0],),
         "encode_text": (ids.reshape(2, 8), np.ones((2, 8), bool)),
     }[method]
-    params, result = compiled(full_model()).params, []
+    params = compiled(full_model()).params
+    result = []
     for remat in (False, True):
         net = build(full_model(remat=remat))
         first = lambda params, net=net: jnp.mean(getattr(net, method)(params, *args) ** 2)  # noqa: E731
@@ -143,7 +160,8 @@ def test_rematerialised_stacks_give_the_same_gradient_from_work_done_again(metho
         again = re.findall(r"\b(?:remat2?|checkpoint)\[", str(traced.jaxpr))
         result.append((jax.device_get(traced.lower().compile()(params)), len(again)))
     (plain, few), (remat, many) = result
-    assert many - few >= 2 * (2 if method == "reconstruct" else 1)  # of each stack, of encoder and decoder
+    # of each stack, of encoder and decoder
+    assert many - few >= 2 * (2 if method == "reconstruct" else 1)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), remat, plain)
     assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(plain)) > 0.01
 

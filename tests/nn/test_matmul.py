@@ -12,13 +12,18 @@ from tiny_models import touch_model
 from anytouch_jax.config import Stack
 from anytouch_jax.nn.layers import Block, gelu, product, stored
 
-SHAPES = [(24, 12, 20), (24, 20, 12), (9, 8, 8)]  # rows, inputs, outputs: wider, narrower, as wide
+# rows, inputs, outputs: wider, narrower, as wide
+SHAPES = [(24, 12, 20), (24, 20, 12), (9, 8, 8)]
 NOTHING = (0, 12, 20)
 
 
 def draw(shape):
-    (rows, inputs, outputs), rng = shape, np.random.default_rng(3)
-    return tuple(rng.standard_normal(s).astype("f4") for s in ((rows, inputs), (inputs, outputs), (rows, outputs)))
+    (rows, inputs, outputs) = shape
+    rng = np.random.default_rng(3)
+    return tuple(
+        rng.standard_normal(s).astype("f4")
+        for s in ((rows, inputs), (inputs, outputs), (rows, outputs))
+    )
 
 
 @functools.partial(jax.jit, static_argnums=3)
@@ -46,7 +51,9 @@ def test_a_product_and_its_gradients_are_those_of_the_rounded_operands(shape):
 def test_other_types_are_computed_as_they_are(dtype):
     with jax.enable_x64(dtype == "float64"):
         x, kernel, g = (part.astype(dtype) for part in draw(SHAPES[0]))
-        for ours, wanted in zip(both(x, kernel, g, dtype), (x @ kernel, g @ kernel.T, x.T @ g), strict=True):
+        for ours, wanted in zip(
+            both(x, kernel, g, dtype), (x @ kernel, g @ kernel.T, x.T @ g), strict=True
+        ):
             assert ours.dtype == dtype == stored(dtype)
             np.testing.assert_allclose(ours, wanted, rtol=1e-6, atol=1e-6)
 
@@ -81,13 +88,28 @@ def test_an_accelerator_stores_16_bits_between_products(monkeypatch):
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_block_keeps_its_products_alone_for_the_backward_pass(dtype, capsys):
-    width, hidden, b, s = 12, 20, 2, 7
+    width = 12
+    hidden = 20
+    b = 2
+    s = 7
     model = touch_model(touch=Stack(width, 1, 2, hidden), dtype=dtype)
     graph, state = nnx.split(Block(model.touch, model, 1e-5, gelu))
     jax.ad_checkpoint.print_saved_residuals(
         lambda p, x: nnx.merge(graph, p)(x).sum(), state, np.ones((b, s, width), "f4")
     )
-    kept = [line.split(" ")[0] for line in capsys.readouterr().out.splitlines() if " from the argument" not in line]
-    wide = [shape for shape in kept if shape in (f"f32[{b},{s},{hidden}]", f"f32[{b * s},{hidden}]")]
-    assert len(wide) == 1  # what goes into the activation, not what comes out of it
-    assert len([shape for shape in kept if shape in (f"f32[{b},{s},{width}]", f"f32[{b * s},{width}]")]) == 1
+    kept = [
+        line.split(" ")[0]
+        for line in capsys.readouterr().out.splitlines()
+        if " from the argument" not in line
+    ]
+    wide = [
+        shape for shape in kept if shape in (f"f32[{b},{s},{hidden}]", f"f32[{b * s},{hidden}]")
+    ]
+    # what goes into the activation, not what comes out of it
+    assert len(wide) == 1
+    assert (
+        len(
+            [shape for shape in kept if shape in (f"f32[{b},{s},{width}]", f"f32[{b * s},{width}]")]
+        )
+        == 1
+    )

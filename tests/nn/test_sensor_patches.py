@@ -12,7 +12,8 @@ from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten
 
 RNG = np.random.default_rng(0)
-SHARED, OWN = touch_model(), touch_model(patch_encoder="sensor")
+SHARED = touch_model()
+OWN = touch_model(patch_encoder="sensor")
 CLIP = RNG.standard_normal((3, 3, 28, 28, 3)).astype("f4")
 
 
@@ -26,7 +27,11 @@ def encode(model, params, clip, sensor):
 
 def test_a_batch_of_one_sensor_trains_its_own_patch_encoder_alone():
     params = parameters(OWN)
-    loss = jax.jit(jax.grad(lambda p, clip, sensor: (compiled(OWN).net.encode_touch(p, clip, sensor) ** 2).sum()))
+    loss = jax.jit(
+        jax.grad(
+            lambda p, clip, sensor: (compiled(OWN).net.encode_touch(p, clip, sensor) ** 2).sum()
+        )
+    )
     for clip in (CLIP, CLIP[:, :1]):
         for sensor, used in (([3, 3, 3], [3]), ([0, 9, 0], [0, 9])):
             grad = loss(params, clip, np.asarray(sensor, np.int32))["touch"]["patch"]["kernel"]
@@ -48,7 +53,8 @@ def test_sensors_differ_by_their_patch_encoders_without_tokens():
     z = encode(model, parameters(model), np.repeat(CLIP[:1], 3, axis=0), [0, 3, 3])
     assert np.abs(z[0] - z[1]).max() > 1e-3
     np.testing.assert_allclose(z[1], z[2], atol=1e-6)
-    model = replace(SHARED, sensor_tokens=0)  # neither: nothing tells them apart
+    # neither: nothing tells them apart
+    model = replace(SHARED, sensor_tokens=0)
     z = encode(model, parameters(model), np.repeat(CLIP[:1], 3, axis=0), [0, 3, 3])
     np.testing.assert_allclose(z[0], z[1], atol=1e-6)
 
@@ -60,7 +66,9 @@ def test_a_row_outside_the_table_is_nan_not_the_last_sensor():
         assert np.isnan(z[1]).all() and np.isfinite(z[[0, 2]]).all()
 
 
-@pytest.mark.parametrize("model", [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)])
+@pytest.mark.parametrize(
+    "model", [OWN, replace(OWN, sensor_tokens=0), full_model(image=None), full_model(text=None)]
+)
 def test_the_shapes_written_down_are_those_of_the_network(model):
     wanted = {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
     assert {name: tuple(shape) for name, shape in param_shapes(model).items()} == wanted

@@ -6,7 +6,8 @@ from anytouch_jax.ops import tokens
 from anytouch_jax.ops.tokens import count_visible
 
 patchify, segments, sincos_table = (
-    jax.jit(f, static_argnums=n) for f, n in ((tokens.patchify, 1), (tokens.segments, 1), (tokens.sincos_table, (0, 1)))
+    jax.jit(f, static_argnums=n)
+    for f, n in ((tokens.patchify, 1), (tokens.segments, 1), (tokens.sincos_table, (0, 1)))
 )
 unpatchify = jax.jit(tokens.unpatchify, static_argnums=(1, 2))
 
@@ -34,11 +35,15 @@ def test_sincos_table_class_row_is_zero_and_positions_differ():
     assert len(np.unique(table.round(5), axis=0)) == 17
     # Position (row 0, col 0): all sines 0, all cosines 1. First half of the channels: the column.
     np.testing.assert_allclose(table[1], np.tile(np.repeat([0.0, 1.0], 8), 2))
-    np.testing.assert_array_equal(table[1 + 1, 16:], table[1, 16:])  # one column on: the row half stays
-    np.testing.assert_array_equal(table[1 + 4, :16], table[1, :16])  # one row on: the column half stays
+    # one column on: the row half stays
+    np.testing.assert_array_equal(table[1 + 1, 16:], table[1, 16:])
+    # one row on: the column half stays
+    np.testing.assert_array_equal(table[1 + 4, :16], table[1, :16])
 
 
-@pytest.mark.parametrize(("total", "starts"), [(3, [0]), (6, [0, 3]), (7, [0, 3, 4]), (10, [0, 3, 6, 7])])
+@pytest.mark.parametrize(
+    ("total", "starts"), [(3, [0]), (6, [0, 3]), (7, [0, 3, 4]), (10, [0, 3, 6, 7])]
+)
 def test_segments_cover_every_frame_and_end_with_the_last(total, starts):
     cut = np.asarray(segments(np.arange(total).reshape(1, total, 1), 3))
     assert cut.shape == (1, len(starts), 3, 1)

@@ -38,7 +38,16 @@ from tests.parity.golden_files import (
     read_arrays,
     read_cases,
 )
-from tests.parity.losses import align, align_edge, dead_keys, encode, match, setup, stage1, table_rows
+from tests.parity.losses import (
+    align,
+    align_edge,
+    dead_keys,
+    encode,
+    match,
+    setup,
+    stage1,
+    table_rows,
+)
 from tests.support.adam_moments import moments
 
 Params = dict[str, Any]
@@ -50,7 +59,9 @@ def run(folder: Path) -> list[Row]:
     rows = [row for case in found for row in run_case(case)]
     others = {name for case in found for name in case.info.get("files", ())}
     paths = sorted(path for path in folder.glob("*.pth") if path.name not in others)
-    return rows + [row for path in paths for row in _tried(weights.checkpoint, Case(path.name, folder, {}))]
+    return rows + [
+        row for path in paths for row in _tried(weights.checkpoint, Case(path.name, folder, {}))
+    ]
 
 
 def run_case(case: Case) -> list[Row]:
@@ -71,7 +82,9 @@ def _tried(runner: Callable[[Case], None], case: Case) -> list[Row]:
         case.finish()
         if not case.rows:
             case.fail("-", "nothing was compared")
-    except Exception as error:  # a folder of another make: any array or key may be absent or of another shape
+    except (
+        Exception
+    ) as error:  # a folder of another make: any array or key may be absent or of another shape
         reason = (str(error).splitlines() or [""])[0]
         case.fail("-", f"not understood: {type(error).__name__}: {reason}")
     return case.rows
@@ -89,15 +102,20 @@ def _probe(case: Case) -> None:
         images = case.inputs("feel_images" if feel else "images")
         case.seen |= {"in/sensors", "in/feel_sensors"}
         flat = np.asarray(channel_last(images.reshape(-1, *images.shape[-3:])))
-        sensor = np.tile(sensor, len(flat) // len(sensor))  # the reference tiles ids batch-major (golden Q13)
+        # the reference tiles ids batch-major (golden Q13)
+        sensor = np.tile(sensor, len(flat) // len(sensor))
         if sub["pooling"] == "cls":
             out = encode(params, flat, sensor, net=net)
             case.compare(f"out/{name}/projected", out)
             head_input = out.reshape(len(images), -1)
         else:
             out = encode(params, flat, sensor, net=net, read=AnyTouch.encode_tokens)
-            case.compare(f"out/{name}/projected", out[:, : case.arrays[f"out/{name}/projected"].shape[1]])
-            if feel:  # the reference interleaves the two images' tokens by a plain reshape (golden Q13)
+            case.compare(
+                f"out/{name}/projected", out[:, : case.arrays[f"out/{name}/projected"].shape[1]]
+            )
+            if (
+                feel
+            ):  # the reference interleaves the two images' tokens by a plain reshape (golden Q13)
                 out = out.reshape(len(images), out.shape[1], -1)
                 head_input = jnp.mean(out[:, 1 + net.model.sensor_tokens :], axis=1)
             else:
@@ -128,13 +146,21 @@ def _probe_head(case: Case, name: str, head_input: jax.Array) -> None:
 def _optimizer(case: Case) -> None:
     """Five AdamW steps through `make_step`; an epoch is as many steps as make all recorded epochs whole numbers."""
     net, config, params = setup(case, 1)
-    args, epochs = case.info["args"], case.info["epoch_fraction"]
-    per_epoch = int(np.lcm.reduce([Fraction(t).limit_denominator(1000).denominator for t in epochs]))
+    args = case.info["args"]
+    epochs = case.info["epoch_fraction"]
+    per_epoch = int(
+        np.lcm.reduce([Fraction(t).limit_denominator(1000).denominator for t in epochs])
+    )
     optim = replace(
-        config.optim, learning_rate=args["lr"], min_rate=args["min_lr"], warmup=args["warmup_epochs"] * per_epoch,
-        beta1=case.info["optimizer"]["betas"][0], beta2=case.info["optimizer"]["betas"][1],
-        eps=case.info["optimizer"]["eps"], weight_decay=case.info["optimizer"]["weight_decay"],
-    )  # fmt: skip
+        config.optim,
+        learning_rate=args["lr"],
+        min_rate=args["min_lr"],
+        warmup=args["warmup_epochs"] * per_epoch,
+        beta1=case.info["optimizer"]["betas"][0],
+        beta2=case.info["optimizer"]["betas"][1],
+        eps=case.info["optimizer"]["eps"],
+        weight_decay=case.info["optimizer"]["weight_decay"],
+    )
     config = replace(config, optim=optim, run=replace(config.run, steps=args["epochs"] * per_epoch))
 
     def loss(p: Params, batch: Any, key: Any, progress: Any) -> Any:
@@ -143,8 +169,12 @@ def _optimizer(case: Case) -> None:
     def trained(batch: Any) -> Any:
         return objectives.trained_by(TouchBatch(*batch[:2]), config=config)
 
-    step = jax.jit(make_step(loss, optimizer(config), total_steps=config.run.steps, trained=trained))
-    state, values, rates = init_state(params, config), [], []
+    step = jax.jit(
+        make_step(loss, optimizer(config), total_steps=config.run.steps, trained=trained)
+    )
+    state = init_state(params, config)
+    values = []
+    rates = []
     for i, epoch in enumerate(epochs):
         state = state._replace(step=jax.device_put(np.int32(round(epoch * per_epoch))))
         state, metrics = step(state, _optimizer_batch(case, net, i), jax.random.key(0))
@@ -159,7 +189,12 @@ def _optimizer(case: Case) -> None:
 
 def _compare_schedule(case: Case) -> None:
     s = case.info["schedule"]
-    ends = {"peak": s["lr"], "floor": s["min_lr"], "warmup": s["warmup_epochs"], "total": s["epochs"]}
+    ends = {
+        "peak": s["lr"],
+        "floor": s["min_lr"],
+        "warmup": s["warmup_epochs"],
+        "total": s["epochs"],
+    }
     ours = jax.jit(partial(learning_rate, **ends, decay="cosine"))(np.asarray(s["epoch"]))
     case.seen |= {"schedule/epoch"}
     case.compare("schedule/lr", ours)
@@ -168,9 +203,14 @@ def _compare_schedule(case: Case) -> None:
 def _optimizer_batch(case: Case, net: Net, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Batch of step i: the still batch of case A or the clip batch of case B, with this case's noise."""
     kinds = case.info.get("data_type", 0)
-    source = "A_stage1_image" if (kinds[i] if isinstance(kinds, list) else kinds) == 0 else "B_stage1_video"
+    source = (
+        "A_stage1_image"
+        if (kinds[i] if isinstance(kinds, list) else kinds) == 0
+        else "B_stage1_video"
+    )
     arrays = read_arrays(case.folder / f"{source}.npz")
-    clip, sensor = channel_last(arrays["in/pixels"]), table_rows(arrays["in/sensor_type"], net)
+    clip = channel_last(arrays["in/pixels"])
+    sensor = table_rows(arrays["in/sensor_type"], net)
     return clip, sensor, case.inputs(f"noise_{i}")
 
 
@@ -228,18 +268,22 @@ def _text(module: Any, *text: Any) -> jax.Array:
 def _clip(case: Case) -> None:
     pixels = np.asarray(channel_last(case.inputs("pixel_values"), clip=False))
     masks = {
-        name: np.asarray(case.inputs(name).astype(bool)) for name in ("attention_mask", "attention_mask_with_hole")
+        name: np.asarray(case.inputs(name).astype(bool))
+        for name in ("attention_mask", "attention_mask_with_hole")
     }
     ids = {name: np.asarray(case.inputs(f"input_ids_{name}")) for name in ("pad_eot", "pad_zero")}
     texts = {
-        "pad_eot": (ids["pad_eot"], masks["attention_mask"]), "pad_zero": (ids["pad_zero"], masks["attention_mask"]),
-        "hole": (ids["pad_eot"], masks["attention_mask_with_hole"]), "nomask": (ids["pad_eot"], None),
-    }  # fmt: skip
+        "pad_eot": (ids["pad_eot"], masks["attention_mask"]),
+        "pad_zero": (ids["pad_zero"], masks["attention_mask"]),
+        "hole": (ids["pad_eot"], masks["attention_mask_with_hole"]),
+        "nomask": (ids["pad_eot"], None),
+    }
     for sub, clip in case.info["subcases"].items():
         info = {**case.info, "clip_config": {**case.info["clip_config"], **clip}}
         config = golden_config(info, stage=2)
         model = replace(config.model, lora_rank=0, match_head="none")
-        net, params = build(model), golden_params(case.folder, case.info["params_file"], model)
+        net = build(model)
+        params = golden_params(case.folder, case.info["params_file"], model)
         for name, (text, mask) in texts.items():
             for output, read in (
                 ("last_hidden_state", lambda module, *text: module.text.hidden(*text)),
@@ -260,12 +304,24 @@ def _clip(case: Case) -> None:
         if f"out/{sub}/logits_per_image" in case.arrays:
             z_image = losses.normalise(_tower(params, pixels, net=net, read=_image))
             z_text = losses.normalise(_tower(params, *texts["pad_eot"], net=net, read=_text))
-            case.compare(f"out/{sub}/logits_per_image", jnp.exp(params["logit_scale"]) * z_image @ z_text.T)
+            case.compare(
+                f"out/{sub}/logits_per_image", jnp.exp(params["logit_scale"]) * z_image @ z_text.T
+            )
 
 
 _RUNNERS: dict[str, Callable[[Case], None]] = {
-    r"[ABC]_": stage1, r"D_": align, r"E_": align_edge, r"F_": match, r"G_": _probe, r"H_": _optimizer,
-    r"I_": _positions, r"J_clip_params": weights.parameters, r"J_": _clip, r"K_weight_loading_map": weights.loading_map,
-    r"K_manifest": weights.manifest, r"stage[12]_params": weights.parameters,
-    r"preprocess_full_size": families.preprocess, r"manifest_full_size": families.full_size,
-}  # fmt: skip
+    r"[ABC]_": stage1,
+    r"D_": align,
+    r"E_": align_edge,
+    r"F_": match,
+    r"G_": _probe,
+    r"H_": _optimizer,
+    r"I_": _positions,
+    r"J_clip_params": weights.parameters,
+    r"J_": _clip,
+    r"K_weight_loading_map": weights.loading_map,
+    r"K_manifest": weights.manifest,
+    r"stage[12]_params": weights.parameters,
+    r"preprocess_full_size": families.preprocess,
+    r"manifest_full_size": families.full_size,
+}

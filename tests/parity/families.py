@@ -20,16 +20,25 @@ from anytouch_jax.weights.convert import check_arrays, file_shapes
 from tests.parity.golden_files import Case
 
 # Inside the encoder, or of heads and decoders that are no part of it.
-LEFT_OUT = re.compile(r"pooler/.*|out/.*/(embedded|block\d+|positions|pos_embed|attentive_pooled|logits|proj)")
+LEFT_OUT = re.compile(
+    r"pooler/.*|out/.*/(embedded|block\d+|positions|pos_embed|attentive_pooled|logits|proj)"
+)
 PIXEL = 1e-6  # of the largest value: the preparation is exact to rounding
 
 
 def compare(case: Case) -> None:
     """Compare every file of a case of a family with every output that is recorded for it."""
     case.seen |= {name for name in case.arrays if LEFT_OUT.fullmatch(name)}
-    for file in [name for name in case.info["files"] if not name.endswith(("config.json", "trunk.pth"))]:
-        for name in dict.fromkeys(key.split("/")[1] for key in case.arrays if key.startswith("out/")):
-            if case.info["family"] != "t3" or case.info["cases"][name]["encoder"] == Path(file).stem:
+    for file in [
+        name for name in case.info["files"] if not name.endswith(("config.json", "trunk.pth"))
+    ]:
+        for name in dict.fromkeys(
+            key.split("/")[1] for key in case.arrays if key.startswith("out/")
+        ):
+            if (
+                case.info["family"] != "t3"
+                or case.info["cases"][name]["encoder"] == Path(file).stem
+            ):
                 _case(case, file, name)
 
 
@@ -41,13 +50,19 @@ def _case(case: Case, file: str, name: str) -> None:
     encoder = load_encoder(path, heads=info["architecture"]["heads"], image_size=theirs.shape[-2:])
     assert isinstance(encoder, FamilyEncoder)
     if "mean" in info:
-        steps = replace(encoder.preparation, mean=tuple(info["mean"]), std=tuple(info["std"]), shorter=info["resize"])
+        steps = replace(
+            encoder.preparation,
+            mean=tuple(info["mean"]),
+            std=tuple(info["std"]),
+            shorter=info["resize"],
+        )
         encoder = replace(encoder, preparation=steps)
     if name == "small_scale":
         power = float(eval(re.search(r"2\^(-\d+)", about["rule"])[0].replace("^", "**")))  # type: ignore[index]
         encoder = replace(encoder, params=_scaled(encoder.params, power))
     if encoder.form.calibration:
-        images, gel = case.inputs("a/calibration_frames"), case.inputs("a/background")
+        images = case.inputs("a/calibration_frames")
+        gel = case.inputs("a/background")
         encoder = encoder.calibrated(list(images), gel)
         if name == "a":
             ours = encoder.calibration.transpose(0, 3, 1, 2).reshape(1, -1, *theirs.shape[-2:])
@@ -69,7 +84,9 @@ def _case(case: Case, file: str, name: str) -> None:
         sensor = np.full(len(clips), 7) if name == "small_scale" else sensor
     variants = [("", encoder)]
     if info["family"].startswith("dinov2"):
-        variants = [("facebook/", encoder)] if file.endswith(".pth") or encoder.form.registers else []
+        variants = (
+            [("facebook/", encoder)] if file.endswith(".pth") or encoder.form.registers else []
+        )
         if not file.endswith(".pth"):
             shifted = replace(encoder, form=replace(encoder.form, resample="shifted"))
             variants += [("", encoder), ("hf_4_42/", shifted)]
@@ -90,7 +107,9 @@ def _scaled(params: Any, power: float) -> Any:
 
     def scale(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
-        return leaf if "norm" in name and not name.startswith("pre_norm") else leaf * np.float32(power)
+        if "norm" in name and not name.startswith("pre_norm"):
+            return leaf
+        return leaf * np.float32(power)
 
     return jax.tree_util.tree_map_with_path(scale, params)
 
@@ -108,23 +127,34 @@ def _ours(theirs: np.ndarray, family: str, encoder: FamilyEncoder) -> np.ndarray
 
 def _prepared(case: Case, name: str, encoder: FamilyEncoder, about: dict[str, Any]) -> np.ndarray:
     """Return raw frames prepared by the encoder, (B, T, H, W, 3)."""
-    frames, key = case.inputs(f"{name}/frames"), f"in/{name}/background"
+    frames = case.inputs(f"{name}/frames")
+    key = f"in/{name}/background"
     background = case.inputs(f"{name}/background") if key in case.arrays else None
     if frames.ndim == 5:  # clips with a background each
         assert background is not None
         rows = zip(frames, background, strict=True)
-        return np.stack([np.stack([encoder.preprocess(frame, gel) for frame in clip]) for clip, gel in rows])
+        return np.stack(
+            [np.stack([encoder.preprocess(frame, gel) for frame in clip]) for clip, gel in rows]
+        )
     done = np.stack([encoder.preprocess(frame, background) for frame in frames])
-    return done[None, : about["newest_frame"] + 1] if "newest_frame" in about else done[:, None]
+    if "newest_frame" in about:
+        return done[None, : about["newest_frame"] + 1]
+    return done[:, None]
 
 
-def _outputs(encoder: FamilyEncoder, clips: np.ndarray, sensor: Any) -> dict[str, Callable[[], Any]]:
+def _outputs(
+    encoder: FamilyEncoder, clips: np.ndarray, sensor: Any
+) -> dict[str, Callable[[], Any]]:
     """Return how each output of an encoder is computed, under the names of all families."""
     clips, form, start = np.ascontiguousarray(clips), encoder.form, encoder.form.start
 
     @cache
     def network() -> Any:
-        rows = np.full(len(clips), encoder.sensor_row(sensor, lambda _: None)) if isinstance(sensor, str) else sensor
+        rows = (
+            np.full(len(clips), encoder.sensor_row(sensor, lambda _: None))
+            if isinstance(sensor, str)
+            else sensor
+        )
         parts = encoder._clips(jnp.asarray(clips))[:, 0]
         return jax.jit(encoder._run)(encoder.params, parts, jnp.asarray(rows))
 
@@ -134,27 +164,36 @@ def _outputs(encoder: FamilyEncoder, clips: np.ndarray, sensor: Any) -> dict[str
     last = 0 if form.grid is None else form.grid[1] * form.grid[2]
     return {
         **dict.fromkeys(("tokens", "latent", "last_hidden_state"), tokens),
-        **dict.fromkeys(("mean_patch", "feature_mean_patch", "mean_patch_normed"), mean), "feature_contrastive": own,
+        **dict.fromkeys(("mean_patch", "feature_mean_patch", "mean_patch_normed"), mean),
+        "feature_contrastive": own,
         "feature_cls": (lambda: network().normed[:, 0]) if encoder.family.name == "sitr" else own,
-        "registers": lambda: network().normed[:, form.class_token : start], "encoder_tokens": lambda: network().encoded,
+        "registers": lambda: network().normed[:, form.class_token : start],
+        "encoder_tokens": lambda: network().encoded,
         "projected_tokens": lambda: network().projected,
         "feature_global_pooling": lambda: network().hidden[:, start:].mean(axis=1),
         "feature_last": lambda: network().hidden[:, -last:].mean(axis=1),
-    }  # fmt: skip
+    }
 
 
 def preprocess(case: Case) -> None:
     """Compare the preparations at their real sizes, every seventh pixel."""
-    frames, background = case.inputs("frames"), case.inputs("background")
+    frames = case.inputs("frames")
+    background = case.inputs("background")
     of = {family.name: family.preparation for family in reversed(families.FAMILIES)}
     t3 = {"mean": (0.51808, 0.503, 0.51457), "std": (0.13893, 0.11343, 0.13497)}
     steps = of | {"t3": replace(of["t3"], **t3)}
     for name in case.info["cases"]:
         family = name.split("_")[0]
         size = (320, 240) if name.endswith("320x240") else (224, 224)
-        gel = background if steps[family].background != "keep" and "no_background" not in name else None
+        gel = (
+            background
+            if steps[family].background != "keep" and "no_background" not in name
+            else None
+        )
         used = frames if family == "anytouch2" else frames[:1]
-        done = np.stack([prepare(frame, gel, steps[family], size) for frame in used]).transpose(0, 3, 1, 2)
+        done = np.stack([prepare(frame, gel, steps[family], size) for frame in used]).transpose(
+            0, 3, 1, 2
+        )
         done = done if family == "anytouch2" else done[0]
         case.compare(f"out/{name}", done[..., ::7, ::7])
         axes = (-2, -1)
@@ -184,7 +223,9 @@ def key_lists(lists: dict[str, Any]) -> Iterator[tuple[str, list[Any]]]:
 
     def replaced(name: str, changed: list[Any], without: str = "") -> list[Any]:
         new = {row[0]: row for row in changed}
-        return [new.pop(row[0], row) for row in lists[name] if row[0] != without] + list(new.values())
+        return [new.pop(row[0], row) for row in lists[name] if row[0] != without] + list(
+            new.values()
+        )
 
     for name, rows in lists.items():
         if name == "t3_medium_encoder":
@@ -197,7 +238,10 @@ def key_lists(lists: dict[str, Any]) -> Iterator[tuple[str, list[Any]]]:
         name = f"sparsh_vjepa_{size}"
         (learned,) = lists[f"{name}_if_learned_positions"].values()
         yield f"{name}_learned", replaced(name, learned, "pos_embed.frequency_bands")
-        yield f"dinov2_registers_hf_{size}", replaced(f"dinov2_hf_{size}", lists[f"dinov2_registers_hf_{size}"]["plus"])
+        yield (
+            f"dinov2_registers_hf_{size}",
+            replaced(f"dinov2_hf_{size}", lists[f"dinov2_registers_hf_{size}"]["plus"]),
+        )
     for count, shape in lists["sitr_base_c_patch_embed_for_4_8_9"].items():
         yield f"sitr_base_{count}", replaced("sitr_base_18", [["c_patch_embed.proj.weight", shape]])
     (fewer,) = lists["anytouch2_vit_b_2frames_encoder_part"].values()

@@ -30,8 +30,12 @@ from anytouch_jax.weights import convert
 
 Arrays = dict[str, np.ndarray]
 
-OUTPUT, GRADIENT, PARAMETER = 1e-5, 5e-5, 1e-5  # relative, relative, absolute
-KEY_BIAS = ("k_proj.bias", "key.bias")  # exact gradient 0: softmax does not feel a shift of all keys
+# relative, relative, absolute
+OUTPUT = 1e-5
+GRADIENT = 5e-5
+PARAMETER = 1e-5
+# exact gradient 0: softmax does not feel a shift of all keys
+KEY_BIAS = ("k_proj.bias", "key.bias")
 
 
 @dataclass(frozen=True)
@@ -72,14 +76,19 @@ class Case:
         """Absolute rounding noise of the reference on an array, as recorded; 0 where it was not."""
         return float(self.info.get("float32_vs_float64", {}).get("arrays", {}).get(name, [0.0])[0])
 
-    def compare(self, name: str, ours: Any, relative: float = OUTPUT, absolute: float = 0.0) -> None:
+    def compare(
+        self, name: str, ours: Any, relative: float = OUTPUT, absolute: float = 0.0
+    ) -> None:
         """Compare `ours` with the recorded array `name`; tolerance as in the issue: relative, or 5 x noise."""
         self.seen.add(name)
         self.check(name, ours, self.arrays[name], relative, max(absolute, 5 * self.noise(name)))
 
-    def check(self, name: str, ours: Any, theirs: Any, relative: float, absolute: float = 0.0) -> None:
+    def check(
+        self, name: str, ours: Any, theirs: Any, relative: float, absolute: float = 0.0
+    ) -> None:
         """Compare two arrays; the tolerance is the larger of `relative` x max |theirs| and `absolute`."""
-        ours, theirs = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
+        ours = np.asarray(ours, np.float64)
+        theirs = np.asarray(theirs, np.float64)
         if ours.shape != theirs.shape:
             self.fail(name, f"shape {ours.shape} instead of {theirs.shape}")
             return
@@ -104,7 +113,8 @@ class Case:
 def read_arrays(path: Path) -> Arrays:
     """The arrays of an `.npz` file, without pickle. Raises UserError."""
     try:
-        with open(path, "rb") as file, np.load(file) as arrays:  # np.load alone leaves a broken file open
+        # np.load alone leaves a broken file open
+        with open(path, "rb") as file, np.load(file) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"cannot read the golden arrays {path}: {error}") from None
@@ -113,7 +123,9 @@ def read_arrays(path: Path) -> Arrays:
 def read_cases(folder: Path) -> list[Case]:
     """All cases of a golden folder, in order. Raises UserError when there is none."""
     if not folder.is_dir():
-        raise UserError(f"no golden folder at {folder}; give the folder that holds A_*.json, B_*.json, ...")
+        raise UserError(
+            f"no golden folder at {folder}; give the folder that holds A_*.json, B_*.json, ..."
+        )
     cases = []
     for path in sorted(folder.glob("*.json")):
         try:
@@ -127,30 +139,49 @@ def read_cases(folder: Path) -> list[Case]:
 
 def golden_config(info: dict[str, Any], *, stage: int, sensors: int = 10) -> Config:
     """The recipe `release` in the sizes and arguments that a case's JSON gives."""
-    size, args, clip = info["config"], info.get("args", {}), info["clip_config"]
+    size = info["config"]
+    args = info.get("args", {})
+    clip = info["clip_config"]
     tower = Stack(size["hidden"], size["layers"], size["heads"], size["mlp"])
     text_stack = Stack(size["th"], size["tl"], size["theads"], size["tmlp"])
     end = clip["text_eos_token_id"]
     model = ModelConfig(
-        image_size=size["image"], patch=size["patch"], embed=size["proj"], touch=tower,
-        decoder=Stack(size["dh"], size["dl"], size["dheads"], size["dmlp"]), image=tower if stage == 2 else None,
-        text=TextTower(text_stack, size["vocab"], size["maxpos"], None if end == 2 else end) if stage == 2 else None,
-        sensors=_sensor_names(sensors), activation=clip["hidden_act"], norm_eps=clip["layer_norm_eps"],
+        image_size=size["image"],
+        patch=size["patch"],
+        embed=size["proj"],
+        touch=tower,
+        decoder=Stack(size["dh"], size["dl"], size["dheads"], size["dmlp"]),
+        image=tower if stage == 2 else None,
+        text=TextTower(text_stack, size["vocab"], size["maxpos"], None if end == 2 else end)
+        if stage == 2
+        else None,
+        sensors=_sensor_names(sensors),
+        activation=clip["hidden_act"],
+        norm_eps=clip["layer_norm_eps"],
         decoder_norm_eps=info.get("decoder_config", {}).get("layer_norm_eps", 1e-12),
         decoder_sensor_tokens=args.get("new_decoder_sensor_token", False),
         match_head="linear" if stage == 2 else "none",
         lora_rank=args.get("lora_r", size["lora_r"]) if stage == 2 else 0,
         lora_alpha=args.get("lora_alpha", size["lora_alpha"]),
-    )  # fmt: skip
+    )
     objective = LossConfig(
-        mask_ratio=args.get("mask_ratio", 0.75), norm_pix_loss=args.get("norm_pix_loss", False),
-        alpha_tv=args.get("alpha_vt", 1.0), alpha_tl=args.get("alpha_lt", 1.0), alpha_vl=args.get("alpha_vl", 0.2),
+        mask_ratio=args.get("mask_ratio", 0.75),
+        norm_pix_loss=args.get("norm_pix_loss", False),
+        alpha_tv=args.get("alpha_vt", 1.0),
+        alpha_tl=args.get("alpha_lt", 1.0),
+        alpha_vl=args.get("alpha_vl", 0.2),
         match_weight=args.get("cross_alpha", 0.1),
-    )  # fmt: skip
+    )
     return Config(
-        model, stage=2 if stage == 2 else 1, recipe="release", towers="pretrained" if stage == 2 else "none",
-        objective=objective, optim=OptimConfig(decay="cosine"), data=DataConfig(), run=RunConfig(),
-    )  # fmt: skip
+        model,
+        stage=2 if stage == 2 else 1,
+        recipe="release",
+        towers="pretrained" if stage == 2 else "none",
+        objective=objective,
+        optim=OptimConfig(decay="cosine"),
+        data=DataConfig(),
+        run=RunConfig(),
+    )
 
 
 def _sensor_names(rows: int) -> tuple[str, ...]:
@@ -173,4 +204,6 @@ def golden_params(folder: Path, file: str, model: ModelConfig, scale: Any = None
 def channel_last(pixels: np.ndarray, *, clip: bool = True) -> np.ndarray:
     """(B, 3, H, W) or (B, T, 3, H, W) -> (B, T, H, W, 3), or (B, H, W, 3) of a photograph with `clip` False."""
     pixels = np.moveaxis(pixels, -3, -1)
-    return pixels[:, None] if clip and pixels.ndim == 4 else pixels
+    if clip and pixels.ndim == 4:
+        return pixels[:, None]
+    return pixels

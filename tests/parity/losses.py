@@ -15,7 +15,15 @@ from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.ops import losses, tokens
 from anytouch_jax.train.step import merge, split
 from anytouch_jax.weights import convert
-from tests.parity.golden_files import GRADIENT, KEY_BIAS, Case, channel_last, golden_config, golden_params, read_arrays
+from tests.parity.golden_files import (
+    GRADIENT,
+    KEY_BIAS,
+    Case,
+    channel_last,
+    golden_config,
+    golden_params,
+    read_arrays,
+)
 from tests.support.release_keys import release_names, release_shapes
 from tests.support.used_parameters import used_parameters
 
@@ -29,11 +37,17 @@ def setup(case: Case, stage: int) -> tuple[Net, Config, Params]:
     (table,) = [value for key, value in weights.items() if key.endswith("sensor_token")]
     config = golden_config(case.info, stage=stage, sensors=len(table))
     scale = _scale_rule(case.info["param_scale"]["factor"]) if "param_scale" in case.info else None
-    return build(config.model), config, golden_params(case.folder, case.info["params_file"], config.model, scale)
+    return (
+        build(config.model),
+        config,
+        golden_params(case.folder, case.info["params_file"], config.model, scale),
+    )
 
 
 def _scale_rule(factor: float) -> Callable[[str, np.ndarray], np.ndarray]:
-    return lambda key, value: value * np.float32(factor) if "pre_layrnorm" in key or "norm" not in key else value
+    return lambda key, value: (
+        value * np.float32(factor) if "pre_layrnorm" in key or "norm" not in key else value
+    )
 
 
 def table_rows(sensor: np.ndarray, net: Net) -> np.ndarray:
@@ -42,23 +56,31 @@ def table_rows(sensor: np.ndarray, net: Net) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnames=("value", "net", "config"))
-def _grad(trainable: Params, frozen: Params, inputs: Any, *, value: Value, net: Net, config: Config) -> Params:
+def _grad(
+    trainable: Params, frozen: Params, inputs: Any, *, value: Value, net: Net, config: Config
+) -> Params:
     return jax.grad(lambda p: value(merge(p, frozen), inputs, net=net, config=config))(trainable)
 
 
-def _gradients(value: Value, params: Params, inputs: Any, exact: Any, net: Net, config: Config) -> dict[str, Any]:
+def _gradients(
+    value: Value, params: Params, inputs: Any, exact: Any, net: Net, config: Config
+) -> dict[str, Any]:
     """Gradients by the authors' key names; None for parameters that the loss does not use or the config freezes.
 
     `inputs` may be padded so that cases share a program; `exact` has the shapes that say what the loss reads.
     """
     trainable, frozen = split(params, config.frozen)
     grads = jax.device_get(_grad(trainable, frozen, inputs, value=value, net=net, config=config))
-    used = used_parameters(lambda p: value(merge(p, frozen), exact, net=net, config=config), trainable)
+    used = used_parameters(
+        lambda p: value(merge(p, frozen), exact, net=net, config=config), trainable
+    )
     zeros = jax.tree.map(np.zeros_like, frozen)
     flags = merge(jax.tree.map(lambda u, g: np.full(g.shape, u, np.float32), used, grads), zeros)
     named, live = (convert.to_release(tree, config.model) for tree in (merge(grads, zeros), flags))
     dead = dead_keys(config)
-    return {key: None if key in dead or not np.any(live[key]) else array for key, array in named.items()}
+    return {
+        key: None if key in dead or not np.any(live[key]) else array for key, array in named.items()
+    }
 
 
 def dead_keys(config: Config) -> set[str]:
@@ -67,7 +89,14 @@ def dead_keys(config: Config) -> set[str]:
 
 
 def _compare_gradients(
-    case: Case, value: Value, params: Params, inputs: Any, exact: Any, net: Net, config: Config, prefix: str = "grad"
+    case: Case,
+    value: Value,
+    params: Params,
+    inputs: Any,
+    exact: Any,
+    net: Net,
+    config: Config,
+    prefix: str = "grad",
 ) -> None:
     """Values, presence (golden Q7) and norms of all gradients."""
     grads = _gradients(value, params, inputs, exact, net, config)
@@ -90,7 +119,9 @@ def _compare_gradients(
         _compare_norms(case, f"{prefix}_l2", grads, norms)
 
 
-def _compare_norms(case: Case, label: str, grads: dict[str, Any], norms: dict[str, float | None]) -> None:
+def _compare_norms(
+    case: Case, label: str, grads: dict[str, Any], norms: dict[str, float | None]
+) -> None:
     """L2 norms of all gradients and which are None, from the JSON (seven digits; absent keys are None)."""
     wrong = sorted(key for key in grads if (grads[key] is None) != (norms.get(key) is None))
     unknown = sorted(set(norms) - set(grads))
@@ -113,72 +144,114 @@ def _stage1_outputs(params: Params, inputs: Any, *, net: Net, config: Config) ->
         noise, tokens.count_visible(net.model.patches, config.objective.keep_ratio)
     )
     seen = clip[:, : net.model.frames]
-    pred, _ = objectives.reconstruct(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)
-    loss, metrics = objectives.stage1_terms(params, *inputs[:3], net=net, config=config, decoder_sensor=target)
+    pred, _ = objectives.reconstruct(
+        params, clip, sensor, noise, net=net, config=config, decoder_sensor=target
+    )
+    loss, metrics = objectives.stage1_terms(
+        params, *inputs[:3], net=net, config=config, decoder_sensor=target
+    )
     return {
-        "ids_restore": restore_ids, "mask": hidden, "embeddings": net.bind(params).touch.tokens(seen, sensor, keep_ids),
+        "ids_restore": restore_ids,
+        "mask": hidden,
+        "embeddings": net.bind(params).touch.tokens(seen, sensor, keep_ids),
         "last_hidden_state": net.bind(params).touch.hidden(seen, sensor, keep_ids),
         "latent": net.encode_tokens(params, seen, sensor, keep_ids),
-        "features_unmasked": net.encode_touch(params, seen, sensor), "pred": pred, "loss": loss,
-        "loss_recon": metrics["reconstruction"], "loss_pred": metrics.get("next_frame"),
-    }  # fmt: skip
+        "features_unmasked": net.encode_touch(params, seen, sensor),
+        "pred": pred,
+        "loss": loss,
+        "loss_recon": metrics["reconstruction"],
+        "loss_pred": metrics.get("next_frame"),
+    }
 
 
 def _stage1_value(params: Params, inputs: Any, *, net: Net, config: Config) -> jax.Array:
     clip, sensor, noise, target = inputs
-    return objectives.stage1_terms(params, clip, sensor, noise, net=net, config=config, decoder_sensor=target)[0]
+    return objectives.stage1_terms(
+        params, clip, sensor, noise, net=net, config=config, decoder_sensor=target
+    )[0]
 
 
 def stage1(case: Case) -> None:
     """Cases A, B, C: every output of a stage-1 pass, its losses and gradients."""
     net, config, params = setup(case, 1)
-    target = table_rows(case.inputs("target_sensor_type"), net) if "in/target_sensor_type" in case.arrays else None
+    target = (
+        table_rows(case.inputs("target_sensor_type"), net)
+        if "in/target_sensor_type" in case.arrays
+        else None
+    )
     inputs = (
-        channel_last(case.inputs("pixels")), table_rows(case.inputs("sensor_type"), net), case.inputs("noise"), target,
-    )  # fmt: skip
+        channel_last(case.inputs("pixels")),
+        table_rows(case.inputs("sensor_type"), net),
+        case.inputs("noise"),
+        target,
+    )
     ours = _stage1_outputs(params, inputs, net=net, config=config)
     ours["pred_first2"] = ours["pred"][:2]
     for name, value in ours.items():
         if f"out/{name}" in case.arrays:
             recorded = case.arrays[f"out/{name}"]
-            case.compare(f"out/{name}", np.reshape(value, recorded.shape) if "pred" in name else value)
+            case.compare(
+                f"out/{name}", np.reshape(value, recorded.shape) if "pred" in name else value
+            )
     if any(name.startswith("grad") for name in case.info["arrays"]):
         _compare_gradients(case, _stage1_value, params, inputs, inputs, net, config)
 
 
 def _align_batch(case: Case, net: Net, flags: str = "") -> tuple[AlignBatch, AlignBatch]:
     """The recorded batch twice: with a slot for every sample, unused ones at row B, and with the present ones alone."""
-    rows, slots = len(case.arrays["in/touch"]), {}
+    rows = len(case.arrays["in/touch"])
+    slots = {}
     for kind in ("vision", "text"):
         present = np.flatnonzero(case.inputs(f"{flags}{kind}_flag")).astype(np.int32)
-        slots[kind] = (present, np.concatenate([present, np.full(rows - len(present), rows, np.int32)]))
-    clip, sensor = channel_last(case.inputs("touch")), table_rows(case.inputs("sensor_type"), net)
-    image, ids = channel_last(case.inputs("image"), clip=False), case.inputs("input_ids")
+        slots[kind] = (
+            present,
+            np.concatenate([present, np.full(rows - len(present), rows, np.int32)]),
+        )
+    clip = channel_last(case.inputs("touch"))
+    sensor = table_rows(case.inputs("sensor_type"), net)
+    image = channel_last(case.inputs("image"), clip=False)
+    ids = case.inputs("input_ids")
     mask = case.inputs("attention_mask").astype(bool)
 
     def batch(vision: np.ndarray, text: np.ndarray) -> AlignBatch:
         v, t = (np.minimum(r, rows - 1) for r in (vision, text))
-        return AlignBatch(clip, sensor, image[v], vision, ids[t], np.where((text < rows)[:, None], mask[t], True), text)
+        return AlignBatch(
+            clip,
+            sensor,
+            image[v],
+            vision,
+            ids[t],
+            np.where((text < rows)[:, None], mask[t], True),
+            text,
+        )
 
     exact, padded = (batch(slots["vision"][i], slots["text"][i]) for i in (0, 1))
     return padded, exact
 
 
 @partial(jax.jit, static_argnames=("net", "config"))
-def _align_all(params: Params, inputs: Any, *, net: Net, config: Config) -> tuple[Any, Any, Any, Any]:
+def _align_all(
+    params: Params, inputs: Any, *, net: Net, config: Config
+) -> tuple[Any, Any, Any, Any]:
     batch, noise, target = inputs
     total, metrics = objectives.stage2_terms(
         params, Stage2Batch(batch, None), noise, net=net, config=config, decoder_sensor=target
     )
-    hidden = tokens.random_mask(noise, tokens.count_visible(net.model.patches, config.objective.keep_ratio))[2]
-    touch = losses.normalise(net.encode_touch(params, batch.clip[:, : net.model.frames], batch.sensor))
+    hidden = tokens.random_mask(
+        noise, tokens.count_visible(net.model.patches, config.objective.keep_ratio)
+    )[2]
+    touch = losses.normalise(
+        net.encode_touch(params, batch.clip[:, : net.model.frames], batch.sensor)
+    )
     return total, metrics, objectives.align_embeddings(params, batch, touch, net=net), hidden
 
 
 def _align_value(params: Params, inputs: Any, *, net: Net, config: Config) -> jax.Array:
     batch, noise, target = inputs
     step = Stage2Batch(batch, None)
-    return objectives.stage2_terms(params, step, noise, net=net, config=config, decoder_sensor=target)[0]
+    return objectives.stage2_terms(
+        params, step, noise, net=net, config=config, decoder_sensor=target
+    )[0]
 
 
 _PAIRS = {
@@ -188,7 +261,9 @@ _PAIRS = {
 }
 
 
-def _align_outputs(case: Case, net: Net, config: Config, params: Params, inputs: Any, here: str) -> None:
+def _align_outputs(
+    case: Case, net: Net, config: Config, params: Params, inputs: Any, here: str
+) -> None:
     """Compare embeddings, logits, masks and losses of one align batch."""
     total, metrics, z, hidden = jax.device_get(_align_all(params, inputs, net=net, config=config))
     scale = np.exp(params["logit_scale"])
@@ -198,12 +273,18 @@ def _align_outputs(case: Case, net: Net, config: Config, params: Params, inputs:
     for pair, (ours_forth, ours_back, forth, back) in _PAIRS.items():
         first, second = pair.split("_")
         both = rows[first] & rows[second]
-        _if_recorded(case, f"{here}logits_{pair}", scale * getattr(z, first)[both] @ getattr(z, second)[both].T)
+        _if_recorded(
+            case,
+            f"{here}logits_{pair}",
+            scale * getattr(z, first)[both] @ getattr(z, second)[both].T,
+        )
         _if_recorded(case, f"{here}loss_{forth}", metrics[ours_forth])
         _if_recorded(case, f"{here}loss_{back}", metrics[ours_back])
     _if_recorded(case, f"{here}mask", hidden)
     _if_recorded(case, f"{here}align_loss", metrics["align"])
-    _if_recorded(case, f"{here}mae_loss", metrics["reconstruction"] + metrics.get("next_frame", 0.0))
+    _if_recorded(
+        case, f"{here}mae_loss", metrics["reconstruction"] + metrics.get("next_frame", 0.0)
+    )
     _if_recorded(case, f"{here}total_loss", total)
     _if_recorded(case, f"{here}no_mae_total_loss", metrics["align"])
     _if_recorded(case, f"{here}no_mae_mae_loss", 0.0)
@@ -230,7 +311,14 @@ def align(case: Case) -> None:
     _compare_gradients(case, _align_value, params, inputs, exact, net, config)
     if "grad_no_mae_l2" in case.info:
         _compare_gradients(
-            case, _align_value, params, _without_mae(inputs), _without_mae(exact), net, config, "grad_no_mae"
+            case,
+            _align_value,
+            params,
+            _without_mae(inputs),
+            _without_mae(exact),
+            net,
+            config,
+            "grad_no_mae",
         )
 
 
@@ -246,31 +334,48 @@ def align_edge(case: Case) -> None:
     for name, sub in case.info["subcases"].items():
         inputs, exact = _align_inputs(case, net, f"{name}/")
         _align_outputs(case, net, config, params, inputs, f"out/{name}/")
-        variants = {"with_mae": (inputs, exact), "without_mae": (_without_mae(inputs), _without_mae(exact))}
+        variants = {
+            "with_mae": (inputs, exact),
+            "without_mae": (_without_mae(inputs), _without_mae(exact)),
+        }
         for label, both in variants.items():
             grads = _gradients(_align_value, params, *both, net, config)
-            if not sub[f"grad_l2_{label}"]:  # the reference has no graph there: no gradient reaches any parameter
-                grads = {key: None if value is None or not value.any() else value for key, value in grads.items()}
+            if not sub[
+                f"grad_l2_{label}"
+            ]:  # the reference has no graph there: no gradient reaches any parameter
+                grads = {
+                    key: None if value is None or not value.any() else value
+                    for key, value in grads.items()
+                }
             _compare_norms(case, f"{name}/grad_l2_{label}", grads, sub[f"grad_l2_{label}"])
 
 
 @partial(jax.jit, static_argnames=("net", "read"))
 def encode(
-    params: Params, clip: Any, sensor: Any, *, net: Net, read: Callable[..., Any] = AnyTouch.encode_touch
+    params: Params,
+    clip: Any,
+    sensor: Any,
+    *,
+    net: Net,
+    read: Callable[..., Any] = AnyTouch.encode_touch,
 ) -> Any:
     """Return `read(module, clip, sensor)`, compiled once for all cases of equal shapes."""
     return read(net.bind(params), clip, sensor)
 
 
 def _match_value(params: Params, inputs: Any, *, net: Net, config: Config) -> jax.Array:
-    return objectives.stage2_terms(params, Stage2Batch(None, inputs), None, net=net, config=config)[0]
+    return objectives.stage2_terms(params, Stage2Batch(None, inputs), None, net=net, config=config)[
+        0
+    ]
 
 
 def match(case: Case) -> None:
     """Case F: matching logits, loss and gradients."""
     net, config, params = setup(case, 2)
     clips = [channel_last(case.inputs(name)) for name in ("touch", "positive", "negative")]
-    sensors = [table_rows(case.inputs(name), net) for name in ("sensor_type", "pos_sensors", "neg_sensors")]
+    sensors = [
+        table_rows(case.inputs(name), net) for name in ("sensor_type", "pos_sensors", "neg_sensors")
+    ]
     batch = MatchBatch(*(x for pair in zip(clips, sensors, strict=True) for x in pair))
     touches = list(zip(clips, sensors, strict=True))
     z = jax.jit(partial(objectives.touch_embeddings, net=net))(params, touches)

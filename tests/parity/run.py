@@ -35,18 +35,33 @@ def run(options: Parity) -> int:
     worst: dict[str, Any] = {}
     for row in rows:
         held = worst.get(row.case)
-        if held is None or row.error / max(row.tolerance, 1e-30) > held.error / max(held.tolerance, 1e-30):
+        if held is None or row.error / max(row.tolerance, 1e-30) > held.error / max(
+            held.tolerance, 1e-30
+        ):
             worst[row.case] = row
     table = Table("case", "arrays", "worst array", "error", "tolerance", "")
     counts = {case: sum(row.case == case for row in rows) for case in worst}
     bad = [row for row in rows if not row.good]
-    shown = rows if options.verbose else [*worst.values(), *(row for row in bad if row is not worst[row.case])][:200]
+    shown = (
+        rows
+        if options.verbose
+        else [*worst.values(), *(row for row in bad if row is not worst[row.case])][:200]
+    )
     for row in shown:
         mark = "ok" if row.good else f"OUT {row.note}"
-        table.add_row(row.case, str(counts[row.case]), row.array, f"{row.error:.2g}", f"{row.tolerance:.2g}", mark)
+        table.add_row(
+            row.case,
+            str(counts[row.case]),
+            row.array,
+            f"{row.error:.2g}",
+            f"{row.tolerance:.2g}",
+            mark,
+        )
     Console(width=None if Console().is_terminal else 160).print(table)
     print(f"{len(rows)} comparisons, {len(bad)} out of tolerance")
-    return 1 if bad else 0
+    if bad:
+        return 1
+    return 0
 
 
 def main(args: Sequence[str] | None = None) -> int:

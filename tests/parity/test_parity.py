@@ -64,7 +64,9 @@ def test_every_case_of_the_folder_is_run():
 @pytest.mark.parametrize("name", WHOLE)
 def test_a_case_of_the_whole_set_is_within_tolerance(name):
     (case,) = [case for case in read_cases(ALL) if case.name == name]
-    assert {r.array: (r.error, r.tolerance, r.note) for r in cases.run_case(case) if not r.good} == {}
+    assert {
+        r.array: (r.error, r.tolerance, r.note) for r in cases.run_case(case) if not r.good
+    } == {}
 
 
 @pytest.mark.slow
@@ -74,7 +76,9 @@ def test_the_authors_checkpoints_give_the_recorded_parameters(path, tmp_path):
     for file in (path, ALL / f"{stage}_params.npz", ALL / f"{stage}_params.json"):
         shutil.copy(file, tmp_path)
     rows = cases.run(tmp_path)
-    assert [row.case for row in rows] == [f"{stage}_params", path.name] and all(row.good for row in rows)
+    assert [row.case for row in rows] == [f"{stage}_params", path.name] and all(
+        row.good for row in rows
+    )
 
 
 NEW = {"out/new": lambda _: np.zeros(3, np.float32)}
@@ -83,7 +87,12 @@ NEW = {"out/new": lambda _: np.zeros(3, np.float32)}
 @pytest.mark.parametrize(
     ("case", "changes", "lists", "note"),
     [
-        ("A_stage1_image_small_scale", {"out/latent": lambda x: np.where(x == x.max(), np.nan, x)}, {}, ""),
+        (
+            "A_stage1_image_small_scale",
+            {"out/latent": lambda x: np.where(x == x.max(), np.nan, x)},
+            {},
+            "",
+        ),
         ("I_pos_embed", {"pos_embed_32_4_cls": lambda x: x[:, :16]}, {}, "shape"),
         ("I_pos_embed", NEW, {"out/new": [[3], "float32"]}, "not understood"),
         ("I_pos_embed", NEW, {}, "not understood"),
@@ -91,7 +100,9 @@ NEW = {"out/new": lambda _: np.zeros(3, np.float32)}
     ids=["a NaN", "another shape", "an array that nobody compares", "one that is not listed"],
 )
 def test_what_cannot_be_compared_is_reported(tmp_path, case, changes, lists, note):
-    folder = copied(tmp_path, case, lambda info: info | {"arrays": info["arrays"] | lists}, **changes)
+    folder = copied(
+        tmp_path, case, lambda info: info | {"arrays": info["arrays"] | lists}, **changes
+    )
     assert note in bad(folder)[next(iter(changes))].note
 
 
@@ -102,7 +113,9 @@ def test_unknown_broken_and_empty_cases_are_failures_not_tracebacks(tmp_path):
         (tmp_path / f"{name}.json").write_text("{}")
     np.savez(tmp_path / "I_pos.npz", unknown=np.zeros(3))
     rows = [row for row in cases.run(tmp_path) if not row.good]
-    assert [row.case for row in rows] == ["A_broken", "I_pos", "Z_new"] and rows[1].note == "nothing was compared"
+    assert [row.case for row in rows] == ["A_broken", "I_pos", "Z_new"] and rows[
+        1
+    ].note == "nothing was compared"
     assert all("understand" in row.note or "understood" in row.note for row in rows[::2])
     (tmp_path / "A_x.json").write_text("{")
     with pytest.raises(UserError, match=r"A_x\.json is not JSON"):
@@ -111,25 +124,37 @@ def test_unknown_broken_and_empty_cases_are_failures_not_tracebacks(tmp_path):
 
 def test_tolerances_are_the_larger_of_relative_and_five_times_the_noise():
     case = Case("c", HERE, {"float32_vs_float64": {"arrays": {"out/a": [3e-4, 10.0]}}})
-    case.arrays = {"out/a": np.array([10.0, 0.0]), "out/b": np.array([10.0, 0.0]), "out/c": np.zeros(2)}
+    case.arrays = {
+        "out/a": np.array([10.0, 0.0]),
+        "out/b": np.array([10.0, 0.0]),
+        "out/c": np.zeros(2),
+    }
     case.compare("out/a", np.array([10.0, 1e-3]))
     case.compare("out/b", np.array([10.0, 1e-3]), GRADIENT)
     case.compare("out/c", np.array([0.0, 2e-5]))
     a, b, c = case.rows
     assert a.good and a.error == pytest.approx(1e-4) and a.tolerance == pytest.approx(1.5e-4)
     assert not b.good and b.tolerance == pytest.approx(GRADIENT)
-    assert not c.good  # a recorded zero is compared in absolute terms, and not with a tolerance of its size
+    # a recorded zero is compared in absolute terms, and not with a tolerance of its size
+    assert not c.good
     assert not Row("c", "d", float("nan"), 1.0).good
 
 
 def test_exit_codes_and_table_of_the_command(tmp_path, capsys):
-    good, wrong = tmp_path / "good", tmp_path / "wrong"
+    good = tmp_path / "good"
+    wrong = tmp_path / "wrong"
     for folder in (good, wrong):
         folder.mkdir()
     assert main([str(copied(good, "I_pos_embed"))]) == 0
     assert "0 out of tolerance" in capsys.readouterr().out
-    assert main([str(copied(wrong, "I_pos_embed", pos_embed_32_4_cls=lambda x: x + 1)), "--verbose"]) == 1
+    assert (
+        main([str(copied(wrong, "I_pos_embed", pos_embed_32_4_cls=lambda x: x + 1)), "--verbose"])
+        == 1
+    )
     out = capsys.readouterr().out
     assert (
-        "1 out of tolerance" in out and "pos_embed_32_4_cls" in out and "OUT" in out and "pos_embed_512_16_cls" in out
+        "1 out of tolerance" in out
+        and "pos_embed_32_4_cls" in out
+        and "OUT" in out
+        and "pos_embed_512_16_cls" in out
     )

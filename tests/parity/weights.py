@@ -19,9 +19,11 @@ STAGE1 = preset("large", recipe="release")
 STAGE2 = preset("large", stage=2, recipe="release", towers="pretrained")
 # entry of K_manifest -> the layout of that file and the preset that it is a file of
 _FULL_SIZE: dict[str, tuple[str, Config]] = {
-    "stage1": ("stage1", STAGE1), "stage2": ("stage2", STAGE2), "probe_material": ("probe", STAGE1),
+    "stage1": ("stage1", STAGE1),
+    "stage2": ("stage2", STAGE2),
+    "probe_material": ("probe", STAGE1),
     "hf_clip_vit_l_14": ("clip", STAGE2),
-}  # fmt: skip
+}
 _FRESH = "kept at its fresh initial value"
 
 
@@ -32,14 +34,19 @@ def manifest(case: Case) -> None:
         ours = release_shapes(config.model, layout)
         _same(case, f"{kind}/keys", ours, {key: tuple(shape) for key, shape, *_ in rows})
         if layout in ("stage1", "stage2"):
-            shapes = {name: tuple(leaf.shape) for name, leaf in flatten(build(config.model).abstract()).items()}
+            shapes = {
+                name: tuple(leaf.shape)
+                for name, leaf in flatten(build(config.model).abstract()).items()
+            }
             _same(case, f"{kind}/network", param_shapes(config.model), shapes)
             _groups(case, kind, config, rows)
 
 
 def _groups(case: Case, kind: str, config: Config, rows: Iterable[Any]) -> None:
     """The decay group of every array that something reads; `text` runs without gradient there (golden Q10)."""
-    names, ours, theirs = release_names(config.model), {}, {}
+    names = release_names(config.model)
+    ours = {}
+    theirs = {}
     for key, _, _, group in rows:
         if key in names:
             name = names[key]
@@ -77,16 +84,26 @@ def loading_map(case: Case) -> None:
             if name.startswith("probe"):
                 _probe_map(case, name, sources, model1 if "mae" in str(sources) else model2, files)
             else:
-                _stage_map(case, name, sources, model1 if name.startswith("stage1") else model2, files)
+                _stage_map(
+                    case, name, sources, model1 if name.startswith("stage1") else model2, files
+                )
 
 
 def _two_layers() -> tuple[ModelConfig, ModelConfig]:
     """Stage 1 and stage 2 of the preset in small."""
     stack = Stack(16, 2, 4, 24)
-    sizes: Any = {"image_size": 28, "patch": 14, "embed": 12, "touch": stack, "decoder": Stack(8, 2, 2, 16)}
+    sizes: Any = {
+        "image_size": 28,
+        "patch": 14,
+        "embed": 12,
+        "touch": stack,
+        "decoder": Stack(8, 2, 2, 16),
+    }
     assert STAGE2.model.text is not None
     text = replace(STAGE2.model.text, stack=Stack(10, 2, 2, 14), vocab=30)
-    return replace(STAGE1.model, **sizes), replace(STAGE2.model, **sizes, image=stack, text=text, lora_rank=0)
+    return replace(STAGE1.model, **sizes), replace(
+        STAGE2.model, **sizes, image=stack, text=text, lora_rank=0
+    )
 
 
 def _values(shapes: Mapping[str, Any], seed: int) -> Arrays:
@@ -99,28 +116,45 @@ def _expected(key: str, source: str, files: Mapping[str, Arrays]) -> np.ndarray:
     file, _, theirs = source.partition(":")
     array = files[file][theirs]
     repeated = key.endswith("video_patch_embedding.weight") and file == "clip"
-    return np.repeat(array[:, None], 3, axis=1) if repeated else array
+    if repeated:
+        return np.repeat(array[:, None], 3, axis=1)
+    return array
 
 
 def _stage_map(
-    case: Case, name: str, sources: Mapping[str, str], model: ModelConfig, files: Mapping[str, Arrays]
+    case: Case,
+    name: str,
+    sources: Mapping[str, str],
+    model: ModelConfig,
+    files: Mapping[str, Arrays],
 ) -> None:
     fresh = nest(_values(param_shapes(model), 4))
     begun = "stage1" in name and not name.startswith("stage1")
     stage1 = convert.to_params(files["mae"], _two_layers()[0]) if begun else None
     merged = load.first_params(fresh, model, stage1=stage1, clip=files["clip"])
-    ours, before = convert.to_release(merged, model), convert.to_release(fresh, model)
+    ours = convert.to_release(merged, model)
+    before = convert.to_release(fresh, model)
     used = release_names(model)
     for key in used:
         source = sources.get(key, "nowhere")
-        expected = before[key] if source == _FRESH else _expected(key, source, files) if key in sources else None
+        expected = (
+            before[key]
+            if source == _FRESH
+            else _expected(key, source, files)
+            if key in sources
+            else None
+        )
         if expected is None or not np.array_equal(ours[key], expected):
             case.fail(f"{name}/{key}", f"its value is not that of {source}")
     case.check(f"{name}/keys", len(used), len(used.keys() & sources.keys()), 0.0)
 
 
 def _probe_map(
-    case: Case, name: str, sources: Mapping[str, str], model: ModelConfig, files: Mapping[str, Arrays]
+    case: Case,
+    name: str,
+    sources: Mapping[str, str],
+    model: ModelConfig,
+    files: Mapping[str, Arrays],
 ) -> None:
     """A probe's file, filled as the map says, is read as the touch encoder of its source."""
     (source,) = {value.partition(":")[0] for value in sources.values() if value != _FRESH}
@@ -132,7 +166,12 @@ def _probe_map(
 def parameters(case: Case) -> None:
     """A file of parameters that other cases use: the recorded keys, shapes and types."""
     stored = {key: (array.shape, str(array.dtype)) for key, array in case.arrays.items()}
-    _same(case, "keys", stored, {key: (tuple(shape), kind) for key, (shape, kind) in case.info["keys"].items()})
+    _same(
+        case,
+        "keys",
+        stored,
+        {key: (tuple(shape), kind) for key, (shape, kind) in case.info["keys"].items()},
+    )
 
 
 def checkpoint(case: Case) -> None:
@@ -140,9 +179,13 @@ def checkpoint(case: Case) -> None:
     stage = 2 if case.name.startswith("stage2") else 1
     weights = load.read_weights(case.folder / case.name)
     stored = read_arrays(case.folder / f"stage{stage}_params.npz")
-    extra = {key for key in stored if key not in weights and key.endswith("sensor_token_proj.weight")}
+    extra = {
+        key for key in stored if key not in weights and key.endswith("sensor_token_proj.weight")
+    }
     expected = {key: value for key, value in stored.items() if key not in extra}
-    ours, theirs = (flatten(convert.to_params(w, convert.detect_form(w, {})[0])) for w in (weights, expected))
+    ours, theirs = (
+        flatten(convert.to_params(w, convert.detect_form(w, {})[0])) for w in (weights, expected)
+    )
     _equal(case, "parameters", ours, theirs)
 
 

@@ -13,16 +13,33 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-WORDS, NUMBERS, CELL, README_WORDS = 30, 3, 25, 700
+WORDS = 30
+NUMBERS = 3
+CELL = 25
+README_WORDS = 700
 PAGES = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "experiments/**/*.md")
 # Copies, and help texts.
-MADE = tuple(f"docs/{name}" for name in ("results/", "tutorials/", "reference/", "contributing.md", "changelog.md"))
+MADE = tuple(
+    f"docs/{name}"
+    for name in ("results/", "tutorials/", "reference/", "contributing.md", "changelog.md")
+)
 CODE = ("src/**/*.py",)
 NOTEBOOKS = ("experiments/notebooks/*.ipynb",)
 PHRASES = (
-    "told", "tells", "tell", "less the", "anew", "likewise", "of its own", "as it is", "as they are",
-    "where there is none", "where there are none", "so far as", "by heart",
-)  # fmt: skip
+    "told",
+    "tells",
+    "tell",
+    "less the",
+    "anew",
+    "likewise",
+    "of its own",
+    "as it is",
+    "as they are",
+    "where there is none",
+    "where there are none",
+    "so far as",
+    "by heart",
+)
 _FORBIDDEN = re.compile(r"\b(" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
 _SENTENCE_END = re.compile(r"(?<=[.!?:])[\"')\]*]*\s+(?=[\"'(\[*`]*(?:[A-Z0-9`*]|code\b))")
 _ABBREVIATION = re.compile(r"\b(e\.g|i\.e|Eq|Sec|Fig|App|No|vs|cf|al)\.\s")
@@ -69,7 +86,8 @@ def words(text: str) -> list[str]:
 def markdown_blocks(text: str) -> Iterator[Block]:
     """Yield the prose of a page, block by block; code blocks and front matter are left out."""
     waiting: list[str] = []
-    start, fence = 0, ""
+    start = 0
+    fence = ""
     lines = text.splitlines()
     front = lines and lines[0] == "---"
 
@@ -97,7 +115,10 @@ def markdown_blocks(text: str) -> Iterator[Block]:
             if bare.startswith("#"):
                 yield Block(number, bare.lstrip("# "), "heading")
             elif bare.startswith("|") and not re.fullmatch(r"[|\s:-]+", bare):
-                yield from (Block(number, cell.strip(), "cell") for cell in re.split(r"(?<!\\)\|", bare.strip("|")))
+                yield from (
+                    Block(number, cell.strip(), "cell")
+                    for cell in re.split(r"(?<!\\)\|", bare.strip("|"))
+                )
             continue
         if item := re.match(r"([-*+]|\d+\.)\s+(.*)", bare):
             yield from flush()
@@ -118,11 +139,17 @@ def page_faults(file: Path, text: str) -> Iterator[Fault]:
             yield Fault(file, block.line, f"the phrase {found[0]!r}")
         if block.kind == "cell":
             if len(words(prose)) > CELL:
-                yield Fault(file, block.line, f"a table cell of {len(words(prose))} words, at most {CELL}")
+                yield Fault(
+                    file, block.line, f"a table cell of {len(words(prose))} words, at most {CELL}"
+                )
             continue
         for sentence in sentences(prose):
             if len(words(sentence)) > WORDS:
-                yield Fault(file, block.line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
+                yield Fault(
+                    file,
+                    block.line,
+                    f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...",
+                )
             if ";" in sentence:
                 yield Fault(file, block.line, f"a semicolon: {sentence[:60]}...")
             if len(NUMBER.findall(sentence)) > NUMBERS:
@@ -137,7 +164,9 @@ def text_faults(file: Path, line: int, text: str) -> Iterator[Fault]:
         yield Fault(file, line, f"the phrase {found[0]!r}")
     for sentence in sentences(text.replace("; ", ". ")):
         if len(words(sentence)) > WORDS:
-            yield Fault(file, line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}...")
+            yield Fault(
+                file, line, f"{len(words(sentence))} words, at most {WORDS}: {sentence[:60]}..."
+            )
 
 
 def code_faults(file: Path, text: str) -> Iterator[Fault]:
@@ -146,18 +175,27 @@ def code_faults(file: Path, text: str) -> Iterator[Fault]:
         if isinstance(node, DOCUMENTED) and (docstring := ast.get_docstring(node)):
             for block in re.split(r"\n\s*\n|\n(?=\s*[-*>]\s)", docstring):
                 if not block.startswith("    ") and not block.lstrip().startswith(">>>"):  # code
-                    yield from text_faults(file, node.body[0].lineno, plain(" ".join(block.split())))
+                    yield from text_faults(
+                        file, node.body[0].lineno, plain(" ".join(block.split()))
+                    )
         elif isinstance(node, ast.Call) and node.args and MESSAGE.fullmatch(ast.unparse(node.func)):
-            parts = node.args[0].values if isinstance(node.args[0], ast.JoinedStr) else [node.args[0]]
-            prose = "".join(str(part.value) if isinstance(part, ast.Constant) else "code" for part in parts)
+            parts = (
+                node.args[0].values if isinstance(node.args[0], ast.JoinedStr) else [node.args[0]]
+            )
+            prose = "".join(
+                str(part.value) if isinstance(part, ast.Constant) else "code" for part in parts
+            )
             yield from text_faults(file, node.lineno, prose)
 
 
 def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
     """Yield the faults of the text cells of a notebook. A line counts within the text of all of them."""
-    cells = [cell["source"] for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"]
+    cells = [
+        cell["source"] for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"
+    ]
     yield from page_faults(
-        file, "\n\n".join(source if isinstance(source, str) else "".join(source) for source in cells)
+        file,
+        "\n\n".join(source if isinstance(source, str) else "".join(source) for source in cells),
     )
 
 
@@ -171,7 +209,11 @@ def texts(root: Path, patterns: Sequence[str]) -> dict[Path, str]:
 def faults(root: Path) -> list[Fault]:
     """Return the faults of all pages, modules and notebooks below `root`."""
     rules = (PAGES, page_faults), (CODE, code_faults), (NOTEBOOKS, notebook_faults)
-    each = (check(file, text) for patterns, check in rules for file, text in texts(root, patterns).items())
+    each = (
+        check(file, text)
+        for patterns, check in rules
+        for file, text in texts(root, patterns).items()
+    )
     return [fault for found in each for fault in found]
 
 

@@ -26,24 +26,37 @@ class Statistic(NamedTuple):
     @property
     def holds(self) -> bool:
         """Whether the value keeps the limit."""
-        return self.value >= self.limit if self.least else self.value <= self.limit
+        if self.least:
+            return self.value >= self.limit
+        return self.value <= self.limit
 
 
 def longest_without_heading(text: str) -> int:
     """Return the most words of prose between two headings of a page."""
     most = count = 0
     for block in markdown_blocks(text):
-        count = 0 if block.kind == "heading" else count + len(words(plain(block.text))) * (block.kind == "prose")
+        count = (
+            0
+            if block.kind == "heading"
+            else count + len(words(plain(block.text))) * (block.kind == "prose")
+        )
         most = max(most, count)
     return most
 
 
 def statistics(pages: Mapping[Path, str]) -> list[Statistic]:
     """Return the statistics of the texts of pages."""
-    prose = [plain(block.text) for text in pages.values() for block in markdown_blocks(text) if block.kind == "prose"]
+    prose = [
+        plain(block.text)
+        for text in pages.values()
+        for block in markdown_blocks(text)
+        if block.kind == "prose"
+    ]
     lengths = sorted(len(words(one)) for text in prose for one in sentences(text))
     count = sum(len(words(text)) for text in prose)
-    numbers, readers = (sum(len(found.findall(text)) for text in prose) for found in (NUMBER, READER))
+    numbers, readers = (
+        sum(len(found.findall(text)) for text in prose) for found in (NUMBER, READER)
+    )
     run, page = max((longest_without_heading(text), page) for page, text in pages.items())
     return [
         Statistic("words of the median sentence", lengths[len(lengths) // 2], 13),

@@ -9,7 +9,8 @@ from places import ROOT
 from tests.prose import check
 from tests.prose.statistics import longest_without_heading, main, statistics
 
-PAGE, README = Path("docs/page.md"), Path("README.md")
+PAGE = Path("docs/page.md")
+README = Path("README.md")
 LONG = " ".join(["word"] * 31) + "."
 
 
@@ -20,12 +21,15 @@ def reasons(text: str, file: Path = PAGE) -> list[str]:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        (LONG, "31 words"), ("One idea; another idea.", "a semicolon"),
-        ("It has 1, 2, 3 and 4 parts.", "more than 3 numbers"), ("The sensor told us so.", "the phrase 'told'"),
-        ("| a | " + LONG + " |\n| --- | --- |", "a table cell of 31 words"), ("* an item\n* " + LONG, "31 words"),
+        (LONG, "31 words"),
+        ("One idea; another idea.", "a semicolon"),
+        ("It has 1, 2, 3 and 4 parts.", "more than 3 numbers"),
+        ("The sensor told us so.", "the phrase 'told'"),
+        ("| a | " + LONG + " |\n| --- | --- |", "a table cell of 31 words"),
+        ("* an item\n* " + LONG, "31 words"),
         ("line one\ngoes " + LONG, "words, at most"),
     ],
-)  # fmt: skip
+)
 def test_a_fault_is_found_with_its_line(text, reason):
     assert any(reason in found for found in reasons("# Title\n\n" + text))
     assert all(fault.line >= 3 for fault in check.page_faults(PAGE, "# Title\n\n" + text))
@@ -34,12 +38,17 @@ def test_a_fault_is_found_with_its_line(text, reason):
 @pytest.mark.parametrize(
     "text",
     [
-        " ".join(["word"] * 30) + ".", LONG[:40] + ". " + LONG[:40] + ".", "```\n" + LONG + "; 1 2 3 4 5\n```",
-        "    " + LONG, "See `a; b; c` and [a page](x;y).", "`a` is " + LONG[:120] + ". `b` is " + LONG[:120] + ".",
-        "By e.g. Eq. 3 of the paper, Sec. 4 holds. " + " ".join(["word"] * 25), "| 1 | 2 | 3 | 4 | 5 |",
+        " ".join(["word"] * 30) + ".",
+        LONG[:40] + ". " + LONG[:40] + ".",
+        "```\n" + LONG + "; 1 2 3 4 5\n```",
+        "    " + LONG,
+        "See `a; b; c` and [a page](x;y).",
+        "`a` is " + LONG[:120] + ". `b` is " + LONG[:120] + ".",
+        "By e.g. Eq. 3 of the paper, Sec. 4 holds. " + " ".join(["word"] * 25),
+        "| 1 | 2 | 3 | 4 | 5 |",
         "---\ntitle: a; b\n---\nFine.",
     ],
-)  # fmt: skip
+)
 def test_what_is_fine_passes(text):
     assert reasons(text) == []
 
@@ -55,7 +64,9 @@ def test_docstrings_and_messages_are_checked_and_code_is_not():
     text += f'raise UserError(f"{{x}} is it. {LONG}")\nlog("It tells.")\nname("It tells.")\nraise OSError\n'
     found = sorted((fault.line, fault.reason) for fault in check.code_faults(Path("a.py"), text))
     assert [line for line, _ in found] == [1, 5, 14, 15]
-    assert all(word in reason for word, (_, reason) in zip((" words", "tells") * 2, found, strict=True))
+    assert all(
+        word in reason for word, (_, reason) in zip((" words", "tells") * 2, found, strict=True)
+    )
 
 
 def test_the_text_of_a_notebook_is_checked_and_its_code_is_not():

@@ -13,7 +13,16 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim import dataset, scene
 from anytouch_jax.sim.scene import Scenes
 
-SCENES = Scenes(touches=10, objects=24, seed=4, sensors=("digit", "tac3d"), size=32, frames=4, vision=0.5, text=0.5)
+SCENES = Scenes(
+    touches=10,
+    objects=24,
+    seed=4,
+    sensors=("digit", "tac3d"),
+    size=32,
+    frames=4,
+    vision=0.5,
+    text=0.5,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -22,7 +31,11 @@ def _no_physics(monkeypatch):
 
 
 def tree(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +53,9 @@ def test_the_manifest_is_one_that_the_project_reads(made):
     assert len(table) == 10 * 2 * 4 + 10 and splits == {"train", "val", "test", "background"}
     rows = table.table.to_pylist()
     for index, row in enumerate(rows):
-        assert table.file(index).exists() and (row["path"].endswith(".npy") == (row["sensor"] == "tac3d"))
+        assert table.file(index).exists() and (
+            row["path"].endswith(".npy") == (row["sensor"] == "tac3d")
+        )
         if row["split"] == "background":
             assert row["touch"] is None and row["text"] is None and row["image_path"] is None
     clips = table.clips(4)
@@ -49,24 +64,42 @@ def test_the_manifest_is_one_that_the_project_reads(made):
     assert len(pairs) == 20
     _, splits = scene.objects_and_splits(SCENES)
     touches = [scene.draw_touch(SCENES, number, splits) for number in range(10)]
-    units = [scene.draw_recording(SCENES, touch, sensor).unit for touch in touches for sensor in SCENES.sensors]
+    units = [
+        scene.draw_recording(SCENES, touch, sensor).unit
+        for touch in touches
+        for sensor in SCENES.sensors
+    ]
     tints = {tuple(unit.tint) for unit in units}
-    assert len(tints) == 20, "every recording has a unit of its own, so no test unit is met in training"
+    assert len(tints) == 20, (
+        "every recording has a unit of its own, so no test unit is met in training"
+    )
 
 
 def test_shares_and_labels_are_as_drawn(made):
-    rows = [row for row in manifests.read(made / "manifest.parquet").table.to_pylist() if row["touch"]]
+    rows = [
+        row for row in manifests.read(made / "manifest.parquet").table.to_pylist() if row["touch"]
+    ]
     things, splits = scene.objects_and_splits(SCENES)
     for row in rows:
         touch = scene.draw_touch(SCENES, int(row["touch"]), splits)
         recording = scene.draw_recording(SCENES, touch, row["sensor"])
         thing = things[touch.object]
-        assert (row["image_path"] is not None, row["text"] is not None) == (recording.has_photo, recording.has_text)
+        assert (row["image_path"] is not None, row["text"] is not None) == (
+            recording.has_photo,
+            recording.has_text,
+        )
         assert (row["object"], row["split"]) == (thing.name, touch.split)
-        assert row["label.material"] == thing.material.name and row["label.indenter"] == thing.shape.primitive
+        assert (
+            row["label.material"] == thing.material.name
+            and row["label.indenter"] == thing.shape.primitive
+        )
         if row["text"]:
             assert thing.name not in row["text"].lower()
-    assert {row["image_path"] is None for row in rows} == {row["text"] is None for row in rows} == {True, False}
+    assert (
+        {row["image_path"] is None for row in rows}
+        == {row["text"] is None for row in rows}
+        == {True, False}
+    )
 
 
 def test_a_data_set_of_another_version_is_not_continued(made, monkeypatch):
@@ -80,14 +113,21 @@ def test_touches_from_another_number_on_are_others_of_the_same_objects(made, tmp
     later = replace(SCENES, touches=2, first=2)
     dataset.simulate(later, tmp_path / "later")
     number = lambda row: row["path"].split("/")[1]  # noqa: E731
-    rows = {number(row): row for row in manifests.read(tmp_path / "later" / "manifest.parquet").table.to_pylist()}
+    rows = {
+        number(row): row
+        for row in manifests.read(tmp_path / "later" / "manifest.parquet").table.to_pylist()
+    }
     assert sorted(rows) == ["000002", "000003"]
-    for row in manifests.read(made / "manifest.parquet").table.to_pylist():  # touch 2 of either is one and the same
+    # touch 2 of either is one and the same
+    for row in manifests.read(made / "manifest.parquet").table.to_pylist():
         if number(row) in rows:
             assert row["object"] == rows[number(row)]["object"]
-            assert (made / row["path"]).read_bytes() == (tmp_path / "later" / row["path"]).read_bytes()
+            assert (made / row["path"]).read_bytes() == (
+                tmp_path / "later" / row["path"]
+            ).read_bytes()
     assert '"first": 2' in (tmp_path / "later" / "dataset.json").read_text()
-    assert "first" not in (made / "dataset.json").read_text()  # data sets older than the setting go on
+    # data sets older than the setting go on
+    assert "first" not in (made / "dataset.json").read_text()
     with pytest.raises(UserError, match="first 2, not None"):
         dataset.simulate(replace(later, first=0), tmp_path / "later")
 
@@ -140,14 +180,19 @@ def test_a_finished_part_is_not_made_again(tmp_path, monkeypatch):
     first.clear()
     full = False
     dataset.simulate(SCENES, tmp_path / "full")
-    assert first == [dataset.GROUP] * 2  # two sensors of the second part, and nothing of the first
+    # two sensors of the second part, and nothing of the first
+    assert first == [dataset.GROUP] * 2
     first.clear()
-    (tmp_path / "full" / "parts").mkdir()  # a kill between the last two moves
+    # a kill between the last two moves
+    (tmp_path / "full" / "parts").mkdir()
     dataset.simulate(SCENES, tmp_path / "full")
     assert not first and not (tmp_path / "full" / "parts").exists()
-    (tmp_path / "cut" / "parts" / "00000.parquet").write_bytes(b"")  # the name without its bytes
+    # the name without its bytes
+    (tmp_path / "cut" / "parts" / "00000.parquet").write_bytes(b"")
     dataset.simulate(SCENES, tmp_path / "cut")
-    assert first == [0] * 2 + [dataset.GROUP] * 2 and tree(tmp_path / "cut") == tree(tmp_path / "full")
+    assert first == [0] * 2 + [dataset.GROUP] * 2 and tree(tmp_path / "cut") == tree(
+        tmp_path / "full"
+    )
 
 
 def test_a_folder_of_something_else_is_left_alone(made, tmp_path):
@@ -155,11 +200,15 @@ def test_a_folder_of_something_else_is_left_alone(made, tmp_path):
     with pytest.raises(UserError, match="is not empty and holds no simulated data set"):
         dataset.simulate(SCENES, tmp_path)
     assert (tmp_path / "mine.txt").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
-    with pytest.raises(UserError, match=r"holds a data set with seed 4, not 5; vision 0.5, not 0.25"):
+    with pytest.raises(
+        UserError, match=r"holds a data set with seed 4, not 5; vision 0.5, not 0.25"
+    ):
         dataset.simulate(replace(SCENES, seed=5, vision=0.25), made)
     for text in ("[1]", "", "{}"):
         (tmp_path / "dataset.json").write_text(text)
-        with pytest.raises(UserError, match=r"dataset\.json does not hold the settings of a simulated data set"):
+        with pytest.raises(
+            UserError, match=r"dataset\.json does not hold the settings of a simulated data set"
+        ):
             dataset.simulate(SCENES, tmp_path)
 
 
@@ -176,6 +225,7 @@ def test_settings_are_compared_by_value(made):
     file = made / "dataset.json"
     before = file.read_bytes()
     file.write_text(json.dumps(json.loads(before)))  # formatted otherwise
-    whole = replace(SCENES, depth=(SCENES.depth[0], int(SCENES.depth[1])))  # 1 for 1.0
+    # 1 for 1.0
+    whole = replace(SCENES, depth=(SCENES.depth[0], int(SCENES.depth[1])))
     assert SCENES.depth[1] == 1 and dataset.simulate(whole, made) == made / "manifest.parquet"
     file.write_bytes(before)

@@ -18,7 +18,10 @@ COUNT = 3000
 
 
 def flat(tree):
-    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
+    return {
+        jax.tree_util.keystr(path): leaf
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    }
 
 
 def gesture(rng):
@@ -28,7 +31,11 @@ def gesture(rng):
 
 @pytest.mark.parametrize(
     ("draw", "most"),
-    [(partial(draw_unit, SENSORS["gelsight_mini"]), 2048), (gesture, 128), (partial(draw_drift, 3), 128)],
+    [
+        (partial(draw_unit, SENSORS["gelsight_mini"]), 2048),
+        (gesture, 128),
+        (partial(draw_drift, 3), 128),
+    ],
     ids=["unit", "gesture", "drift"],
 )
 def test_both_kinds_of_draws_have_one_distribution(draw, most):
@@ -49,18 +56,24 @@ def world():
     return endless.make_world(endless.objects_of(SCENES)[:3], ("digit", "gelsight_mini"), places=2)
 
 
-SAMPLING = endless.Sampling(frames=1, takes=2, size=32, vision=0.5, fields=("displacement",), field_size=16)
+SAMPLING = endless.Sampling(
+    frames=1, takes=2, size=32, vision=0.5, fields=("displacement",), field_size=16
+)
 
 
 @pytest.fixture(scope="module")
 def drawn(world):
-    return jax.device_get(jax.jit(endless.draw_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12))
+    return jax.device_get(
+        jax.jit(endless.draw_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12)
+    )
 
 
 @pytest.fixture(scope="module")
 def touches(world):
     return jax.device_get(
-        jax.jit(endless.sample_touches, static_argnums=(2, 3))(jax.random.key(1), world, SAMPLING, 12)
+        jax.jit(endless.sample_touches, static_argnums=(2, 3))(
+            jax.random.key(1), world, SAMPLING, 12
+        )
     )
 
 
@@ -72,7 +85,9 @@ def test_touches_have_their_shapes_and_a_key_decides_them(world, touches, drawn)
     assert np.all(touches.labels["depth"].max(-1) > 0), "every still shows a touch"
     photographed = touches.photo >= 0
     place = drawn.clip.place[photographed]
-    np.testing.assert_array_equal(place[:, 0], world.places[touches.object[photographed], touches.photo[photographed]])
+    np.testing.assert_array_equal(
+        place[:, 0], world.places[touches.object[photographed], touches.photo[photographed]]
+    )
 
 
 def test_one_program_for_all_sensors_equals_the_program_of_a_sensor(touches, drawn):
@@ -82,20 +97,32 @@ def test_one_program_for_all_sensors_equals_the_program_of_a_sensor(touches, dra
         name = ("digit", "gelsight_mini")[touches.sensor[row, take]]
         field = tuple(float(x) for x in numbers.field)
         sensor = replace(SENSORS[name], field=field)
-        view = View((endless.GRID,) * 2, float(pitch), (32, 32), look(SENSORS[name]), True, (16, 16))
-        out = jax.jit(partial(simulate_clip, sensor=sensor, fidelity="fast", fields=("displacement",), view=view))(clip)
+        view = View(
+            (endless.GRID,) * 2, float(pitch), (32, 32), look(SENSORS[name]), True, (16, 16)
+        )
+        out = jax.jit(
+            partial(
+                simulate_clip, sensor=sensor, fidelity="fast", fields=("displacement",), view=view
+            )
+        )(clip)
         np.testing.assert_allclose(out.field[-1], touches.fields[row, take], atol=2e-5)
         assert np.abs(np.asarray(out.image, int) - touches.clip[row, take]).max() <= 1
-        np.testing.assert_allclose(out.labels["force"], touches.labels["force"][row, take], rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(
+            out.labels["force"], touches.labels["force"][row, take], rtol=1e-3, atol=1e-5
+        )
 
 
 def test_kinds_that_are_held_out_never_occur():
     kinds = {
-        split: {thing.kind for thing in endless.objects_of(SCENES, split, variants=3)} for split in ("train", "test")
+        split: {thing.kind for thing in endless.objects_of(SCENES, split, variants=3)}
+        for split in ("train", "test")
     }
     assert kinds["train"] and kinds["test"] and not kinds["train"] & kinds["test"]
-    own, more = endless.objects_of(SCENES), endless.objects_of(SCENES, variants=2)
-    assert more[: len(own)] == own and {thing.name for thing in more} >= {thing.name for thing in own}
+    own = endless.objects_of(SCENES)
+    more = endless.objects_of(SCENES, variants=2)
+    assert more[: len(own)] == own and {thing.name for thing in more} >= {
+        thing.name for thing in own
+    }
     assert len({thing.seed for thing in more}) == len(more)
     with pytest.raises(UserError, match="no object of 5"):
         endless.objects_of(Scenes(objects=5), "test")

@@ -15,10 +15,12 @@ SAMPLE = jax.jit(sample)
 @pytest.mark.parametrize("thing", catalogue(3, 64)[::6], ids=lambda thing: thing.name)
 def test_a_raster_of_a_tenth_of_a_millimetre_holds_the_surface(thing):
     """What is read between the pixels is the analytic surface to 4 micrometres (RMS) where a gel can touch it."""
-    shape, rng = thing.shape, np.random.default_rng(1)
+    shape = thing.shape
+    rng = np.random.default_rng(1)
     x, y = rng.uniform(-6, 6, (2, 50, 50)).astype(np.float32)
     if shape.primitive in ("edge", "corner"):
-        x, y = x - 3, y - 3
+        x = x - 3
+        y = y - 3
     z = height(shape, x, y)
     read = np.asarray(SAMPLE(relief(shape, 200, 0.1), 0.1, x, y))
     near = z > -1.0
@@ -29,9 +31,13 @@ def test_a_raster_of_a_tenth_of_a_millimetre_holds_the_surface(thing):
 def test_sample_gives_the_pixels_back():
     raster = np.random.default_rng(0).standard_normal((20, 31)).astype(np.float32)
     x, y = np.meshgrid((np.arange(31) - 15) * 0.13, (np.arange(20) - 9.5) * 0.13)
-    np.testing.assert_allclose(SAMPLE(raster, 0.13, x.astype(np.float32), y.astype(np.float32)), raster, atol=2e-4)
+    np.testing.assert_allclose(
+        SAMPLE(raster, 0.13, x.astype(np.float32), y.astype(np.float32)), raster, atol=2e-4
+    )
     # Moved by whole pixels: the rest of the raster, and its lowest border outside.
-    moved = SAMPLE(raster, 0.13, (x + 3 * 0.13).astype(np.float32), (y - 2 * 0.13).astype(np.float32))
+    moved = SAMPLE(
+        raster, 0.13, (x + 3 * 0.13).astype(np.float32), (y - 2 * 0.13).astype(np.float32)
+    )
     np.testing.assert_allclose(moved[2:, :-3], raster[:-2, 3:], atol=2e-4)
     border = min(raster[0].min(), raster[-1].min(), raster[:, 0].min(), raster[:, -1].min())
     assert np.all(np.asarray(moved)[:2] == border) and np.all(np.asarray(moved)[:, -3:] == border)
@@ -43,7 +49,9 @@ def test_sample_is_exact_on_parabolas():
     surface = lambda x, y: 0.3 * x * x - 0.2 * x * y + 0.1 * y * y + 0.4 * x - 0.7  # noqa: E731
     at = np.random.default_rng(1).uniform(-1.2, 1.2, (2, 200)).astype(np.float32)
     np.testing.assert_allclose(
-        SAMPLE(surface(x, y).astype(np.float32), 0.1, *at), surface(*at.astype(np.float64)), atol=2e-6
+        SAMPLE(surface(x, y).astype(np.float32), 0.1, *at),
+        surface(*at.astype(np.float64)),
+        atol=2e-6,
     )
 
 
@@ -73,7 +81,9 @@ def test_a_ball_dents_the_gel_where_it_is_pressed(press):
     force = np.asarray(out.force)
     assert force[0, 2] > 2 * force[1, 2] > 0 and np.abs(force[:, :2]).max() < 0.05 * force[0, 2]
     column = np.asarray(out.depth).sum(1).argmax(1)
-    assert column[2] < column[0], "the place 1 mm to the right of the ball's top lies under the middle of the gel"
+    assert column[2] < column[0], (
+        "the place 1 mm to the right of the ball's top lies under the middle of the gel"
+    )
 
 
 def test_a_drag_shears_along_it_and_a_turn_twists(press):
@@ -88,7 +98,8 @@ def test_the_gradient_is_that_of_finite_differences(press):
         return jnp.sum(simulate_touch(ball(8.0), pose[None], "digit", size=48).depth) / 1000
 
     pose = jnp.array([0.3, -0.2, 0.1, 0.5])
-    value, slope = jax.jit(total), np.asarray(jax.jit(jax.grad(total))(pose))
+    value = jax.jit(total)
+    slope = np.asarray(jax.jit(jax.grad(total))(pose))
     assert np.all(np.isfinite(slope)) and slope[3] > 0
     step = 0.02
     measured = (value(pose.at[3].add(step)) - value(pose.at[3].add(-step))) / (2 * step)

@@ -20,29 +20,42 @@ def recordings(scenes, number=0):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"sensors": ("digit", "nose")}, "no simulated sensor 'nose'"), ({"sensors": ()}, "at least one"),
+        ({"sensors": ("digit", "nose")}, "no simulated sensor 'nose'"),
+        ({"sensors": ()}, "at least one"),
         ({"sensors": ("digit", "digit")}, "once"),
         ({"depth": (-0.1, 0.5)}, "depth is a range of mm from 0 on, lowest first, not -0.1 to 0.5"),
-        ({"depth": (0.5, 0.1)}, "lowest first"), ({"fields": ("heat",)}, "no simulated field 'heat'"),
-        ({"touches": 0}, "touches must be 1 or more"), ({"vision": 1.5}, "vision must be"),
-        ({"grade": "rough"}, "grade must be"), ({"units": "two"}, "units must be"),
+        ({"depth": (0.5, 0.1)}, "lowest first"),
+        ({"fields": ("heat",)}, "no simulated field 'heat'"),
+        ({"touches": 0}, "touches must be 1 or more"),
+        ({"vision": 1.5}, "vision must be"),
+        ({"grade": "rough"}, "grade must be"),
+        ({"units": "two"}, "units must be"),
         ({"seed": -1}, "seed must be 0 or more, not -1"),
         ({"depth": (0.5, 3.0)}, "depth 3 mm may go through the gel of"),
-        ({"fields": ("shear", "shear")}, "each field once"), ({"held_out": -0.3}, "held_out must be"),
+        ({"fields": ("shear", "shear")}, "each field once"),
+        ({"held_out": -0.3}, "held_out must be"),
         ({"first": -1}, "first must be 0 or more, not -1"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_simulated_is_refused(change, sentence):
     with pytest.raises(UserError, match=sentence):
         replace(SCENES, **change)
 
 
 def test_splits_share_no_pair_of_primitive_and_texture():
-    kinds = {split: {t.kind for t, s in zip(THINGS, SPLITS, strict=True) if s == split} for split in set(SPLITS)}
+    kinds = {
+        split: {t.kind for t, s in zip(THINGS, SPLITS, strict=True) if s == split}
+        for split in set(SPLITS)
+    }
     assert set(kinds) == {"train", "val", "test"}
-    assert not kinds["train"] & kinds["test"] and not kinds["train"] & kinds["val"] and not kinds["val"] & kinds["test"]
+    assert (
+        not kinds["train"] & kinds["test"]
+        and not kinds["train"] & kinds["val"]
+        and not kinds["val"] & kinds["test"]
+    )
     assert 0.25 <= SPLITS.count("test") / len(SPLITS) < 0.4
-    for part in range(2):  # every primitive and every texture of the test objects is seen in training, apart
+    # every primitive and every texture of the test objects is seen in training, apart
+    for part in range(2):
         assert {kind[part] for kind in kinds["test"]} <= {kind[part] for kind in kinds["train"]}
 
 
@@ -85,15 +98,25 @@ def test_one_device_of_each_sensor_mounted_straight():
 
 def test_fine_recordings_move_alike_and_coarse_ones_share_only_the_place():
     fine = list(recordings(SCENES, 5).values())
-    assert all(np.array_equal(fine[0].motion, r.motion) and np.array_equal(fine[0].depth, r.depth) for r in fine)
+    assert all(
+        np.array_equal(fine[0].motion, r.motion) and np.array_equal(fine[0].depth, r.depth)
+        for r in fine
+    )
     assert all(np.array_equal(fine[0].start, r.start) and not r.tilt.any() for r in fine)
-    assert len({float(r.unit.rotation) for r in fine}) == len(fine)  # but no two units are alike
+    # but no two units are alike
+    assert len({float(r.unit.rotation) for r in fine}) == len(fine)
     coarse = list(recordings(replace(SCENES, grade="coarse"), 5).values())
-    assert len({r.depth.max() for r in coarse}) == len({tuple(r.start) for r in coarse}) == len(coarse)
+    assert (
+        len({r.depth.max() for r in coarse}) == len({tuple(r.start) for r in coarse}) == len(coarse)
+    )
     assert all(r.tilt.any() for r in coarse)
     assert all(np.array_equal(r.touch.place, coarse[0].touch.place) for r in coarse)
     offsets = np.asarray(
-        [r.start[:2] for n in range(60) for r in recordings(replace(SCENES, grade="coarse"), n).values()]
+        [
+            r.start[:2]
+            for n in range(60)
+            for r in recordings(replace(SCENES, grade="coarse"), n).values()
+        ]
     )
     assert 0.6 < offsets.std() < 1.0 and np.abs(offsets.mean()) < 0.15
 
@@ -102,41 +125,63 @@ def gesture(motion, slide=(0.0, 0.0), twist=0.0, shown=1.0, middle=0.5, lift=-1.
     """A gesture whose phases lift 10 %, press 20 %, pause 10 %, move 30 %, pause 10 %, release 10 % and lift 10 %."""
     phases = np.array([1, 2, 1, 3, 1, 1, 1]) / 10
     return Gesture(
-        0.8, scene.MOTIONS.index(motion), np.asarray(slide), twist, phases, shown, middle, lift,
+        0.8,
+        scene.MOTIONS.index(motion),
+        np.asarray(slide),
+        twist,
+        phases,
+        shown,
+        middle,
+        lift,
         np.array([1.0, 0.0, 0.1]),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("motion", ["hold", "slide", "twist"])
 def test_a_gesture_presses_then_moves_then_lets_go(motion):
-    slide, twist = np.array([1.5, -0.5]) * (motion == "slide"), 0.2 * (motion == "twist")
+    slide = np.array([1.5, -0.5]) * (motion == "slide")
+    twist = 0.2 * (motion == "twist")
     moved, depth = scene.trajectory(101, gesture(motion, slide, twist))
     assert moved.shape == (101, 3) and depth.shape == (101,)
     touching = depth > 0
     assert 0.75 < touching.mean() < 0.85 and not touching[:10].any() and not touching[-10:].any()
     assert depth.max() == pytest.approx(0.8) and (depth[31:80] == depth.max()).all()
-    assert (np.diff(depth[touching][:20]) >= 0).all() and np.abs(np.diff(depth[touching])).max() < 0.15
+    assert (np.diff(depth[touching][:20]) >= 0).all() and np.abs(
+        np.diff(depth[touching])
+    ).max() < 0.15
     assert not moved[:40].any()
     np.testing.assert_allclose(moved[-1], [*slide, twist], atol=1e-9)
-    assert (np.diff(moved @ np.sign([1.5, -0.5, 0.2])) >= -1e-12).all()  # never backwards
+    # never backwards
+    assert (np.diff(moved @ np.sign([1.5, -0.5, 0.2])) >= -1e-12).all()
 
 
 def test_directions_are_those_of_the_picture():
     recording = recordings(SCENES, 0)["digit"]
     assert (
-        scene.directions(recording._replace(gesture=gesture("slide", (2, 0)), depth=-np.ones(10)))["label.motion"]
+        scene.directions(recording._replace(gesture=gesture("slide", (2, 0)), depth=-np.ones(10)))[
+            "label.motion"
+        ]
         == "hold"
     )
 
     def seen(motion, slide=(0.0, 0.0), twist=0.0, mirror=(1, 1), rotation=0.0):
-        unit = recording.unit._replace(mirror=np.asarray(mirror, np.float32), rotation=np.float32(rotation))
-        return scene.directions(recording._replace(unit=unit, gesture=gesture(motion, slide, twist), depth=np.ones(10)))
+        unit = recording.unit._replace(
+            mirror=np.asarray(mirror, np.float32), rotation=np.float32(rotation)
+        )
+        return scene.directions(
+            recording._replace(unit=unit, gesture=gesture(motion, slide, twist), depth=np.ones(10))
+        )
 
     assert seen("hold") == {"label.motion": "hold", "label.twist": "none", "label.slide": "none"}
-    assert seen("slide", (2, 0.3)) == {"label.motion": "slide", "label.twist": "none", "label.slide": "right"}
+    assert seen("slide", (2, 0.3)) == {
+        "label.motion": "slide",
+        "label.twist": "none",
+        "label.slide": "right",
+    }
     assert seen("slide", (2, 0.3), mirror=(-1, 1))["label.slide"] == "left"
     assert seen("slide", (0.1, 1))["label.slide"] == "down"
     assert seen("slide", (1, 0), rotation=math.pi / 2)["label.slide"] == "down"
-    assert seen("twist", twist=0.2)["label.twist"] == "clockwise"  # from x (right) to y (down)
+    # from x (right) to y (down)
+    assert seen("twist", twist=0.2)["label.twist"] == "clockwise"
     assert seen("twist", twist=0.2, mirror=(-1, 1))["label.twist"] == "counterclockwise"
     assert seen("twist", twist=0.2, mirror=(-1, -1))["label.twist"] == "clockwise"

@@ -16,10 +16,15 @@ class BlankRecorder:
         return [self.take(recording) for recording in recordings]
 
     def take(self, recording):
-        frames, rng = self.scenes.frames, np.random.default_rng(recording.seed)
+        frames = self.scenes.frames
+        rng = np.random.default_rng(recording.seed)
         labels = {name: rng.random(frames) for name in ("force", "depth", "area", "x", "y", "slip")}
         if SENSORS[recording.sensor].kind == "field":
             return ClipOutput(None, None, rng.random((frames, 20, 20, 6), np.float32), labels)
         picture = np.full((frames, 43, 32, 3), recording.seed % 251, np.uint8)
-        field = rng.random((frames, 12, 8, len(self.scenes.fields)), np.float32) if self.scenes.fields else None
+        field = (
+            rng.random((frames, 12, 8, len(self.scenes.fields)), np.float32)
+            if self.scenes.fields
+            else None
+        )
         return ClipOutput(picture, picture[0], field, labels)

@@ -14,7 +14,11 @@ def chat(content, **extra):
     text = content if isinstance(content, str) or content is None else json.dumps(content)
     message = {"role": "assistant", "content": text} | extra.pop("message", {})
     choice = {"index": 0, "message": message, "finish_reason": extra.pop("finish", "stop")}
-    return {"id": "x", "choices": [choice], "usage": {"prompt_tokens": 100, "completion_tokens": 20}} | extra
+    return {
+        "id": "x",
+        "choices": [choice],
+        "usage": {"prompt_tokens": 100, "completion_tokens": 20},
+    } | extra
 
 
 class _Server(ThreadingHTTPServer):
@@ -23,8 +27,13 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, behave):
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.behave, self.asked, self.heads = behave, [], []
-        self.lock, self.release, self.busy, self.most = threading.Lock(), threading.Event(), 0, 0
+        self.behave = behave
+        self.asked = []
+        self.heads = []
+        self.lock = threading.Lock()
+        self.release = threading.Event()
+        self.busy = 0
+        self.most = 0
 
     @property
     def url(self):
@@ -38,7 +47,9 @@ class _Handler(BaseHTTPRequestHandler):
         with server.lock:
             number = len(server.asked)
             server.asked.append(body)
-            server.heads.append((self.path, {name.title(): value for name, value in self.headers.items()}))
+            server.heads.append(
+                (self.path, {name.title(): value for name, value in self.headers.items()})
+            )
             server.busy += 1
             server.most = max(server.most, server.busy)
         try:

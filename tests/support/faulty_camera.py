@@ -17,8 +17,11 @@ class FaultyCamera:
     """
 
     def __init__(self, kind: str = "ok", fails_at: int = 3, frames: int = 12) -> None:
-        self.kind, self.fails_at, self.frames = kind, fails_at, frames
-        self.count, self.released = -1, False
+        self.kind = kind
+        self.fails_at = fails_at
+        self.frames = frames
+        self.count = -1
+        self.released = False
 
     def isOpened(self) -> bool:
         return True
@@ -31,13 +34,20 @@ class FaultyCamera:
         self.count += 1
         if self.kind == "raise" and self.count == self.fails_at:
             raise cv2.error("device lost")
-        return self.count < self.frames and not (self.kind == "grab" and self.count == self.fails_at)
+        return self.count < self.frames and not (
+            self.kind == "grab" and self.count == self.fails_at
+        )
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        now, later = self.count == self.fails_at, self.count >= self.fails_at
+        now = self.count == self.fails_at
+        later = self.count >= self.fails_at
         if now and self.kind in ("retrieve", "none"):
             return self.kind == "none", None
-        size = (16, 20) if (self.kind == "smaller" and now) or (self.kind == "resized" and later) else (32, 40)
+        size = (
+            (16, 20)
+            if (self.kind == "smaller" and now) or (self.kind == "resized" and later)
+            else (32, 40)
+        )
         shape = size if self.kind == "grey" and now else (*size, 3)
         lasting = {"black": 0, "frozen": 90}.get(self.kind) if later else None
         return True, np.full(shape, 90 + self.count if lasting is None else lasting, np.uint8)
@@ -72,8 +82,10 @@ def write_uneven_video(path: Path, milliseconds: list[int]) -> Path:
     for number in range(len(milliseconds)):
         writer.write(np.full((32, 40, 3), 8 * number, np.uint8))
     writer.release()
-    data, start = bytearray(path.read_bytes()), 0
-    for number, time_stamp in enumerate(milliseconds):  # of a block: track 1, i16 time, whether it is a key frame
+    data = bytearray(path.read_bytes())
+    start = 0
+    # of a block: track 1, i16 time, whether it is a key frame
+    for number, time_stamp in enumerate(milliseconds):
         is_key = b"\0" if number % 12 else b"\x80"
         start = data.index(b"\x81" + (100 * number).to_bytes(2, "big") + is_key, start)
         data[start + 1 : start + 3] = time_stamp.to_bytes(2, "big")

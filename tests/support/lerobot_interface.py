@@ -30,7 +30,9 @@ class CameraConfig(abc.ABC):  # noqa: B024
 
 class Camera(abc.ABC):
     def __init__(self, config: CameraConfig) -> None:
-        self.fps, self.width, self.height = config.fps, config.width, config.height
+        self.fps = config.fps
+        self.width = config.width
+        self.height = config.height
 
     @property
     @abc.abstractmethod
@@ -68,7 +70,8 @@ class FilmCamera(Camera):
 
     def __init__(self, config: OpenCVCameraConfig) -> None:
         super().__init__(config)
-        self.config, self._next = config, None
+        self.config = config
+        self._next = None
 
     @property
     def is_connected(self) -> bool:
@@ -79,7 +82,8 @@ class FilmCamera(Camera):
         return [{"name": "film", "type": "OpenCV", "id": 0}]
 
     def connect(self, warmup: bool = True) -> None:
-        self._next, self.fps = 0, 30
+        self._next = 0
+        self.fps = 30
         self.height, self.width = self.frames[0].shape[:2]
 
     def read(self) -> np.ndarray:
@@ -102,10 +106,15 @@ class FilmCamera(Camera):
 def modules() -> dict[str, ModuleType]:
     """The modules of LeRobot that a camera plugin imports."""
     content = {
-        "lerobot": {}, "lerobot.cameras": {}, "lerobot.cameras.camera": {"Camera": Camera},
+        "lerobot": {},
+        "lerobot.cameras": {},
+        "lerobot.cameras.camera": {"Camera": Camera},
         "lerobot.cameras.configs": {"CameraConfig": CameraConfig},
-        "lerobot.cameras.opencv": {"OpenCVCamera": FilmCamera, "OpenCVCameraConfig": OpenCVCameraConfig},
-    }  # fmt: skip
+        "lerobot.cameras.opencv": {
+            "OpenCVCamera": FilmCamera,
+            "OpenCVCameraConfig": OpenCVCameraConfig,
+        },
+    }
     made = {name: ModuleType(name) for name in content}
     for name, names in content.items():
         vars(made[name]).update(names)

@@ -13,25 +13,33 @@ CAMERAS = {"gelsight_mini": (90, 120, 60), "digit": (60, 60, 120), "duragel": (1
 
 def scene(rng: np.random.Generator, size: int = 28) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The images u8 (size, size, 3) of one press by name of the camera, and its field f32 (20, 20, 6)."""
-    place, depth = rng.uniform(-0.6, 0.6, 2), rng.uniform(0.3, 1.0)
+    place = rng.uniform(-0.6, 0.6, 2)
+    depth = rng.uniform(0.3, 1.0)
 
     def dent(side: int) -> np.ndarray:
         y, x = (np.mgrid[:side, :side] + 0.5) * 2 / side - 1
         return depth * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 0.15)
 
-    light = dent(size)[..., None] * np.array([[100, -40, 60], [-50, 100, 40], [60, 90, -50]])[:, None, None]
+    light = (
+        dent(size)[..., None]
+        * np.array([[100, -40, 60], [-50, 100, 40], [60, 90, -50]])[:, None, None]
+    )
     images = {
         name: np.clip(np.asarray(ground) + light[k], 0, 255).astype(np.uint8)
         for k, (name, ground) in enumerate(CAMERAS.items())
     }
-    return images, (dent(20)[..., None] * np.array([0.1, -0.1, 1.0, 1e-3, 1e-3, 4e-3])).astype(np.float32)
+    return images, (dent(20)[..., None] * np.array([0.1, -0.1, 1.0, 1e-3, 1e-3, 4e-3])).astype(
+        np.float32
+    )
 
 
 def arrays(count: int, seed: int = 0, size: int = 28) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """GelSight Mini and DuraGel images u8 (n, size, size, 3), Tac3D fields f32 (n, 20, 20, 6), of `count` presses."""
     rng = np.random.default_rng(seed)
     several = [scene(rng, size) for _ in range(count)]
-    first, second = (np.stack([images[name] for images, _ in several]) for name in ("gelsight_mini", "duragel"))
+    first, second = (
+        np.stack([images[name] for images, _ in several]) for name in ("gelsight_mini", "duragel")
+    )
     return first, second, np.stack([field for _, field in several])
 
 
@@ -46,10 +54,15 @@ def make_pairs(folder: Path, touches: dict[str, int], frames: int = 2) -> Path:
                 images, field = scene(rng)
                 stem = f"{split}{number}_{frame}"
                 np.save(folder / f"{stem}.npy", field)
-                rows.append(row(f"{stem}.npy", "tac3d", split, number, frame) | {"field_path": f"{stem}.npy"})
+                rows.append(
+                    row(f"{stem}.npy", "tac3d", split, number, frame)
+                    | {"field_path": f"{stem}.npy"}
+                )
                 for name, image in images.items():
                     cv2.imwrite(str(folder / f"{stem}_{name}.png"), image[..., ::-1])
-                    rows.append(row(f"{stem}_{name}.png", name, split, number, frame) | {"field_path": None})
+                    rows.append(
+                        row(f"{stem}_{name}.png", name, split, number, frame) | {"field_path": None}
+                    )
     order = rng.permutation(len(rows))
     columns = {name: [rows[i][name] for i in order] for name in rows[0]}
     file = folder / "manifest.parquet"
@@ -57,8 +70,16 @@ def make_pairs(folder: Path, touches: dict[str, int], frames: int = 2) -> Path:
     return file
 
 
-def row(path: str, sensor: str, split: str, number: int, frame: int, grade: str | None = "fine") -> dict[str, Any]:
+def row(
+    path: str, sensor: str, split: str, number: int, frame: int, grade: str | None = "fine"
+) -> dict[str, Any]:
     return {
-        "path": path, "sensor": sensor, "sequence": f"{split}/{number}/{sensor}/{grade}", "frame_index": frame,
-        "split": split, "touch": f"{split}/{number}", "object": f"{split} thing {number}", "grade": grade,
-    }  # fmt: skip
+        "path": path,
+        "sensor": sensor,
+        "sequence": f"{split}/{number}/{sensor}/{grade}",
+        "frame_index": frame,
+        "split": split,
+        "touch": f"{split}/{number}",
+        "object": f"{split} thing {number}",
+        "grade": grade,
+    }

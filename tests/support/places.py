@@ -4,5 +4,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENTS = ROOT / "experiments"
-SHARED = ROOT.parent / "shared"  # data next to the checkout; tests that need it are skipped without it
+# data next to the checkout; tests that need it are skipped without it
+SHARED = ROOT.parent / "shared"
 SUPPORT = ROOT / "tests" / "support"

@@ -7,7 +7,9 @@ LOOKS = "coloured", "darkening", "dotted"
 SENSORS = {"coloured": "gelsight_mini", "darkening": "9dtact", "dotted": "gelsight"}
 
 
-def gel_frame(look: str, depth: float, shape: str = "ball", shift: float = 0.0, seed: int = 0) -> np.ndarray:
+def gel_frame(
+    look: str, depth: float, shape: str = "ball", shift: float = 0.0, seed: int = 0
+) -> np.ndarray:
     """Return one frame u8 RGB (120, 160, 3) of a gel pressed by `depth` (0 to 1) at `shift` pixels from the middle."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float64)
     rng = np.random.default_rng(seed)
@@ -16,7 +18,9 @@ def gel_frame(look: str, depth: float, shape: str = "ball", shift: float = 0.0, 
         picture = 165 - ((x - 80) ** 2 + (y - 60) ** 2) / 560 - 34 * dent
         picture = np.repeat(picture[..., None], 3, 2)
     else:
-        picture = np.dstack([90 + 30 * np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 3000), 100 + 0 * x, 80 + y / 6])
+        picture = np.dstack(
+            [90 + 30 * np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 3000), 100 + 0 * x, 80 + y / 6]
+        )
         contrast = 280 if look == "dotted" else 180
         picture[..., 0] += contrast * np.gradient(dent, axis=1)
         picture[..., 2] += contrast * np.gradient(dent, axis=0)
@@ -31,7 +35,9 @@ def gel_frame(look: str, depth: float, shape: str = "ball", shift: float = 0.0, 
     return np.clip(picture + rng.normal(0, 1.2, picture.shape), 0, 255).astype(np.uint8)
 
 
-def press_film(look: str, share: float, shape: str = "ball", frames: int = 40) -> tuple[list[np.ndarray], np.ndarray]:
+def press_film(
+    look: str, share: float, shape: str = "ball", frames: int = 40
+) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the frames of one film and whether each is pressed: free, a press that slides, free."""
     pressed = round(share * frames)
     first = (frames - pressed + 1) // 2
@@ -41,7 +47,9 @@ def press_film(look: str, share: float, shape: str = "ball", frames: int = 40) -
     for number in range(frames):
         place = (number - first + 0.5) / max(pressed, 1)
         depth = (0.6 + 0.4 * np.sin(np.pi * place)) * contact[number]
-        pictures.append(gel_frame(look, depth, shape, 14 * (place - 0.5) * contact[number], seed + number))
+        pictures.append(
+            gel_frame(look, depth, shape, 14 * (place - 0.5) * contact[number], seed + number)
+        )
     return pictures, contact
 
 
@@ -51,4 +59,5 @@ def _dent(shape: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     if shape == "bar":
         return np.asarray(np.exp(-((np.abs(y) / 9) ** 4) - (x / 45) ** 4))
     inside = (np.abs(x) < 55) & (np.abs(y) < 42)
-    return np.asarray(inside * np.exp(-((((x + 8) % 16) - 8) ** 2 + (((y + 7) % 14) - 7) ** 2) / 8))  # pins
+    # pins
+    return np.asarray(inside * np.exp(-((((x + 8) % 16) - 8) ** 2 + (((y + 7) % 14) - 7) ** 2) / 8))

@@ -40,12 +40,20 @@ class ProgramCount:
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
         if hasattr(session.config, "workeroutput"):
             session.config.workeroutput["programs"] = dict(self.tests), dict(self.names)
-        elif session.config.option.markexpr == "not slow" and self.tests.total() > LIMIT and not session.exitstatus:
+        elif (
+            session.config.option.markexpr == "not slow"
+            and self.tests.total() > LIMIT
+            and not session.exitstatus
+        ):
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        write, most = terminalreporter.write_line, self.tests.total() > LIMIT
-        write(f"{self.tests.total()} compiled programs, of at most {LIMIT} of all quick tests", red=most)
+        write = terminalreporter.write_line
+        most = self.tests.total() > LIMIT
+        write(
+            f"{self.tests.total()} compiled programs, of at most {LIMIT} of all quick tests",
+            red=most,
+        )
         if terminalreporter.config.option.verbose > 0 or most:
             for counts in (self.tests, self.names):
                 for name, count in counts.most_common(20):

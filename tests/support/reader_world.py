@@ -23,7 +23,14 @@ def fill(root: Path, files: Iterable[str]) -> None:
 
 def fill_ycb(root: Path, objects: Iterable[str] = ("mug",), frames: int = 4) -> None:
     """Write YCB-Slide with one recording of each object."""
-    fill(root, [f"real/{name}/dataset_0/frames/frame_{i:07d}.jpg" for name in objects for i in range(frames)])
+    fill(
+        root,
+        [
+            f"real/{name}/dataset_0/frames/frame_{i:07d}.jpg"
+            for name in objects
+            for i in range(frames)
+        ],
+    )
 
 
 class Table:

@@ -15,10 +15,20 @@ from anytouch_jax.pretrain import pretrain
 from anytouch_jax.train.loop import FitResult
 from anytouch_jax.weights.tree import flatten
 
-TIMING = ("samples_per_second", "wait", "wait_share")  # the fields of a line that differ between equal runs
+# the fields of a line that differ between equal runs
+TIMING = ("samples_per_second", "wait", "wait_share")
 COLUMNS = (
-    "path", "sensor", "sequence", "frame_index", "split", "touch", "object", "image_path", "text", "label.object",
-)  # fmt: skip
+    "path",
+    "sensor",
+    "sequence",
+    "frame_index",
+    "split",
+    "touch",
+    "object",
+    "image_path",
+    "text",
+    "label.object",
+)
 # sequence -> sensor and the split of its four frames
 SEQUENCES = {
     "a": ("digit", ("train",) * 4),
@@ -29,10 +39,19 @@ SEQUENCES = {
 
 # The options of `anytouch train` for a network that compiles fast.
 SIZES = {
-    "model.image-size": 28, "model.patch": 7, "model.embed": 12, "model.touch.width": 16, "model.touch.depth": 1,
-    "model.touch.heads": 2, "model.touch.mlp": 32, "model.decoder.width": 8, "model.decoder.depth": 1,
-    "model.decoder.heads": 2, "model.decoder.mlp": 16, "data.clip-share": 0,
-}  # fmt: skip
+    "model.image-size": 28,
+    "model.patch": 7,
+    "model.embed": 12,
+    "model.touch.width": 16,
+    "model.touch.depth": 1,
+    "model.touch.heads": 2,
+    "model.touch.mlp": 32,
+    "model.decoder.width": 8,
+    "model.decoder.depth": 1,
+    "model.decoder.heads": 2,
+    "model.decoder.mlp": 16,
+    "data.clip-share": 0,
+}
 
 
 def make_world(folder: Path) -> Path:
@@ -49,7 +68,9 @@ def make_world(folder: Path) -> Path:
             cv2.imwrite(str(folder / path), image.astype(np.uint8))
             photo = "photo.png" if (name, frame) == ("a", 2) else ""
             text = f"a round thing, {name}" if thing == "ball" and split == "train" else ""
-            rows.append((path, sensor, name, frame, split, f"place {thing}", thing, photo, text, thing))
+            rows.append(
+                (path, sensor, name, frame, split, f"place {thing}", thing, photo, text, thing)
+            )
     return write_manifest(folder / "manifest.csv", rows)
 
 
@@ -65,15 +86,24 @@ def read_rows(manifest: Path) -> list[dict[str, str]]:
 
 
 def run_config(
-    manifest: Path, stage: int = 1, recipe: str = "paper", towers: str = "scratch", *, steps: int = 4,
-    batch: int = 8, model: dict[str, Any] | None = None, **run: Any,
-) -> Config:  # fmt: skip
+    manifest: Path,
+    stage: int = 1,
+    recipe: str = "paper",
+    towers: str = "scratch",
+    *,
+    steps: int = 4,
+    batch: int = 8,
+    model: dict[str, Any] | None = None,
+    **run: Any,
+) -> Config:
     """A recipe on the smallest model and the small world; a step for each of the four devices to share."""
     config = tiny_config(stage, recipe, towers, **(model or {}))
     data = replace(config.data, manifests=(str(manifest),), batch_size=batch)
     settings: dict[str, Any] = {"steps": steps, "save_every": steps, "figure_every": 0} | run
     if config.model.text:  # room for the tokenizer that is trained on the captions
-        config = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=2048)))
+        config = replace(
+            config, model=replace(config.model, text=replace(config.model.text, vocab=2048))
+        )
     return replace(config, data=data, run=replace(config.run, **settings))
 
 

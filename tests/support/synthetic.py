@@ -34,33 +34,57 @@ def change(results: Path, key: str, **values: Any) -> None:
 
 
 def record_of(leaf: plan.Leaf, mean: Mean = level) -> dict[str, Any]:
-    rows = [row for one in COLUMNS[leaf.question] for row in _rows(leaf, one.view, one.task, one.metric, mean)]
+    rows = [
+        row
+        for one in COLUMNS[leaf.question]
+        for row in _rows(leaf, one.view, one.task, one.metric, mean)
+    ]
     return {
-        "question": leaf.question, "name": leaf.name, "seed": leaf.seed, "identity": leaf.identity,
-        "simulator": plan.simulator(), "settings": plan.settings(leaf.size), "scoring": plan.scoring(leaf.question),
-        "size": leaf.size.name, "trained": [{"key": one.key, "seconds": 60.0} for one in leaf.trainings],
-        "data": {"own": "0" * 64}, "version": "0", "source": "s", "machine": "a machine; load 1", "seconds": 30.0,
-        "rows": rows, "points": _points(leaf.seed) if leaf.question == "q2" else [],
-    }  # fmt: skip
+        "question": leaf.question,
+        "name": leaf.name,
+        "seed": leaf.seed,
+        "identity": leaf.identity,
+        "simulator": plan.simulator(),
+        "settings": plan.settings(leaf.size),
+        "scoring": plan.scoring(leaf.question),
+        "size": leaf.size.name,
+        "trained": [{"key": one.key, "seconds": 60.0} for one in leaf.trainings],
+        "data": {"own": "0" * 64},
+        "version": "0",
+        "source": "s",
+        "machine": "a machine; load 1",
+        "seconds": 30.0,
+        "rows": rows,
+        "points": _points(leaf.seed) if leaf.question == "q2" else [],
+    }
 
 
 SILHOUETTES = [f"silhouette by {one}" for one in ("sensor", "object")]
 COLUMNS = {
-    "q1": (*FOUR, *FORM), "ablations": (*FOUR, *FORM), "q3": (*SIX, *FORM, *MOVING),
-    "q2": (Column("class token", "top-1", "share"), *(Column("class token", one, one) for one in SILHOUETTES)),
-}  # fmt: skip
+    "q1": (*FOUR, *FORM),
+    "ablations": (*FOUR, *FORM),
+    "q3": (*SIX, *FORM, *MOVING),
+    "q2": (
+        Column("class token", "top-1", "share"),
+        *(Column("class token", one, one) for one in SILHOUETTES),
+    ),
+}
 
 
 def _rows(leaf: plan.Leaf, view: str, task: str, metric: str, mean: Mean) -> list[dict[str, Any]]:
     value = mean(leaf.question, leaf.name, leaf.seed, view, task)
     shared = {"view": view, "task": task, "metric": metric, "test": 100}
     both = ("honest",) if leaf.question == "q2" else ("honest", "published")
-    return [shared | {"protocol": one, "mean": value, "low": value - 0.05, "high": value + 0.05} for one in both]
+    return [
+        shared | {"protocol": one, "mean": value, "low": value - 0.05, "high": value + 0.05}
+        for one in both
+    ]
 
 
 def _points(seed: int) -> list[dict[str, Any]]:
     rng = np.random.default_rng(seed)
     return [
         {"x": float(rng.normal()), "y": float(rng.normal()), "sensor": sensor, "touch": touch}
-        for touch in range(30) for sensor in ("digit", "gelsight", "gelsight_mini")
-    ]  # fmt: skip
+        for touch in range(30)
+        for sensor in ("digit", "gelsight", "gelsight_mini")
+    ]

@@ -37,12 +37,16 @@ class Compiled:
     """The methods of a network, each under one `jax.jit`: outside of it every operation is a program for itself."""
 
     def __init__(self, net: Net) -> None:
-        self.net, self.bind, self.abstract = net, net.bind, net.abstract
+        self.net = net
+        self.bind = net.bind
+        self.abstract = net.abstract
         self.params = net.init(jax.random.key(0))
 
     @cache  # noqa: B019  of the few networks of a module
     def __getattr__(self, name: str) -> Any:
-        static = {"encode_touch": "join", "encode_poolings": "join", "reconstruct": "frames"}.get(name)
+        static = {"encode_touch": "join", "encode_poolings": "join", "reconstruct": "frames"}.get(
+            name
+        )
         return jax.jit(getattr(self.net, name), static_argnames=static)
 
 

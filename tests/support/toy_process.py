@@ -41,9 +41,20 @@ def batches_of(index: int, count: int, *, at: int = -1, number: int = 0):
     return batches
 
 
-def start(run_dir: Path, count: int = 2, *, devices: int = 1, hit: int = -1, at: int = -1, number: int = 0, **run):
+def start(
+    run_dir: Path,
+    count: int = 2,
+    *,
+    devices: int = 1,
+    hit: int = -1,
+    at: int = -1,
+    number: int = 0,
+    **run,
+):
     """Start `count` processes that train in `run_dir`; process `hit` gets the signal `number` before step `at`."""
-    settings = json.dumps({"run_dir": str(run_dir), "hit": hit, "at": at, "number": number, "run": run})
+    settings = json.dumps(
+        {"run_dir": str(run_dir), "hit": hit, "at": at, "number": number, "run": run}
+    )
     return spawn([__file__, settings], count, devices)
 
 
@@ -57,12 +68,18 @@ def spawn(words: list[str], count: int = 2, devices: int = 1, *folders: Path):
     """Start `count` processes of Python that find each other, with the tests' helpers and `folders` in their path."""
     path = [str(SRC), str(SUPPORT), *map(str, folders), os.environ.get("PYTHONPATH", "")]
     common = os.environ | {
-        "PYTHONPATH": os.pathsep.join(path), "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
-        "JAX_NUM_CPU_DEVICES": str(devices), "JAX_COORDINATOR_ADDRESS": free_address(), "JAX_NUM_PROCESSES": str(count),
-    }  # fmt: skip
+        "PYTHONPATH": os.pathsep.join(path),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
+        "JAX_NUM_CPU_DEVICES": str(devices),
+        "JAX_COORDINATOR_ADDRESS": free_address(),
+        "JAX_NUM_PROCESSES": str(count),
+    }
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     places = [common | {"JAX_PROCESS_ID": str(index)} for index in range(count)]
-    return [subprocess.Popen([sys.executable, *words], env=place, text=True, **pipes) for place in places]
+    return [
+        subprocess.Popen([sys.executable, *words], env=place, text=True, **pipes)
+        for place in places
+    ]
 
 
 def finish(processes, timeout: float = 600):
@@ -82,10 +99,14 @@ def main(run_dir: str, hit: int, at: int, number: int, run: dict) -> None:
     with joined() as place:
         index = place.index
         fit(
-            config_of(**run), params=toy_params(WIDE), loss_fn=toy_loss,
-            batches=batches_of(index, jax.process_count(), at=at if index == hit else -1, number=number),
+            config_of(**run),
+            params=toy_params(WIDE),
+            loss_fn=toy_loss,
+            batches=batches_of(
+                index, jax.process_count(), at=at if index == hit else -1, number=number
+            ),
             run_dir=Path(run_dir),
-        )  # fmt: skip
+        )
 
 
 if __name__ == "__main__":

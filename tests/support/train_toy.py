@@ -14,16 +14,22 @@ import numpy as np
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config, DataConfig, OptimConfig, RunConfig, preset
 
-ROWS, PIXELS, WIDTH = 8, 12, 4
+ROWS = 8
+PIXELS = 12
+WIDTH = 4
 
 
-def toy_config(*, steps: int = 8, optim: dict | None = None, data: dict | None = None, **run) -> Config:
+def toy_config(
+    *, steps: int = 8, optim: dict | None = None, data: dict | None = None, **run
+) -> Config:
     tiny = preset("tiny")
     settings = {"save_every": 3, "figure_every": 0, "steps": steps, "max_skipped": 3} | run
     return dataclasses.replace(
-        tiny, optim=OptimConfig(**({"learning_rate": 0.05, "warmup": 2} | (optim or {}))),
-        data=DataConfig(**({"batch_size": ROWS} | (data or {}))), run=RunConfig(**settings),
-    )  # fmt: skip
+        tiny,
+        optim=OptimConfig(**({"learning_rate": 0.05, "warmup": 2} | (optim or {}))),
+        data=DataConfig(**({"batch_size": ROWS} | (data or {}))),
+        run=RunConfig(**settings),
+    )
 
 
 def toy_params(wide: int = WIDTH) -> dict:
@@ -36,10 +42,12 @@ def toy_params(wide: int = WIDTH) -> dict:
     return {
         "trunk": {"kernel": draw(PIXELS, wide), "bias": draw(wide)},
         "decoder": {
-            "position": draw(wide), "still_head": {"kernel": draw(wide, 2)}, "clip_head": {"kernel": draw(wide, 3)},
+            "position": draw(wide),
+            "still_head": {"kernel": draw(wide, 2)},
+            "clip_head": {"kernel": draw(wide, 3)},
         },
         "idle": {"kernel": draw(3, 3)},
-    }  # fmt: skip
+    }
 
 
 def toy_loss(params, batch, key, progress):
@@ -49,7 +57,8 @@ def toy_loss(params, batch, key, progress):
     """
     pixels = batch.clip.astype(jnp.float32) / 255.0
     flat = pixels.reshape(*pixels.shape[:2], -1).mean(1)
-    trunk, decoder = params["trunk"], params["decoder"]
+    trunk = params["trunk"]
+    decoder = params["decoder"]
     hidden = jnp.tanh(flat @ trunk["kernel"] + trunk["bias"][None] + decoder["position"][None])
     kind = "still_head" if batch.clip.shape[1] == 1 else "clip_head"
     out = hidden @ decoder[kind]["kernel"]
@@ -92,7 +101,9 @@ def main(run_dir: str, at: int, number: int) -> None:
     def batches(start, stop):
         return stopping_batches(start, stop, at=at, number=number)
 
-    result = fit(toy_config(), params=toy_params(), loss_fn=toy_loss, batches=batches, run_dir=Path(run_dir))
+    result = fit(
+        toy_config(), params=toy_params(), loss_fn=toy_loss, batches=batches, run_dir=Path(run_dir)
+    )
     sys.exit(130 if result.interrupted == signal.SIGINT else 0)
 
 

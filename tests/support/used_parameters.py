@@ -14,9 +14,18 @@ from jax.extend.core import Literal
 Tree = Any
 # Primitives whose inputs and outputs are, one by one, those of the program inside.
 _CALLS = {
-    "jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2", "custom_jvp_call", "custom_vjp_call",
-    "custom_vjp_call_jaxpr", "shard_map",
-}  # fmt: skip
+    "jit",
+    "pjit",
+    "closed_call",
+    "core_call",
+    "checkpoint",
+    "remat",
+    "remat2",
+    "custom_jvp_call",
+    "custom_vjp_call",
+    "custom_vjp_call_jaxpr",
+    "shard_map",
+}
 
 
 def used_parameters(loss_fn: Callable[..., Any], params: Tree, *args: Any) -> Tree:
@@ -38,7 +47,11 @@ def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
 
 def _live_inputs(jaxpr: Any, live_outputs: list[bool]) -> list[bool]:
     """Return which inputs of a jaxpr reach one of its live outputs through differentiable values."""
-    live = {var for var, on in zip(jaxpr.outvars, live_outputs, strict=True) if on and _carries_gradient(var)}
+    live = {
+        var
+        for var, on in zip(jaxpr.outvars, live_outputs, strict=True)
+        if on and _carries_gradient(var)
+    }
     for eqn in reversed(jaxpr.eqns):
         outputs = [var in live for var in eqn.outvars]
         if any(outputs):
@@ -48,24 +61,32 @@ def _live_inputs(jaxpr: Any, live_outputs: list[bool]) -> list[bool]:
 
 
 def _carries_gradient(var: Any) -> bool:
-    return not isinstance(var, Literal) and jnp.issubdtype(getattr(var.aval, "dtype", jnp.int32), jnp.inexact)
+    return not isinstance(var, Literal) and jnp.issubdtype(
+        getattr(var.aval, "dtype", jnp.int32), jnp.inexact
+    )
 
 
 def _live_operands(eqn: Any, outputs: list[bool]) -> list[bool]:
     """Return which operands of an equation reach its live outputs. An unknown primitive uses all of them."""
-    name, params, everything = eqn.primitive.name, eqn.params, [True] * len(eqn.invars)
+    name = eqn.primitive.name
+    params = eqn.params
+    everything = [True] * len(eqn.invars)
     if name == "stop_gradient":
         return [False] * len(eqn.invars)
     if name == "scan":
         if "num_consts" in params:
-            consts, carry = params["num_consts"], params["num_carry"]
+            consts = params["num_consts"]
+            carry = params["num_carry"]
         else:  # jax 0.11
             consts, carry = (len(part) for part in params["ft_in"].unpack()[:2])
         return _live_loop(params["jaxpr"].jaxpr, outputs, consts, carry)
     if name == "while":
         # The predicate is a bool: nothing flows through the condition.
-        skip, consts = params["cond_nconsts"], params["body_nconsts"]
-        return [False] * skip + _live_loop(params["body_jaxpr"].jaxpr, outputs, consts, len(outputs))
+        skip = params["cond_nconsts"]
+        consts = params["body_nconsts"]
+        return [False] * skip + _live_loop(
+            params["body_jaxpr"].jaxpr, outputs, consts, len(outputs)
+        )
     if name == "cond":
         branches = [_live_inputs(branch.jaxpr, outputs) for branch in params["branches"]]
         return [False] + [any(lives) for lives in zip(*branches, strict=True)]

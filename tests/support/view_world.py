@@ -13,9 +13,14 @@ class PressCamera:
     """A camera at 30 frames/s of a gel that is pressed by `shape`: "ball", "bar", "pins", or "" for nothing."""
 
     def __init__(self) -> None:
-        self.shape, self._count, self._due = "", 0, 0.0
+        self.shape = ""
+        self._count = 0
+        self._due = 0.0
         self._frames = {
-            shape: [gel_frame("coloured", 0.9 * bool(shape), shape or "ball", i - 6, i)[..., ::-1] for i in range(12)]
+            shape: [
+                gel_frame("coloured", 0.9 * bool(shape), shape or "ball", i - 6, i)[..., ::-1]
+                for i in range(12)
+            ]
             for shape in ("", "ball", "bar", "pins")
         }
 

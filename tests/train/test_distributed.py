@@ -14,7 +14,8 @@ from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import joined, make_mesh, process_count
 
 SLURM = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_PROCID": "3", "SLURM_LOCALID": "1"}
-ALLOCATION = {"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}  # without srun
+# without srun
+ALLOCATION = {"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}
 OMPI = {"OMPI_COMM_WORLD_SIZE": "4", "OMPI_COMM_WORLD_RANK": "3", "OMPI_COMM_WORLD_LOCAL_RANK": "1"}
 ADDRESS = {"JAX_COORDINATOR_ADDRESS": "node1:29400"}
 BY_HAND = ADDRESS | {"JAX_NUM_PROCESSES": "4", "JAX_PROCESS_ID": "3"}
@@ -26,18 +27,26 @@ def initialized(monkeypatch):
     calls = []
     monkeypatch.setattr(jax.distributed, "initialize", lambda **kwargs: calls.append(kwargs))
     monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
-    monkeypatch.setattr(distributed.os, "_exit", lambda status: (_ for _ in ()).throw(SystemExit(status)))
+    monkeypatch.setattr(
+        distributed.os, "_exit", lambda status: (_ for _ in ()).throw(SystemExit(status))
+    )
     return calls
 
 
 @pytest.mark.parametrize(
     ("environ", "count"),
     [
-        ({}, 1), ({"JAX_NUM_PROCESSES": "1"}, 1), ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, 1), (ALLOCATION, 1),
-        (SLURM | {"SLURM_STEP_NUM_TASKS": "1"}, 1), (BY_HAND, 4), (BY_HAND | {"JAX_NUM_PROCESSES": "2"} | SLURM, 2),
-        (SLURM, 4), (OMPI, 4),
+        ({}, 1),
+        ({"JAX_NUM_PROCESSES": "1"}, 1),
+        ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, 1),
+        (ALLOCATION, 1),
+        (SLURM | {"SLURM_STEP_NUM_TASKS": "1"}, 1),
+        (BY_HAND, 4),
+        (BY_HAND | {"JAX_NUM_PROCESSES": "2"} | SLURM, 2),
+        (SLURM, 4),
+        (OMPI, 4),
     ],
-)  # fmt: skip
+)
 def test_processes_of_the_environment(environ, count, initialized):
     assert process_count(environ) == count
     with joined(environ) as process:
@@ -55,7 +64,9 @@ def test_numbers_set_by_hand_go_before_detection(initialized):
     assert slurm["coordinator_address"] == "node1:29400" and "process_id" not in slurm
 
 
-@pytest.mark.parametrize(("name", "value"), [("JAX_NUM_PROCESSES", "two"), ("JAX_PROCESS_ID", "one")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("JAX_NUM_PROCESSES", "two"), ("JAX_PROCESS_ID", "one")]
+)
 def test_a_number_that_is_none_is_named(name, value, initialized, capfd):
     with pytest.raises((ConfigError, SystemExit)) as raised, joined(BY_HAND | {name: value}):
         raise AssertionError("it must not run")
@@ -71,10 +82,12 @@ def test_one_process_raises_its_errors():
 @pytest.mark.parametrize(
     ("error", "status"),
     [
-        (UserError("batch_size 3"), 2), (KeyboardInterrupt(), 130),
-        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), 1), (ValueError("odd"), 1),
+        (UserError("batch_size 3"), 2),
+        (KeyboardInterrupt(), 130),
+        (jax.errors.JaxRuntimeError("Gloo all-reduce failed:\n Connection closed by peer"), 1),
+        (ValueError("odd"), 1),
     ],
-)  # fmt: skip
+)
 def test_a_process_that_fails_exits_at_once(error, status, initialized, capfd):
     with pytest.raises(SystemExit) as exit_, joined(BY_HAND):
         raise error
@@ -84,8 +97,12 @@ def test_a_process_that_fails_exits_at_once(error, status, initialized, capfd):
     assert ("Traceback" in message) == (type(error) is ValueError)
 
 
-@pytest.mark.parametrize("error", [RuntimeError("DEADLINE_EXCEEDED"), ValueError("undefined"), KeyError("URI")])
-def test_a_failed_join_is_one_sentence_that_names_the_variables(error, initialized, monkeypatch, capfd):
+@pytest.mark.parametrize(
+    "error", [RuntimeError("DEADLINE_EXCEEDED"), ValueError("undefined"), KeyError("URI")]
+)
+def test_a_failed_join_is_one_sentence_that_names_the_variables(
+    error, initialized, monkeypatch, capfd
+):
     def fail(**kwargs):
         raise error
 
@@ -105,9 +122,15 @@ def test_a_ballot_gives_the_largest_vote():
 def lock(run_dir, mesh=None, **more):
     """The same run in this process."""
     return fit(
-        config_of(**{"steps": 12} | more.pop("run", {})), params=toy_params(WIDE), loss_fn=toy_loss,
-        batches=batches_of(0, 1), run_dir=run_dir, mesh=mesh or make_mesh(1), log=lambda sentence: None, **more,
-    )  # fmt: skip
+        config_of(**{"steps": 12} | more.pop("run", {})),
+        params=toy_params(WIDE),
+        loss_fn=toy_loss,
+        batches=batches_of(0, 1),
+        run_dir=run_dir,
+        mesh=mesh or make_mesh(1),
+        log=lambda sentence: None,
+        **more,
+    )
 
 
 def column(run_dir, name="loss"):
@@ -134,7 +157,10 @@ def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, un
     (_, first), (_, second) = ended
     assert first.count("stopped by SIGTERM after step 6 and saved") == 1 and "step 1/12" in first
     assert second == ""  # one of them speaks
-    assert sorted(entry.name for entry in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000006"]
+    assert sorted(entry.name for entry in (tmp_path / "checkpoints").iterdir()) == [
+        "00000003",
+        "00000006",
+    ]
     assert column(tmp_path, "skipped_samples") == [1 + 2] * 6  # by both
     result = lock(tmp_path, mesh=make_mesh(fsdp=4), run={"fsdp": 4})
     assert result.resumed == 6
@@ -146,10 +172,13 @@ def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, un
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", [0, 1])
 @pytest.mark.parametrize("number", [signal.SIGKILL, -1], ids=["killed", "failed"])
-def test_a_lost_process_ends_the_other_and_the_next_start_goes_on(tmp_path, undisturbed, lost, number):
+def test_a_lost_process_ends_the_other_and_the_next_start_goes_on(
+    tmp_path, undisturbed, lost, number
+):
     """The checkpoint of step 3 is complete before that of step 6 is begun, and at step 7 one is lost."""
     ended = finish(start(tmp_path, hit=lost, at=7, number=number, steps=12, fsdp=2))
-    (status, message), (other_status, other_message) = ended[lost], ended[1 - lost]
+    (status, message) = ended[lost]
+    (other_status, other_message) = ended[1 - lost]
     assert status == (-signal.SIGKILL if number > 0 else 2)
     assert number > 0 or message.count(f"process {lost} of 2: no such row") == 1
     assert other_status != 0 and "Traceback" not in message + other_message

@@ -13,7 +13,15 @@ import pytest
 from adam_moments import moments
 from places import ROOT, SUPPORT
 from runs import TIMING
-from train_toy import ROWS, stopping_batches, toy_batch, toy_batches, toy_config, toy_loss, toy_params
+from train_toy import (
+    ROWS,
+    stopping_batches,
+    toy_batch,
+    toy_batches,
+    toy_config,
+    toy_loss,
+    toy_params,
+)
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.train import loop
@@ -36,7 +44,9 @@ def clips(start, stop):
 
 
 def rows(run_dir):
-    found = [json.loads(line) for line in (Path(run_dir) / "metrics.jsonl").read_text().splitlines()]
+    found = [
+        json.loads(line) for line in (Path(run_dir) / "metrics.jsonl").read_text().splitlines()
+    ]
     return [{name: value for name, value in row.items() if name not in TIMING} for row in found]
 
 
@@ -65,16 +75,29 @@ def undisturbed(tmp_path_factory):
 def test_a_run_leaves_its_folder_and_a_line_a_step(undisturbed):
     run_dir, result = undisturbed
     assert {entry.name for entry in run_dir.iterdir()} == {
-        ".lock", "config.json", "metrics.jsonl", "checkpoints", "figures",
-    }  # fmt: skip
+        ".lock",
+        "config.json",
+        "metrics.jsonl",
+        "checkpoints",
+        "figures",
+    }
     found = rows(run_dir)
     assert [row["step"] for row in found] == list(range(8))
-    wanted = {"loss", "reconstruction", "grad_norm", "param_norm", "update_norm", "learning_rate", "p_u"}
+    wanted = {
+        "loss",
+        "reconstruction",
+        "grad_norm",
+        "param_norm",
+        "update_norm",
+        "learning_rate",
+        "p_u",
+    }
     wanted |= {"samples", "skipped_samples", "skipped", "skipped_batches"}
     assert wanted <= set(found[0])
     assert found[0]["learning_rate"] == 0 and found[4]["p_u"] == pytest.approx(0.375)
     assert (result.step, result.resumed, result.interrupted) == (8, 0, None)
-    assert result.state.step == 8 and result.metrics["step"] == 7 and result.traces == 2  # one a kind of batch
+    # one a kind of batch
+    assert result.state.step == 8 and result.metrics["step"] == 7 and result.traces == 2
     assert all(value is not None for row in found for value in row.values())
 
 
@@ -109,7 +132,9 @@ def test_another_number_of_devices_goes_on(tmp_path):
     assert part("moving", 2, stop_after=6).resumed == 4
     last = part("moving", 1, mesh=make_mesh(1))
     assert last.resumed == 6
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), last.params, one.params)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), last.params, one.params
+    )
     losses = [[row["loss"] for row in rows(tmp_path / name)] for name in ("one", "moving")]
     np.testing.assert_allclose(*losses, rtol=1e-5)
     assert not np.array_equal(one.params["trunk"]["kernel"], toy_params(8192)["trunk"]["kernel"])
@@ -126,11 +151,13 @@ def test_skipped_steps_are_counted_and_change_nothing(tmp_path):
 
 
 def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
-    batches, config = partial(toy_batches, bad=range(2, 100)), toy_config(save_every=2, max_skipped=3)
+    batches = partial(toy_batches, bad=range(2, 100))
+    config = toy_config(save_every=2, max_skipped=3)
     with pytest.raises(UserError, match=r"4 steps in a row, up to step 5.* --optim.grad-clip"):
         run(tmp_path, config, batches=batches)
     assert [row["step"] for row in rows(tmp_path)] == list(range(6))
-    with pytest.raises(UserError, match="4 steps in a row, up to step 5"):  # going on recalls those before
+    # going on recalls those before
+    with pytest.raises(UserError, match="4 steps in a row, up to step 5"):
         run(tmp_path, config, batches=batches)
     good = run(tmp_path, config, stop_after=8)
     assert good.step == 8 and good.resumed == 4
@@ -138,7 +165,8 @@ def test_too_many_skipped_in_a_row_end_the_run(tmp_path):
 
 def test_metrics_are_fetched_while_the_next_step_runs(tmp_path, monkeypatch):
     events = []
-    fetch, compiled = jax.device_get, loop._Loop.compile
+    fetch = jax.device_get
+    compiled = loop._Loop.compile
 
     def watched(self, *args):
         step = compiled(self, *args)
@@ -164,20 +192,27 @@ class Step:
     """A step that ends `after` seconds after it began (None: never) by that clock."""
 
     def __init__(self, clock, after):
-        self.clock, self.after = clock, after
+        self.clock = clock
+        self.after = after
 
     def began(self, metrics):
         self.start = self.clock.now
 
     def ended(self):
         done = self.after is not None and self.start + self.after <= self.clock.now
-        return self.start + self.after if done else None
+        if done:
+            return self.start + self.after
+        return None
 
 
 @pytest.mark.parametrize(
-    ("after", "first", "other"), [(0, 6, 3), (1, 5, 2), (None, 3, 0)], ids=["at once", "in a second", "busy"]
+    ("after", "first", "other"),
+    [(0, 6, 3), (1, 5, 2), (None, 3, 0)],
+    ids=["at once", "in a second", "busy"],
 )
-def test_the_time_that_a_step_waits_for_its_batch_is_written(tmp_path, monkeypatch, after, first, other):
+def test_the_time_that_a_step_waits_for_its_batch_is_written(
+    tmp_path, monkeypatch, after, first, other
+):
     """A batch takes 3 s and the rest of a step 1 s. What counts is the time in which no step runs."""
     clock = Clock()
 
@@ -208,7 +243,15 @@ def test_no_step_compiles_after_the_first_of_its_kind(tmp_path, caplog, fsdp):
 
     def batches(start, stop):
         for step, batch, info in toy_batches(start, stop):
-            seen.append((step, sum("XLA compilation of jit(step)" in record.message for record in caplog.records)))
+            seen.append(
+                (
+                    step,
+                    sum(
+                        "XLA compilation of jit(step)" in record.message
+                        for record in caplog.records
+                    ),
+                )
+            )
             yield step, batch, info
 
     with jax.log_compiles():
@@ -228,7 +271,8 @@ def test_nothing_is_transferred_to_the_device_unasked(tmp_path):
 
 
 def test_reports_come_every_so_often_and_at_the_end_and_cannot_end_the_run(tmp_path):
-    seen, said = [], []
+    seen = []
+    said = []
 
     def report(step, params, batch):
         seen.append((step, batch.clip.shape[0], sorted(params["decoder"])))
@@ -241,11 +285,13 @@ def test_reports_come_every_so_often_and_at_the_end_and_cannot_end_the_run(tmp_p
     assert "no figures at step 3: RuntimeError: no display" in said
     seen.clear()
     run(tmp_path / "even", toy_config(steps=8, figure_every=4), on_report=report)
-    assert [step for step, *_ in seen] == [4, 8]  # the last one once, although it is the end too
+    # the last one once, although it is the end too
+    assert [step for step, *_ in seen] == [4, 8]
 
 
 def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, monkeypatch):
-    saved, partial = {}, []
+    saved = {}
+    partial = []
 
     class Watched(loop.Checkpoints):
         def save(self, step, state, metrics):
@@ -257,7 +303,9 @@ def test_the_checkpoints_metrics_are_the_mean_since_the_one_before(tmp_path, mon
     run(tmp_path)
     losses = [row["loss"] for row in rows(tmp_path)]
     assert list(saved) == [3, 6, 8]
-    assert list(saved.values()) == pytest.approx([np.mean(losses[a:b]) for a, b in ((0, 3), (3, 6), (6, 8))])
+    assert list(saved.values()) == pytest.approx(
+        [np.mean(losses[a:b]) for a, b in ((0, 3), (3, 6), (6, 8))]
+    )
     assert partial == [False, False, True], "two steps against three: never the best"
 
 
@@ -286,7 +334,8 @@ def test_a_second_interrupt_is_not_held_back(tmp_path):
     def batches(start, stop):
         for step, batch, info in toy_batches(start, stop):
             if step == 2:
-                signal.raise_signal(signal.SIGINT)  # handled in this thread: two kills at once may arrive as one
+                # handled in this thread: two kills at once may arrive as one
+                signal.raise_signal(signal.SIGINT)
                 signal.raise_signal(signal.SIGINT)
             yield step, batch, info
 
@@ -301,13 +350,22 @@ def test_a_second_interrupt_is_not_held_back(tmp_path):
 
 
 def child(run_dir, at, number):
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, str(SUPPORT / "train_toy.py"), str(run_dir), str(at), str(int(number))]
+    env = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
+    }
+    command = [
+        sys.executable,
+        str(SUPPORT / "train_toy.py"),
+        str(run_dir),
+        str(at),
+        str(int(number)),
+    ]
     return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
 
 
 def test_a_killed_run_goes_on_and_ends_as_if_undisturbed(undisturbed, tmp_path):
-    for at in (2, 5):  # before the first checkpoint, and right after it (the save may be under way)
+    # before the first checkpoint, and right after it (the save may be under way)
+    for at in (2, 5):
         assert child(tmp_path, at, signal.SIGKILL).returncode == -signal.SIGKILL
     result = run(tmp_path)
     assert result.resumed in (0, 3)
@@ -323,7 +381,9 @@ def test_a_full_disk_ends_a_run_before_its_first_step(tmp_path, monkeypatch):
     usage = checkpoint.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: usage._replace(free=400))
     for folder in ("new", "run"):
-        with pytest.raises(UserError, match=r"the disk is full. It needs [\d,]+ bytes and has 400\."):
+        with pytest.raises(
+            UserError, match=r"the disk is full. It needs [\d,]+ bytes and has 400\."
+        ):
             run(tmp_path / folder, batches=no_batches)
     monkeypatch.undo()
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["00000002"]
@@ -332,7 +392,9 @@ def test_a_full_disk_ends_a_run_before_its_first_step(tmp_path, monkeypatch):
 
 
 def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monkeypatch, donates):
-    states, seen, compiled = [], [], loop._Loop.compile
+    states = []
+    seen = []
+    compiled = loop._Loop.compile
 
     def watched(self, *args):
         step = compiled(self, *args)
@@ -350,7 +412,8 @@ def test_figures_are_drawn_from_a_live_batch_and_live_parameters(tmp_path, monke
     assert_same(seen[-1], result.params)
     assert not np.array_equal(seen[0]["trunk"]["kernel"], seen[-1]["trunk"]["kernel"])
     gone = [state.trainable["trunk"]["kernel"].is_deleted() for state in states]
-    assert gone[0] == donates and (donates or not any(gone))  # jax 0.11 copies one that a NumPy view of it still holds
+    # jax 0.11 copies one that a NumPy view of it still holds
+    assert gone[0] == donates and (donates or not any(gone))
 
 
 def row(step, **more):
@@ -361,7 +424,8 @@ def test_the_curve_falls_with_the_loss():
     lines = chart([8.0] * 50 + [1.0] * 50, width=10, height=4).splitlines()
     assert [line[10:] for line in lines] == ["█████     "] * 3 + ["█████▁▁▁▁▁"]
     assert lines[0].startswith("   8.0000 ") and lines[-1].startswith("   1.0000 ")
-    assert len(set(chart([2.0, 2.0]).splitlines()[-1][10:])) == 1  # no change, no division by zero
+    # no change, no division by zero
+    assert len(set(chart([2.0, 2.0]).splitlines()[-1][10:])) == 1
 
 
 def test_elsewhere_some_twenty_lines_are_said():
@@ -370,4 +434,6 @@ def test_elsewhere_some_twenty_lines_are_said():
         for step in range(100, 1100):
             advance(row(step))
     assert len(said) == 21
-    assert said[0] == "step 101/1100  loss 0.5000  30 samples/s" and said[-1].startswith("step 1100/1100")
+    assert said[0] == "step 101/1100  loss 0.5000  30 samples/s" and said[-1].startswith(
+        "step 1100/1100"
+    )

@@ -20,10 +20,19 @@ def lines(run_dir):
 
 def test_lines_are_json_and_what_is_not_finite_is_null(tmp_path):
     record = Record(tmp_path, 0)
-    row = record.write(0, {"loss": np.float32(0.1), "grad_norm": float("nan"), "skipped": 0.0, "images": np.int64(3)})
+    row = record.write(
+        0,
+        {"loss": np.float32(0.1), "grad_norm": float("nan"), "skipped": 0.0, "images": np.int64(3)},
+    )
     record.write(1, {"loss": np.float32("inf"), "skipped": 1.0})
     record.close()
-    first = {"step": 0, "loss": float(np.float32(0.1)), "grad_norm": None, "skipped": 0.0, "images": 3}
+    first = {
+        "step": 0,
+        "loss": float(np.float32(0.1)),
+        "grad_norm": None,
+        "skipped": 0.0,
+        "images": 3,
+    }
     second = {"step": 1, "loss": None, "skipped": 1.0, "skipped_batches": 1}
     assert lines(tmp_path) == [first | {"skipped_batches": 0}, second]
     assert row == lines(tmp_path)[0]
@@ -54,7 +63,9 @@ def test_a_full_disk_is_one_sentence(tmp_path):
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (record.path.stat().st_size + 10, limit[1]))
-        with pytest.raises(UserError, match=r"^cannot write .*metrics\.jsonl: .*run the same command again"):
+        with pytest.raises(
+            UserError, match=r"^cannot write .*metrics\.jsonl: .*run the same command again"
+        ):
             record.write(1, {"loss": 1.0, "skipped": 0.0})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -74,20 +85,43 @@ def test_the_config_is_written_once_and_read_back(tmp_path):
     begun(tmp_path / "run")
     open_run(tmp_path / "run", config)
     data = dataclasses.replace(config.data, threads=9, prefetch=9, on_bad_sample="skip")
-    run = dataclasses.replace(config.run, save_every=7, keep=9, figure_every=9, tensorboard=True, fsdp=2, max_skipped=9)
+    run = dataclasses.replace(
+        config.run, save_every=7, keep=9, figure_every=9, tensorboard=True, fsdp=2, max_skipped=9
+    )
     open_run(tmp_path / "run", dataclasses.replace(config, data=data, run=run))
     assert from_json((tmp_path / "run" / "config.json").read_text()) == config
 
 
 # What may change between the parts of a run: it decides where and how fast the run goes, not what it computes.
 MAY_CHANGE = (
-    "data.cache", "data.manifests", "data.on_bad_sample", "data.prefetch", "data.threads", "data.tokenizer",
-    "run.figure_every", "run.fsdp", "run.keep", "run.max_skipped", "run.save_every", "run.tensorboard",
-)  # fmt: skip
+    "data.cache",
+    "data.manifests",
+    "data.on_bad_sample",
+    "data.prefetch",
+    "data.threads",
+    "data.tokenizer",
+    "run.figure_every",
+    "run.fsdp",
+    "run.keep",
+    "run.max_skipped",
+    "run.save_every",
+    "run.tensorboard",
+)
 WORDS = (
-    "release", "scratch", "quick_gelu", "sensor", "linear", "cosine", "bfloat16", "mapped", "random", "same_sensor",
-    "subtract", "skip", "another",
-)  # fmt: skip
+    "release",
+    "scratch",
+    "quick_gelu",
+    "sensor",
+    "linear",
+    "cosine",
+    "bfloat16",
+    "mapped",
+    "random",
+    "same_sensor",
+    "subtract",
+    "skip",
+    "another",
+)
 
 
 def others(value):
@@ -102,7 +136,11 @@ def others(value):
         return WORDS
     if value is None:
         return [1, "another", [["a", 1.0]], 0.5]
-    return [[*value, "another"], [*value, "image"], [one / 2 + 0.01 for one in value if isinstance(one, float)]]
+    return [
+        [*value, "another"],
+        [*value, "image"],
+        [one / 2 + 0.01 for one in value if isinstance(one, float)],
+    ]
 
 
 def changed(config, path):
@@ -128,7 +166,9 @@ def test_a_run_goes_on_with_no_other_setting_than_these(tmp_path):
         if path in MAY_CHANGE:
             assert continues(tmp_path, config), path
         else:
-            with pytest.raises(UserError, match=rf"settings: {re.escape(path)} was [^;]*\. Use the same"):
+            with pytest.raises(
+                UserError, match=rf"settings: {re.escape(path)} was [^;]*\. Use the same"
+            ):
                 continues(tmp_path, config)
 
 

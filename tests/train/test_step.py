@@ -24,7 +24,9 @@ def quiet_loss(params, batch, key, progress):
 
 def build(config=None, loss=toy_loss, **more):
     config = config or toy_config()
-    step = make_step(loss, optimizer(config), total_steps=config.run.steps, trained=toy_trained, **more)
+    step = make_step(
+        loss, optimizer(config), total_steps=config.run.steps, trained=toy_trained, **more
+    )
     return jax.jit(init_state, static_argnums=1)(toy_params(), config), jax.jit(step)
 
 
@@ -36,7 +38,11 @@ def test_split_and_merge_are_inverse_and_disjoint():
     params = toy_params()
     rules = ((r"decoder/.*_head/kernel", True), (r"idle", True), (r"", False))
     trainable, frozen = split(params, rules)
-    assert set(flatten(frozen)) == {"decoder/still_head/kernel", "decoder/clip_head/kernel", "idle/kernel"}
+    assert set(flatten(frozen)) == {
+        "decoder/still_head/kernel",
+        "decoder/clip_head/kernel",
+        "idle/kernel",
+    }
     assert not set(flatten(frozen)) & set(flatten(trainable))
     assert jax.tree.structure(merge(trainable, frozen)) == jax.tree.structure(params)
     assert_same(merge(trainable, frozen), params)
@@ -59,20 +65,27 @@ def test_a_step_is_the_gradient_of_the_loss_through_adamw():
     assert metrics["loss"] == pytest.approx(float(value), rel=1e-6)
     assert metrics["p_u"] == pytest.approx(0.75 * 3 / config.run.steps)
     assert metrics["learning_rate"] == pytest.approx(rate)
-    change = jax.tree.map(lambda a, b: np.asarray(a) - np.asarray(b), new.trainable, state.trainable)
-    norm = lambda tree: np.sqrt(sum(np.sum(np.square(x, dtype=np.float64)) for x in jax.tree.leaves(tree)))  # noqa: E731
+    change = jax.tree.map(
+        lambda a, b: np.asarray(a) - np.asarray(b), new.trainable, state.trainable
+    )
+    norm = lambda tree: np.sqrt(
+        sum(np.sum(np.square(x, dtype=np.float64)) for x in jax.tree.leaves(tree))
+    )  # noqa: E731
     assert metrics["grad_norm"] == pytest.approx(norm(grads), rel=1e-5)
     assert metrics["param_norm"] == pytest.approx(norm(state.trainable), rel=1e-6)
     assert metrics["update_norm"] == pytest.approx(norm(change), rel=1e-4)
     # The first step of Adam is the sign of the gradient; biases do not decay.
     bias = grads["trunk"]["bias"]
     np.testing.assert_allclose(change["trunk"]["bias"], -rate * np.sign(bias), rtol=1e-3)
-    assert {m.shape for m in metrics.values()} == {()} and {m.dtype for m in metrics.values()} == {jnp.dtype("float32")}
+    assert {m.shape for m in metrics.values()} == {()} and {m.dtype for m in metrics.values()} == {
+        jnp.dtype("float32")
+    }
 
 
 def test_a_kind_of_batch_leaves_the_head_it_does_not_use():
     state, step = build()
-    for index in range(5):  # stills, clips, stills, clips, stills
+    # stills, clips, stills, clips, stills
+    for index in range(5):
         before = state
         state, _ = step(state, toy_batch(index), KEY)
         idle = "clip_head" if index % 2 == 0 else "still_head"
@@ -91,10 +104,16 @@ def test_accumulation_equals_the_large_batch(index, accumulate):
     # Without Adam, which turns the sign of a gradient near zero into a whole step.
     state = init_state(toy_params(), toy_config())._replace(opt_state=optax.sgd(0.1).init(None))
     (whole, metrics), (parts, part_metrics) = (
-        jax.jit(make_step(quiet_loss, optax.sgd(0.1), total_steps=8, accumulate=count))(state, toy_batch(index), KEY)
+        jax.jit(make_step(quiet_loss, optax.sgd(0.1), total_steps=8, accumulate=count))(
+            state, toy_batch(index), KEY
+        )
         for count in (1, accumulate)
     )
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), whole.trainable, parts.trainable)
+    jax.tree.map(
+        functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6),
+        whole.trainable,
+        parts.trainable,
+    )
     for name in ("loss", "reconstruction", "grad_norm", "update_norm", "p_u"):
         assert part_metrics[name] == pytest.approx(float(metrics[name]), rel=1e-5)
 
@@ -125,13 +144,17 @@ def test_rows_are_dealt_out_to_micro_batches():
 
 def test_packed_slots_are_refused_by_accumulation_and_empty_ones_are_not():
     def stage2(slots):
-        clip, ids = np.zeros((4, 3, 2, 2, 3), np.uint8), np.zeros(4, np.int32)
-        image, rows = np.zeros((slots, 2, 2, 3), np.uint8), np.zeros(slots, np.int32)
+        clip = np.zeros((4, 3, 2, 2, 3), np.uint8)
+        ids = np.zeros(4, np.int32)
+        image = np.zeros((slots, 2, 2, 3), np.uint8)
+        rows = np.zeros(slots, np.int32)
         empty = np.zeros((0, 5), np.int32)
         align = AlignBatch(clip, ids, image, rows, empty, empty.astype(bool), np.zeros(0, np.int32))
         return Stage2Batch(align, MatchBatch(clip, ids, clip, ids, clip, ids))
 
-    with pytest.raises(ConfigError, match=r"optim\.accumulate must be 1 for batches with images or texts"):
+    with pytest.raises(
+        ConfigError, match=r"optim\.accumulate must be 1 for batches with images or texts"
+    ):
         micro_batches(stage2(2), 2)
     assert micro_batches(stage2(0), 2).align.clip.shape == (2, 2, 3, 2, 2, 3)
 
@@ -148,7 +171,11 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(what):
     state, metrics = good_step(state, toy_batch(0), KEY)
     assert metrics["skipped"] == 0
     after, metrics = bad_step(state, toy_batch(2, bad=what == "loss"), KEY)
-    assert metrics["skipped"] == 1 and metrics["update_norm"] == 0 and not np.isfinite(metrics["grad_norm"])
+    assert (
+        metrics["skipped"] == 1
+        and metrics["update_norm"] == 0
+        and not np.isfinite(metrics["grad_norm"])
+    )
     assert np.isfinite(metrics["loss"]) == (what == "gradient")
     assert after.step == 2
     assert_same(after._replace(step=state.step), state)
@@ -173,6 +200,8 @@ def test_frozen_parameters_are_not_differentiated():
     new, _ = jax.eval_shape(step, state, toy_batch(0), KEY)
     assert jax.tree.map(jnp.shape, new.frozen) == {"decoder": {"position": (4,)}}
     assert "decoder/position" not in flatten(state.trainable)
-    thawed = state._replace(trainable=toy_params(), frozen={}, opt_state=optimizer(config).init(toy_params()))
+    thawed = state._replace(
+        trainable=toy_params(), frozen={}, opt_state=optimizer(config).init(toy_params())
+    )
     with pytest.raises(AssertionError, match="frozen table"):
         jax.eval_shape(step, thawed, toy_batch(0), KEY)

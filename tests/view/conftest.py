@@ -27,13 +27,35 @@ def touches(tmp_path_factory) -> Path:
                 cv2.imwrite(str(folder / path), press(depth + 5 * touch))
                 split = ("train", "test")[touch]
                 rows.append(
-                    (path, sensor, f"{touch}-{sensor}", frame, split, str(touch), name, depth / 10, "0_digit_0.png")
+                    (
+                        path,
+                        sensor,
+                        f"{touch}-{sensor}",
+                        frame,
+                        split,
+                        str(touch),
+                        name,
+                        depth / 10,
+                        "0_digit_0.png",
+                    )
                 )
-    names = ("path", "sensor", "sequence", "frame_index", "split", "touch", "object", "label.force", "background_path")
+    names = (
+        "path",
+        "sensor",
+        "sequence",
+        "frame_index",
+        "split",
+        "touch",
+        "object",
+        "label.force",
+        "background_path",
+    )
     columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
     columns["text"] = [SCRIPT] * len(rows)
     columns["image_path"] = ["0_digit_2.png"] + [None] * (len(rows) - 1)
-    manifests.write(manifests.from_columns(columns, folder / "manifest.parquet"), folder / "manifest.parquet")
+    manifests.write(
+        manifests.from_columns(columns, folder / "manifest.parquet"), folder / "manifest.parquet"
+    )
     return folder / "manifest.parquet"
 
 
@@ -41,10 +63,16 @@ def touches(tmp_path_factory) -> Path:
 def features(touches) -> Path:
     """Features of the rows of `touches`: rows of one touch and frame are near, whatever the sensor."""
     table = manifests.read(touches)
-    touch, frame = (np.asarray(table.column(name).to_pylist(), float) for name in ("touch", "frame_index"))
+    touch, frame = (
+        np.asarray(table.column(name).to_pylist(), float) for name in ("touch", "frame_index")
+    )
     angle = 2 * touch + 0.1 * frame
-    values = np.stack([np.cos(angle), np.sin(angle), 0.01 * np.arange(len(angle))], 1).astype(np.float32)
-    keys = {name: table.text_column(name) for name in ("path", "sensor", "sequence", "split", "object")}
+    values = np.stack([np.cos(angle), np.sin(angle), 0.01 * np.arange(len(angle))], 1).astype(
+        np.float32
+    )
+    keys = {
+        name: table.text_column(name) for name in ("path", "sensor", "sequence", "split", "object")
+    }
     keys["frame_index"] = frame.astype(np.int64)
     path = touches.with_name("features.npz")
     about = {"weights": "none", "encoder": SCRIPT, "input": str(touches)}

@@ -29,13 +29,17 @@ CHROMIUM = shutil.which("chromium")
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 SIGNS = "of 2 touches", "Click a point", "Teach it a touch", "What do you want"  # of each tab
 FRAMES = "Number(document.getElementById('main').dataset.frames)"
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="there is no Chromium: apt-get install chromium"
+)
 
 
 @contextmanager
 def serving(sources: list) -> Iterator[str]:
     """Serve the page of `sources` by a thread, and give its address."""
-    running = uvicorn.Server(uvicorn.Config(server.app(sources), port=0, log_level="error", lifespan="off"))
+    running = uvicorn.Server(
+        uvicorn.Config(server.app(sources), port=0, log_level="error", lifespan="off")
+    )
     thread = threading.Thread(target=running.run, daemon=True)
     thread.start()
     while not running.started:
@@ -46,7 +50,14 @@ def serving(sources: list) -> Iterator[str]:
 
 
 def test_chromium_shows_the_page(touches, features, tmp_path):
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}", "--dump-dom"]
+    command = [
+        CHROMIUM,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        f"--user-data-dir={tmp_path}",
+        "--dump-dom",
+    ]
     with serving(server.open_sources([touches, features])) as address:
         command += ["--virtual-time-budget=10000", address]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
@@ -64,7 +75,9 @@ def address(touches, features, camera, tiny_run, tmp_path_factory) -> Iterator[s
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(live_module, "open_source", lambda *_: (camera, True))
         out = tmp_path_factory.mktemp("taught") / "touches"
-        live = Live("0", load_encoder(tiny_run), sensor="gelsight_mini", out=out, log=lambda _: None)
+        live = Live(
+            "0", load_encoder(tiny_run), sensor="gelsight_mini", out=out, log=lambda _: None
+        )
         live.start()
         start = server.StartPage(lambda _: live)
         with serving([*server.open_sources([touches, features]), live, start]) as place:
@@ -81,7 +94,9 @@ def browse(address) -> Iterator[Callable[..., object]]:
         faults: list[str] = []
 
         def opened(tab: int, width: int = 1200, theme: str = "light", **options):
-            page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=theme, **options)
+            page = browser.new_page(
+                viewport={"width": width, "height": 800}, color_scheme=theme, **options
+            )
             page.on("console", lambda message: faults.append(message.text))
             page.on("pageerror", lambda error: faults.append(str(error)))
             page.on("dialog", lambda dialog: faults.append(f"dialog {dialog.message}"))
@@ -91,7 +106,8 @@ def browse(address) -> Iterator[Callable[..., object]]:
 
         yield opened
         browser.close()
-        assert [fault for fault in faults if "400 (Bad Request)" not in fault] == []  # orders that are refused
+        # orders that are refused
+        assert [fault for fault in faults if "400 (Bad Request)" not in fault] == []
 
 
 def until(page, expression: str, argument: object = None, seconds: float = 60) -> None:
@@ -119,11 +135,15 @@ def test_touches_are_filtered_and_played(browse):
     page.locator("button", has_text="Play").click()
     until(page, "document.querySelector('input[type=range]').value === '2'")
     page.wait_for_selector("button:has-text('Play')")
-    slider, curve = (page.locator(name).first.bounding_box() for name in ("input[type=range]", ".time canvas"))
-    assert slider["x"] == curve["x"] and slider["width"] == curve["width"]  # one time axis
+    slider, curve = (
+        page.locator(name).first.bounding_box() for name in ("input[type=range]", ".time canvas")
+    )
+    # one time axis
+    assert slider["x"] == curve["x"] and slider["width"] == curve["width"]
     page.get_by_role("combobox", name="split", exact=True).select_option("test")
     page.wait_for_selector("text=of 1 touches")
-    assert page.get_by_text(SCRIPT).count() >= 2 and page.title() == "anytouch view"  # text, and no more
+    # text, and no more
+    assert page.get_by_text(SCRIPT).count() >= 2 and page.title() == "anytouch view"
     page.get_by_role("combobox", name="sensor", exact=True).select_option("digit")
     until(page, "document.querySelectorAll('.clip').length === 1")
 
@@ -133,7 +153,8 @@ def test_a_surface_is_turned(browse):
     page = browse(0)
     page.get_by_role("button", name="Surface").click()
     page.wait_for_selector("text=times as high")
-    canvas, seen = page.locator(".stage canvas").first, set()
+    canvas = page.locator(".stage canvas").first
+    seen = set()
     seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
     for key in ("ArrowLeft", "ArrowDown"):
         canvas.press(key)
@@ -143,7 +164,8 @@ def test_a_surface_is_turned(browse):
     page.mouse.move(500, 400, steps=3)
     page.mouse.up()
     seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
-    assert len(seen) == 4 and page.locator("input[type=number]").input_value() == "1"  # still the first touch
+    # still the first touch
+    assert len(seen) == 4 and page.locator("input[type=number]").input_value() == "1"
     page.wait_for_selector("text=measured force, N")  # its curve
     page.get_by_role("button", name="Picture").click()
     assert drawn(page) not in seen
@@ -166,7 +188,8 @@ def test_keyboard_alone(browse):
     page.keyboard.press("ArrowDown")
     until(page, "document.querySelectorAll('.clip').length === 1")
     assert number.input_value() == "1"
-    for _ in range(30):  # Tab reaches everything, and what has the focus can be seen
+    # Tab reaches everything, and what has the focus can be seen
+    for _ in range(30):
         page.keyboard.press("Tab")
         if page.evaluate("document.activeElement.ariaLabel") == "next touch":
             break
@@ -185,7 +208,8 @@ def test_a_point_of_the_map_shows_its_neighbours(browse):
     assert drawn(page)
     chosen = "[...document.querySelectorAll('dd')].map(one => one.textContent).join()"
     shown = {page.evaluate(chosen)}
-    for key in ("ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"):  # a neighbour lies on one side at least
+    # a neighbour lies on one side at least
+    for key in ("ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"):
         page.locator("canvas.map").press(key)
         page.wait_for_timeout(500)
         shown.add(page.evaluate(chosen))
@@ -200,7 +224,8 @@ def test_a_point_of_the_map_shows_its_neighbours(browse):
 def test_a_classifier_is_taught_by_touching(browse, camera):
     page = browse(2)
     until(page, f"{FRAMES} > 15")
-    name, record = page.get_by_label("name of what you touch"), page.locator("button.record")
+    name = page.get_by_label("name of what you touch")
+    record = page.locator("button.record")
 
     def press(shape: str, called: str, by_key: bool) -> None:
         camera.shape = shape
@@ -250,16 +275,21 @@ def test_a_classifier_is_taught_by_touching(browse, camera):
 @pytest.mark.slow
 def test_ctrl_c_loses_no_recording(film, tiny_run, tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")
-    words = f"view {film} --live --model {tiny_run} --sensor digit --out {tmp_path / 'out'} --port 8798"
+    words = (
+        f"view {film} --live --model {tiny_run} --sensor digit --out {tmp_path / 'out'} --port 8798"
+    )
     command = [sys.executable, "-m", "anytouch_jax", *words.split()]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
         place = next(line.split()[1] for line in running.stdout if line.startswith("Open "))
         with playwright.sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
             page = browser.new_page()
             page.goto(place)
             page.get_by_label("name of what you touch").fill("cup")
-            page.locator("button.record").click()  # a short press records until the next
+            # a short press records until the next
+            page.locator("button.record").click()
             page.wait_for_selector("text=/Recording cup: [1-9]/")
             running.send_signal(signal.SIGINT)
             running.send_signal(signal.SIGINT)  # impatient

@@ -37,24 +37,39 @@ def page(touches, features):
 
 
 def picture(response) -> np.ndarray:
-    assert response.status_code == 200 and response.headers["content-type"] == "image/jpeg", response.text
+    assert response.status_code == 200 and response.headers["content-type"] == "image/jpeg", (
+        response.text
+    )
     return cv2.imdecode(np.frombuffer(response.content, np.uint8), cv2.IMREAD_COLOR)
 
 
 def test_a_touch_is_its_recordings_by_all_sensors(page):
     about = page.get("/api/sources").json()[0]["about"]
-    assert about["rows"] == 12 and about["touches"] == 2 and about["filters"]["sensor"] == ["digit", "gelsight_mini"]
+    assert (
+        about["rows"] == 12
+        and about["touches"] == 2
+        and about["filters"]["sensor"] == ["digit", "gelsight_mini"]
+    )
     first = page.get("/api/0/touch?place=0").json()
-    assert first["count"] == 2 and [clip["sensor"] for clip in first["clips"]] == ["digit", "gelsight_mini"]
+    assert first["count"] == 2 and [clip["sensor"] for clip in first["clips"]] == [
+        "digit",
+        "gelsight_mini",
+    ]
     assert [clip["rows"] for clip in first["clips"]] == [[0, 1, 2], [3, 4, 5]]
     assert first["clips"][0]["curves"]["label.force"] == [0, 6, 9] and first["clips"][0]["photo"]
-    assert page.get("/api/0/touch?place=7").json()["place"] == 1  # the last one
+    # the last one
+    assert page.get("/api/0/touch?place=7").json()["place"] == 1
     assert page.get("/api/0/touch?row=10").json()["place"] == 1
 
 
 @pytest.mark.parametrize(
     "filters, count, clips",
-    [({"sensor": "digit"}, 2, 1), ({"split": "test"}, 1, 2), ({"object": SCRIPT}, 1, 2), ({"object": "no"}, 0, 0)],
+    [
+        ({"sensor": "digit"}, 2, 1),
+        ({"split": "test"}, 1, 2),
+        ({"object": SCRIPT}, 1, 2),
+        ({"object": "no"}, 0, 0),
+    ],
 )
 def test_filters(page, filters, count, clips):
     found = page.get("/api/0/touch", params={"filters": json.dumps(filters)}).json()
@@ -68,18 +83,24 @@ def test_filters_that_are_none(page, filters):
 
 def test_rows_in_any_order_make_the_same_touches(touches):
     table = manifests.read(touches)
-    mixed = Table(manifests.select_rows(table, np.random.default_rng(0).permutation(len(table))), "mixed")
+    mixed = Table(
+        manifests.select_rows(table, np.random.default_rng(0).permutation(len(table))), "mixed"
+    )
     clips = mixed.touch(0, {})["clips"] + mixed.touch(1, {})["clips"]
     paths = [[mixed.manifest.value(row, "path") for row in clip["rows"]] for clip in clips]
     recordings = [f"{touch}_{sensor}" for touch in "01" for sensor in ("digit", "gelsight_mini")]
-    assert sorted(paths) == [[f"{recording}_{frame}.png" for frame in range(3)] for recording in recordings]
+    assert sorted(paths) == [
+        [f"{recording}_{frame}.png" for frame in range(3)] for recording in recordings
+    ]
 
 
 def test_a_frame_shows_its_difference_and_contact(page):
-    free, pressed = page.get("/api/0/frame/0?layer=difference"), page.get("/api/0/frame/2?layer=contact")
+    free = page.get("/api/0/frame/0?layer=difference")
+    pressed = page.get("/api/0/frame/2?layer=contact")
     assert picture(page.get("/api/0/frame/2")).shape == picture(pressed).shape == (48, 48, 3)
     assert float(free.headers["x-score"]) < 1 < 20 < float(pressed.headers["x-score"])
-    assert abs(picture(free).astype(int) - 128).max() < 6  # an untouched gel is grey
+    # an untouched gel is grey
+    assert abs(picture(free).astype(int) - 128).max() < 6
     blue, _, red = picture(pressed)[24, 24].astype(int)
     assert red > blue + 60  # the middle of the press is marked
     assert picture(page.get("/api/0/photo/0")).shape == (48, 48, 3)
@@ -92,15 +113,27 @@ def test_depth_is_measured_where_the_untouched_gel_is_known(page, tmp_path):
     nothing, values = (json.loads(answer.headers["x-fields"]) for answer in (free, pressed))
     assert picture(pressed).shape == (480, 480, 3) and values["unit"] == "mm"
     assert (
-        nothing["force"][2] < 0.05 < 0.3 < values["force"][2] == pytest.approx(values["curves"]["force, N"], abs=1e-3)
+        nothing["force"][2]
+        < 0.05
+        < 0.3
+        < values["force"][2]
+        == pytest.approx(values["curves"]["force, N"], abs=1e-3)
     )
-    assert nothing["area"] == 0 < values["area"] and values["depth_std"] > 0 and nothing["curves"]["slip"] == 0
+    assert (
+        nothing["area"] == 0 < values["area"]
+        and values["depth_std"] > 0
+        and nothing["curves"]["slip"] == 0
+    )
     surface = picture(page.get("/api/0/frame/2?layer=surface")).astype(int)
-    assert np.ptp(surface.max(2) - surface.min(2)) <= 2 and surface.max() > 60  # grey
+    # grey
+    assert np.ptp(surface.max(2) - surface.min(2)) <= 2 and surface.max() > 60
     assert "x-fields" not in page.get("/api/0/frame/2?layer=contact").headers
     cv2.imwrite(str(tmp_path / "0.png"), np.full((32, 48, 3), 90, np.uint8))
-    manifests.write(manifests.from_columns(columns(sensor=["mine"]), tmp_path / "m.csv"), tmp_path / "m.csv")
-    unknown = client(tmp_path / "m.csv").get("/api/0/frame/0?layer=depth")  # one frame shows no untouched gel
+    manifests.write(
+        manifests.from_columns(columns(sensor=["mine"]), tmp_path / "m.csv"), tmp_path / "m.csv"
+    )
+    # one frame shows no untouched gel
+    unknown = client(tmp_path / "m.csv").get("/api/0/frame/0?layer=depth")
     assert picture(unknown).shape == (32, 48, 3) and "x-fields" not in unknown.headers
 
 
@@ -109,11 +142,13 @@ def test_a_film_by_its_name_with_its_own_untouched_gel(film, tmp_path):
     page = client(tmp_path / "film.avi")
     assert all(page.get(f"/api/0/frame/{row}").headers["x-score"] for row in (0, 11))
     grey = {row: picture(page.get(f"/api/0/frame/{row}")).mean() for row in (11, 3, 4, 0, 7)}
-    for row, value in grey.items():  # frames in any order
+    # frames in any order
+    for row, value in grey.items():
         assert abs(value - 20 - 15 * row) < 4
     touch = page.get("/api/0/touch").json()
     assert touch["clips"][0]["rows"] == list(range(12)) and touch["name"] == "film"
-    assert not {"sensor", "split", "sequence"} & set(touch["clips"][0])  # nothing is known of them
+    # nothing is known of them
+    assert not {"sensor", "split", "sequence"} & set(touch["clips"][0])
 
 
 def test_a_folder_of_pictures(tmp_path):
@@ -121,8 +156,12 @@ def test_a_folder_of_pictures(tmp_path):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((32, 32, 3), value, np.uint8))
     page = client(tmp_path)
     assert page.get("/api/0/touch").json()["clips"][0]["rows"] == [0, 1]
-    assert abs(picture(page.get("/api/0/frame/0")).mean() - 60) < 2  # 2 before 10
-    assert page.get("/api/0/frame/0").headers["x-score"] and page.get("/api/sources").json()[0]["name"] == tmp_path.name
+    # 2 before 10
+    assert abs(picture(page.get("/api/0/frame/0")).mean() - 60) < 2
+    assert (
+        page.get("/api/0/frame/0").headers["x-score"]
+        and page.get("/api/sources").json()[0]["name"] == tmp_path.name
+    )
 
 
 def test_examples_of_the_package(tmp_path):
@@ -135,7 +174,9 @@ def test_examples_of_the_package(tmp_path):
 
 def test_the_first_page_opens_a_camera(monkeypatch):
     class Fake:
-        kind, name, source = "live", "camera 2", "2"
+        kind = "live"
+        name = "camera 2"
+        source = "2"
 
         def about(self):
             return {}
@@ -143,13 +184,20 @@ def test_the_first_page_opens_a_camera(monkeypatch):
         def start(self):
             started.append(self.source)
 
-    started, sources = [], []
+    started = []
+    sources = []
     cameras = [Camera(2, "GelSight Mini", "28H7", ()), Camera(4, "webcam", "", ())]
     monkeypatch.setattr(server, "list_cameras", lambda: cameras)
     sources.append(server.StartPage(lambda camera: Fake()))
     page = TestClient(server.app(sources), "http://127.0.0.1", raise_server_exceptions=False)
-    assert page.get("/api/sources").json()[0]["about"]["cameras"] == {"2": "GelSight Mini 28H7", "4": "webcam"}
-    answers = [page.post("/api/0/control", json={"camera": one}, headers={"X-Anytouch": "1"}) for one in "2324"]
+    assert page.get("/api/sources").json()[0]["about"]["cameras"] == {
+        "2": "GelSight Mini 28H7",
+        "4": "webcam",
+    }
+    answers = [
+        page.post("/api/0/control", json={"camera": one}, headers={"X-Anytouch": "1"})
+        for one in "2324"
+    ]
     assert [answer.status_code for answer in answers] == [200, 400, 200, 400] and started == ["2"]
     assert answers[0].json() == answers[2].json() == {"source": 1}
     assert page.post("/api/0/control", json={"camera": "2"}).status_code == 403
@@ -174,7 +222,13 @@ def test_nothing_outside_is_served(tmp_path, touches):
     folder.mkdir()
     os.symlink(secret, folder / "0.png")
     assert client(folder).get("/api/0/frame/0").status_code == 400
-    for path in ("/../secret.png", "/%2e%2e/secret.png", "/server.py", "//etc/passwd", "/__init__.py"):
+    for path in (
+        "/../secret.png",
+        "/%2e%2e/secret.png",
+        "/server.py",
+        "//etc/passwd",
+        "/__init__.py",
+    ):
         assert page.get(path).status_code == 404
 
 
@@ -184,12 +238,18 @@ def test_the_map_and_neighbours_across_sensors(page):
     assert np.ptp(np.array(points["x"])[:6]) < 0.5 < abs(points["x"][0] - points["x"][6])
     assert len(page.get("/api/1/map?method=tsne").json()["x"]) == 12
     coloured = page.get("/api/1/colours?method=pca&column=sensor").json()
-    assert coloured["names"] == ["digit", "gelsight_mini"] and coloured["codes"] == [0, 0, 0, 1, 1, 1] * 2
+    assert (
+        coloured["names"] == ["digit", "gelsight_mini"]
+        and coloured["codes"] == [0, 0, 0, 1, 1, 1] * 2
+    )
     found = page.get("/api/1/neighbours?row=1&others=1").json()
-    assert [hit["row"] for hit in found["hits"]] == [4, found["hits"][1]["row"]]  # a hit for each recording
+    # a hit for each recording
+    assert [hit["row"] for hit in found["hits"]] == [4, found["hits"][1]["row"]]
     assert {hit["about"]["sensor"] for hit in found["hits"]} == {"gelsight_mini"}
     anywhere = page.get("/api/1/neighbours?row=1").json()["hits"]
-    assert [hit["about"]["sequence"] for hit in anywhere][:1] == ["0-gelsight_mini"] and len(anywhere) == 3
+    assert [hit["about"]["sequence"] for hit in anywhere][:1] == ["0-gelsight_mini"] and len(
+        anywhere
+    ) == 3
     for path in ("map?method=x", "colours?column=x", "neighbours?row=12", "neighbours?row=-1"):
         assert page.get(f"/api/1/{path}").status_code == 400
 
@@ -197,7 +257,8 @@ def test_the_map_and_neighbours_across_sensors(page):
 def test_features_show_pictures_of_given_files_only(page, features, touches, tmp_path):
     assert page.get("/api/sources").json()[1]["about"]["table"] == 0
     alone = client(features).get("/api/sources").json()
-    assert [one["kind"] for one in alone] == ["table", "space"]  # its manifest lies in its folder
+    # its manifest lies in its folder
+    assert [one["kind"] for one in alone] == ["table", "space"]
     moved = Path(shutil.copy(features, tmp_path))  # its manifest does not
     assert [one["kind"] for one in client(moved).get("/api/sources").json()] == ["space"]
     assert client(moved, touches).get("/api/sources").json()[1]["about"]["table"] == 0
@@ -209,19 +270,26 @@ def test_features_show_pictures_of_given_files_only(page, features, touches, tmp
 def test_text_of_files_stays_text(page):
     answer = page.get("/api/0/touch?place=1")
     assert (
-        answer.headers["content-type"] == "application/json" and answer.headers["x-content-type-options"] == "nosniff"
+        answer.headers["content-type"] == "application/json"
+        and answer.headers["x-content-type-options"] == "nosniff"
     )
     assert answer.json()["clips"][0]["object"] == SCRIPT
     policy = page.get("/").headers["content-security-policy"]
-    assert "default-src 'none'" in policy and "script-src 'self';" in policy and "unsafe" not in policy
+    assert (
+        "default-src 'none'" in policy and "script-src 'self';" in policy and "unsafe" not in policy
+    )
     assets = {
         file.name: file.read_text()
         for file in map(Path, map(str, files("anytouch_jax.view").iterdir()))
         if file.suffix in KINDS
     }
     script = "".join(text for name, text in assets.items() if name.endswith(".js"))
-    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc", script)
-    for name, text in assets.items():  # nothing from the network
+    assert not re.search(
+        r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc",
+        script,
+    )
+    # nothing from the network
+    for name, text in assets.items():
         assert not re.search(r"https?:|//cdn|@import|url\(", text)
         assert name == "page.html" or page.get(f"/{name}").text == text
 
@@ -248,13 +316,16 @@ def test_a_run_while_it_trains(tmp_path):
     page = client(run)
     assert isinstance(server.open_sources([run])[0], Run)
     first = page.get("/api/0/losses").json()
-    assert first["lines"][0] == {"step": 1, "loss": 2.0} and first["figures"] == ["reconstruction_000001.png"]
+    assert first["lines"][0] == {"step": 1, "loss": 2.0} and first["figures"] == [
+        "reconstruction_000001.png"
+    ]
     with log.open("a") as file:
         file.write('ss": 1.0}\n')
     rest = page.get(f"/api/0/losses?after={first['next']}").json()
     assert rest["lines"] == [{"step": 3, "loss": 1.0}]
     assert page.get(f"/api/0/losses?after={rest['next']}").json()["lines"] == []
-    assert page.get("/api/0/losses?after=999").json()["lines"][0]["step"] == 1  # a file that was replaced
+    # a file that was replaced
+    assert page.get("/api/0/losses?after=999").json()["lines"][0]["step"] == 1
     assert picture(page.get("/api/0/figure/reconstruction_000001.png")).shape == (8, 8, 3)
     for name in ("secret.png", "..%2f..%2fsecret.png", "no.png"):
         assert page.get(f"/api/0/figure/{name}").status_code in (400, 404)

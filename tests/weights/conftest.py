@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-KINDS = {"f8": "Double", "f4": "Float", "f2": "Half", "i8": "Long", "i4": "Int", "u1": "Byte", "b1": "Bool"}
+KINDS = {
+    "f8": "Double",
+    "f4": "Float",
+    "f2": "Half",
+    "i8": "Long",
+    "i4": "Int",
+    "u1": "Byte",
+    "b1": "Bool",
+}
 
 
 @dataclass
@@ -63,7 +71,9 @@ def _emit(value: Any, storages: list[np.ndarray], legacy: bool) -> bytes:
         case None:
             return b"N"
         case bool():
-            return b"\x88" if value else b"\x89"
+            if value:
+                return b"\x88"
+            return b"\x89"
         case int():
             raw = value.to_bytes(value.bit_length() // 8 + 1, "little", signed=True)
             return b"\x8a" + bytes([len(raw)]) + raw
@@ -88,9 +98,17 @@ def _emit(value: Any, storages: list[np.ndarray], legacy: bool) -> bytes:
             key = str(known[0] if known else len(storages) - 1)
             kind = value.kind or KINDS[value.data.dtype.str[1:]]
             length = len(value.data) if value.length is None else value.length
-            pid = ("storage", Global("torch", f"{kind}Storage"), key, "cpu", length, *([None] if legacy else []))
+            pid = (
+                "storage",
+                Global("torch", f"{kind}Storage"),
+                key,
+                "cpu",
+                length,
+                *([None] if legacy else []),
+            )
             ordered = Call(Global("collections", "OrderedDict"), ())
-            rebuild, rest = Global("torch._utils", "_rebuild_tensor_v2"), (value.offset, value.shape, value.stride)
+            rebuild = Global("torch._utils", "_rebuild_tensor_v2")
+            rest = (value.offset, value.shape, value.stride)
             return emit(rebuild) + b"(" + emit(pid) + b"Q" + emit(*rest, False, ordered) + b"tR"
     raise TypeError(type(value))
 
@@ -124,7 +142,9 @@ def legacy_bytes(content: Any) -> bytes:
 def write_torch(tmp_path: Path) -> Callable[..., Path]:
     """write_torch(content, name): write a file as torch.save does."""
 
-    def write(content: Any, name: str = "weights.pth", *, legacy: bool = False, order: str = "little") -> Path:
+    def write(
+        content: Any, name: str = "weights.pth", *, legacy: bool = False, order: str = "little"
+    ) -> Path:
         path = tmp_path / name
         path.write_bytes(legacy_bytes(content) if legacy else zip_bytes(content, order=order))
         return path

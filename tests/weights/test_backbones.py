@@ -35,32 +35,47 @@ def weights_of(name: str) -> dict[str, np.ndarray]:
 
 def written(folder: Path, weights: dict[str, np.ndarray], **config) -> Path:
     folder.mkdir(exist_ok=True)
-    save_file({key: np.ascontiguousarray(x) for key, x in weights.items()}, folder / "model.safetensors")
+    save_file(
+        {key: np.ascontiguousarray(x) for key, x in weights.items()}, folder / "model.safetensors"
+    )
     (folder / "config.json").write_text(json.dumps(config))
     return folder
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tokens_are_those_of_the_library(name, tmp_path):
-    pictures, tokens = ARRAYS[f"{name}|input"], ARRAYS[f"{name}|tokens"]
-    encoder = load_encoder(written(tmp_path / "one", weights_of(name)), heads=2, image_size=pictures.shape[1:3])
+    pictures = ARRAYS[f"{name}|input"]
+    tokens = ARRAYS[f"{name}|tokens"]
+    encoder = load_encoder(
+        written(tmp_path / "one", weights_of(name)), heads=2, image_size=pictures.shape[1:3]
+    )
     np.testing.assert_allclose(encoder.encode_tokens(pictures), tokens, rtol=1e-4, atol=2e-5)
     start = 0 if "SigLIP" in name else 5
-    np.testing.assert_allclose(encoder.encode_touch(pictures, pooling="mean"), tokens[:, start:].mean(1), atol=2e-5)
+    np.testing.assert_allclose(
+        encoder.encode_touch(pictures, pooling="mean"), tokens[:, start:].mean(1), atol=2e-5
+    )
     own = ARRAYS.get(f"{name}|pooled", tokens.mean(1) if "SigLIP" in name else tokens[:, 0])
     np.testing.assert_allclose(encoder.encode_touch(pictures), own, rtol=1e-4, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["HF DINOv3", "HF SigLIP 2"])
 def test_other_spellings_of_keys_and_a_nested_config(name, tmp_path):
-    weights, pictures = weights_of(name), ARRAYS[f"{name}|input"]
+    weights = weights_of(name)
+    pictures = ARRAYS[f"{name}|input"]
     size = pictures.shape[1:3]
-    wanted = load_encoder(written(tmp_path / "one", weights), heads=2, image_size=size).encode_touch(pictures)
-    text = {"text_model.embeddings.token_embedding.weight": np.zeros((3, 16), "f4"), "logit_bias": np.zeros(1, "f4")}
+    wanted = load_encoder(
+        written(tmp_path / "one", weights), heads=2, image_size=size
+    ).encode_touch(pictures)
+    text = {
+        "text_model.embeddings.token_embedding.weight": np.zeros((3, 16), "f4"),
+        "logit_bias": np.zeros(1, "f4"),
+    }
     prefix, more = ("vision_model.", text) if "SigLIP" in name else ("", {})
     other = {f"{prefix}{key.removeprefix('model.')}": x for key, x in weights.items()} | more
     folder = written(tmp_path / "two", other, vision_config={"num_attention_heads": 2})
-    np.testing.assert_array_equal(load_encoder(folder, image_size=size).encode_touch(pictures), wanted)
+    np.testing.assert_array_equal(
+        load_encoder(folder, image_size=size).encode_touch(pictures), wanted
+    )
 
 
 def test_backbones_without_positions_or_a_class_token_start_no_training(tmp_path):
@@ -72,23 +87,33 @@ def test_backbones_without_positions_or_a_class_token_start_no_training(tmp_path
             load_start(fresh, config, init=folder)
 
 
-TIMM, HF, SIGLIP = weights_of("timm DINOv2 with registers"), weights_of("HF DINOv3"), weights_of("HF SigLIP 2")
+TIMM = weights_of("timm DINOv2 with registers")
+HF = weights_of("HF DINOv3")
+SIGLIP = weights_of("HF SigLIP 2")
 
 
 @pytest.mark.parametrize(
     ("weights", "without", "words"),
     [
-        (TIMM | {"fc_norm.weight": np.ones(16, "f4"), "head.weight": np.ones((3, 16), "f4")}, r"norm\.", "fine-tuned"),
+        (
+            TIMM | {"fc_norm.weight": np.ones(16, "f4"), "head.weight": np.ones((3, 16), "f4")},
+            r"norm\.",
+            "fine-tuned",
+        ),
         (TIMM, r"cls_token|reg_token", "without a class token"),
         (TIMM, r"norm\.|.*ls\d|reg_token", "no final norm"),
         (TIMM | {"fc_norm.weight": np.ones(16, "f4")}, r"norm\.|cls_token", "fine-tuned"),
         (TIMM | {"dist_token": np.ones((1, 1, 16), "f4")}, "reg_token", "distilled"),
         (TIMM | {"blocks.0.mlp.w12.weight": np.ones((3, 16), "f4")}, "nothing", "SwiGLU"),
         (HF | {"model.layer.0.mlp.gate_proj.weight": np.ones((3, 16), "f4")}, "nothing", "SwiGLU"),
-        ({f"vision_model.{key}": x for key, x in SIGLIP.items()}
-         | {"vision_model.embeddings.patch_embedding.weight": np.ones((16, 48), "f4")}, "nothing", "NaFlex"),
+        (
+            {f"vision_model.{key}": x for key, x in SIGLIP.items()}
+            | {"vision_model.embeddings.patch_embedding.weight": np.ones((16, 48), "f4")},
+            "nothing",
+            "NaFlex",
+        ),
     ],
-)  # fmt: skip
+)
 def test_relatives_that_are_not_read_get_a_true_sentence(weights, without, words, tmp_path):
     kept = {key: x for key, x in weights.items() if not re.match(without, key)}
     with pytest.raises(UserError, match=words) as error:

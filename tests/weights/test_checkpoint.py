@@ -19,14 +19,22 @@ import optax
 import pytest
 
 from anytouch_jax.weights import checkpoint
-from anytouch_jax.weights.checkpoint import CheckpointError, Checkpoints, load_params, read_metadata, steps
+from anytouch_jax.weights.checkpoint import (
+    CheckpointError,
+    Checkpoints,
+    load_params,
+    read_metadata,
+    steps,
+)
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.tree import flatten
 
 DATA = Path(__file__).parent / "data"
 METADATA = {
-    "sensors": ["digit", "universal"], "preprocessing": {"mean": [0.5], "size": 112}, "source": {"init": "a test"},
-}  # fmt: skip
+    "sensors": ["digit", "universal"],
+    "preprocessing": {"mean": [0.5], "size": 112},
+    "source": {"init": "a test"},
+}
 
 
 class State(NamedTuple):
@@ -39,17 +47,24 @@ class State(NamedTuple):
 def params(seed: int = 0, width: int = 6) -> dict[str, Any]:
     draw = np.random.default_rng(seed).standard_normal
     touch = {"kernel": draw((5, width)).astype("f4"), "none": np.zeros((0, 3), "f4")}
-    return jax.device_put({"touch": touch, "half": draw(7).astype(jnp.bfloat16), "logit_scale": np.float32(draw())})
+    return jax.device_put(
+        {"touch": touch, "half": draw(7).astype(jnp.bfloat16), "logit_scale": np.float32(draw())}
+    )
 
 
 def state_of(seed: int = 0, width: int = 6) -> State:
     trainable = params(seed, width)
-    frozen = {"touch": {"table": np.arange(4, dtype=np.uint32)}, "ids": np.array([seed, -1], np.int32)}
+    frozen = {
+        "touch": {"table": np.arange(4, dtype=np.uint32)},
+        "ids": np.array([seed, -1], np.int32),
+    }
     return State(*jax.device_put((np.int32(seed), trainable, frozen)), START(trainable))
 
 
 START = jax.jit(
-    optax.chain(optax.identity(), optax.adamw(1e-3, mask=lambda tree: jax.tree.map(lambda _: True, tree))).init
+    optax.chain(
+        optax.identity(), optax.adamw(1e-3, mask=lambda tree: jax.tree.map(lambda _: True, tree))
+    ).init
 )
 
 
@@ -84,7 +99,8 @@ def test_a_loss_of_few_steps_is_never_the_best(tmp_path):
 
 def test_every_type_comes_back_bit_equal(tmp_path):
     with_nan = state_of(3)
-    odd = np.array([0x7FC00001, 0x80000000, 1], np.uint32).view(np.float32)  # a NaN with payload, -0, a denormal
+    # a NaN with payload, -0, a denormal
+    odd = np.array([0x7FC00001, 0x80000000, 1], np.uint32).view(np.float32)
     more = {"odd": jax.device_put(odd), "numpy": np.arange(3, dtype=np.int32)}
     with_nan = with_nan._replace(frozen=with_nan.frozen | more)
     saver = opened(tmp_path)
@@ -97,7 +113,9 @@ def test_every_type_comes_back_bit_equal(tmp_path):
 def test_one_thread_saves_while_another_loads(tmp_path):
     """Orbax runs one operation a process: each waits for the other's."""
     filled(tmp_path / "read", 1).close()
-    saver, done, loaded = opened(tmp_path / "written", keep=20), [], []
+    saver = opened(tmp_path / "written", keep=20)
+    done = []
+    loaded = []
 
     def load() -> None:
         while not done:
@@ -151,7 +169,8 @@ def test_a_failed_or_abandoned_save_does_not_block_a_load(tmp_path, monkeypatch)
 def test_a_checkpoint_that_its_run_removes_while_it_is_read(tmp_path, monkeypatch, when, times):
     """The one after it is read; where that happens again and again the error says so, and not that it is damaged."""
     filled(tmp_path, 1).close()
-    real, read = getattr(checkpoint, when), []
+    real = getattr(checkpoint, when)
+    read = []
 
     def pruned(folder, *more):
         read.append(int(folder.name))
@@ -162,13 +181,19 @@ def test_a_checkpoint_that_its_run_removes_while_it_is_read(tmp_path, monkeypatc
 
     monkeypatch.setattr(checkpoint, when, pruned)
     if times == 2:
-        np.testing.assert_array_equal(load_params(tmp_path)[0]["half"], state_of(1).trainable["half"])
+        np.testing.assert_array_equal(
+            load_params(tmp_path)[0]["half"], state_of(1).trainable["half"]
+        )
     else:
-        with pytest.raises(CheckpointError, match=r"00000003 was removed while it was read; read the latest"):
+        with pytest.raises(
+            CheckpointError, match=r"00000003 was removed while it was read; read the latest"
+        ):
             load_params(tmp_path)
     assert read == [1, 2, 3]
     read.clear()
-    monkeypatch.setattr(checkpoint, when, lambda folder, *more: (shutil.rmtree(folder), real(folder, *more)))
+    monkeypatch.setattr(
+        checkpoint, when, lambda folder, *more: (shutil.rmtree(folder), real(folder, *more))
+    )
     with pytest.raises(CheckpointError, match=r"was removed while it was read"):
         load_params(tmp_path, steps(tmp_path)[0])
 
@@ -193,14 +218,23 @@ def test_describes_itself(tmp_path):
     filled(tmp_path / "checkpoints", 2.5, float("nan")).close()
     for folder in (tmp_path, tmp_path / "checkpoints", tmp_path / "checkpoints" / "00000001"):
         metadata = read_metadata(folder, 1)
-        assert metadata == METADATA | {"step": 1, "config": '{"stage": 1}', "metrics": {"loss": 2.5}}
+        assert metadata == METADATA | {
+            "step": 1,
+            "config": '{"stage": 1}',
+            "metrics": {"loss": 2.5},
+        }
     assert read_metadata(tmp_path)["metrics"] == {"loss": None}
     tree, config, metadata = load_params(tmp_path, 2)
     assert config == '{"stage": 1}' and metadata["sensors"] == ["digit", "universal"]
     expected = state_of(2)
     assert all(isinstance(leaf, np.ndarray) for leaf in flatten(tree).values())
     touch = expected.trainable["touch"] | expected.frozen["touch"]
-    same(tree, jax.tree.map(np.asarray, expected.trainable | {"ids": expected.frozen["ids"], "touch": touch}))
+    same(
+        tree,
+        jax.tree.map(
+            np.asarray, expected.trainable | {"ids": expected.frozen["ids"], "touch": touch}
+        ),
+    )
 
 
 def test_another_configuration_is_named_with_both_shapes(tmp_path):
@@ -211,7 +245,9 @@ def test_another_configuration_is_named_with_both_shapes(tmp_path):
     assert "trainable/touch/kernel: (5, 6) float32 stored, (5, 8) float32 wanted" in message
     assert "opt_state/" in message and "3 entries differ" in message
     wanted = jax.eval_shape(state_of)
-    many = wanted._replace(trainable={f"n{i}": jax.ShapeDtypeStruct((i + 1,), jnp.float32) for i in range(9)})
+    many = wanted._replace(
+        trainable={f"n{i}": jax.ShapeDtypeStruct((i + 1,), jnp.float32) for i in range(9)}
+    )
     with pytest.raises(CheckpointError, match=r"nothing stored, .* wanted.*; \.\.\.") as caught:
         saver.restore(many)
     assert str(caught.value).count(" wanted") == 5
@@ -224,20 +260,31 @@ def test_another_configuration_is_named_with_both_shapes(tmp_path):
 @pytest.mark.parametrize("damage", ["half", "empty", "gone", "flipped"])
 def test_any_damaged_file_is_named_and_the_older_step_is_intact(tmp_path, damage):
     saver = filled(tmp_path / "run", 1, 2)
-    target, copy = tmp_path / "run" / "00000002", tmp_path / "kept"
+    target = tmp_path / "run" / "00000002"
+    copy = tmp_path / "kept"
     shutil.copytree(target, copy)
-    names = [path.relative_to(target) for path in sorted(target.rglob("*")) if path.is_file() and path.stat().st_size]
+    names = [
+        path.relative_to(target)
+        for path in sorted(target.rglob("*"))
+        if path.is_file() and path.stat().st_size
+    ]
     assert len(names) > 5
     for name in names:
         shutil.rmtree(target)
         shutil.copytree(copy, target)
-        path, content = target / name, (target / name).read_bytes()
+        path = target / name
+        content = (target / name).read_bytes()
         middle = len(content) // 2
         flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-        path.write_bytes({"half": content[:middle], "empty": b"", "gone": b"", "flipped": flipped}[damage])
+        path.write_bytes(
+            {"half": content[:middle], "empty": b"", "gone": b"", "flipped": flipped}[damage]
+        )
         if damage == "gone":
             path.unlink()
-        for attempt in (lambda: saver.restore(jax.eval_shape(state_of)), lambda: load_params(tmp_path / "run")):
+        for attempt in (
+            lambda: saver.restore(jax.eval_shape(state_of)),
+            lambda: load_params(tmp_path / "run"),
+        ):
             with pytest.raises(CheckpointError, match="step 1 is intact") as caught:
                 attempt()
             assert str(target) in str(caught.value) and path.name in str(caught.value)
@@ -256,10 +303,14 @@ def test_leftovers_of_a_killed_run_are_swept(tmp_path):
     for name in users:
         (tmp_path / name).mkdir()
     assert steps(tmp_path) == [1]
-    load_params(tmp_path)  # a reader leaves them alone: a run may be writing
+    # a reader leaves them alone: a run may be writing
+    load_params(tmp_path)
     assert len(list(tmp_path.iterdir())) == 7
     saver = opened(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000001", *users] and saver.latest() == 1
+    assert (
+        sorted(path.name for path in tmp_path.iterdir()) == ["00000001", *users]
+        and saver.latest() == 1
+    )
 
 
 @contextlib.contextmanager
@@ -280,12 +331,17 @@ def test_a_failing_write_spares_the_older_checkpoint(tmp_path, capfd):
     saver.wait()
     with _limited_files(100_000):
         saver.save(2, {"trainable": {"x": noise + 1}}, {"loss": 1})
-        with pytest.raises(CheckpointError, match=r"could not write checkpoint .*00000002.*older ones are untouched"):
+        with pytest.raises(
+            CheckpointError,
+            match=r"could not write checkpoint .*00000002.*older ones are untouched",
+        ):
             saver.wait()
     assert capfd.readouterr().err == ""
-    assert [path.name for path in tmp_path.iterdir()] == ["00000001"]  # the debris would keep the disk full
+    # the debris would keep the disk full
+    assert [path.name for path in tmp_path.iterdir()] == ["00000001"]
     np.testing.assert_array_equal(load_params(tmp_path)[0]["x"], noise)
-    saver.save(2, {"trainable": {"x": noise + 1}}, {"loss": 1})  # and the run may go on
+    # and the run may go on
+    saver.save(2, {"trainable": {"x": noise + 1}}, {"loss": 1})
     saver.close()
     np.testing.assert_array_equal(load_params(tmp_path)[0]["x"], noise + 1)
 
@@ -296,7 +352,9 @@ def test_a_disk_without_space_is_refused_before_anything_is_written(tmp_path, mo
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: usage._replace(free=100))
     saving = jax.eval_shape(lambda: state_of(2))
     for attempt in (lambda: saver.check_space(saving), lambda: saver.save(2, state_of(2), {})):
-        with pytest.raises(CheckpointError, match=r"the disk is full. It needs [\d,]+ bytes and has 100\."):
+        with pytest.raises(
+            CheckpointError, match=r"the disk is full. It needs [\d,]+ bytes and has 100\."
+        ):
             attempt()
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: usage._replace(total=0, free=0))
     saver.check_space(saving)  # a disk that does not know its size
@@ -345,17 +403,23 @@ CHILD = """
 """
 
 
-@pytest.mark.parametrize(("where", "last"), [("arrays written", 2), ("renamed", 3), ("removing", 3), ("writing", 2)])
+@pytest.mark.parametrize(
+    ("where", "last"), [("arrays written", 2), ("renamed", 3), ("removing", 3), ("writing", 2)]
+)
 def test_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, where, last):
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(CHILD), str(tmp_path), where], capture_output=True, text=True,
+        [sys.executable, "-c", textwrap.dedent(CHILD), str(tmp_path), where],
+        capture_output=True,
+        text=True,
         timeout=120,
-    )  # fmt: skip
+    )
     assert done.returncode == -9, done.stderr
     present = steps(tmp_path)
     assert present[-1] == last or (where == "writing" and present[-1] == 3)
     for step in present:
-        np.testing.assert_array_equal(load_params(tmp_path, step)[0]["x"], np.full((200, 300), step, "f4"))
+        np.testing.assert_array_equal(
+            load_params(tmp_path, step)[0]["x"], np.full((200, 300), step, "f4")
+        )
     saver = Checkpoints(tmp_path, keep=1, config_json="{}", metadata={})
     assert all(path.name.isdigit() for path in tmp_path.iterdir())
     saver.save(9, {"trainable": {"x": np.zeros(3, "f4")}}, {"loss": -9})
@@ -371,7 +435,11 @@ def test_a_checkpoint_of_the_first_format_loads_to_the_bit(tmp_path):
     stored = json.loads((DATA / "checkpoint_1.json").read_text())
     raw, _, metadata = load_params(tmp_path / "run")
     numbers = {
-        name: [list(array.shape), float(np.asarray(array, np.float64).sum()), zlib.crc32(array.tobytes())]
+        name: [
+            list(array.shape),
+            float(np.asarray(array, np.float64).sum()),
+            zlib.crc32(array.tobytes()),
+        ]
         for name, array in flatten(raw).items()
     }
     assert numbers == stored
@@ -379,7 +447,10 @@ def test_a_checkpoint_of_the_first_format_loads_to_the_bit(tmp_path):
     assert loaded.trained_sensors == ("digit", "gelsight_mini")
     assert {"touch", "decoder", "image", "text"} <= loaded.params.keys()
     model = loaded.config.model
-    tokens, universal = loaded.params["touch"]["sensor_tokens"], raw["touch"]["sensor_tokens"][model.universal_row]
+    tokens = loaded.params["touch"]["sensor_tokens"]
+    universal = raw["touch"]["sensor_tokens"][model.universal_row]
     for row, name in enumerate(model.sensors):
         trained = name in loaded.trained_sensors
-        np.testing.assert_array_equal(tokens[row], raw["touch"]["sensor_tokens"][row] if trained else universal)
+        np.testing.assert_array_equal(
+            tokens[row], raw["touch"]["sensor_tokens"][row] if trained else universal
+        )

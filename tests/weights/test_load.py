@@ -41,7 +41,8 @@ def test_a_run_and_its_export_are_the_same_model(tmp_path):
     config = replace(config, data=replace(config.data, background="subtract"))
     params = params_of(config.model)
     run = load_model(save_run(tmp_path / "run", config, params, seen=TRAINED))
-    assert {"touch", "decoder", "image", "text", "matcher", "logit_scale"} <= run.params.keys()  # towers survive
+    # towers survive
+    assert {"touch", "decoder", "image", "text", "matcher", "logit_scale"} <= run.params.keys()
     assert run.from_run and run.trained_sensors == tuple(TRAINED) and run.universal_drawn
     export_safetensors(tmp_path / "run.safetensors", run.params, run.export_metadata())
     file = load_model(tmp_path / "run.safetensors")
@@ -55,12 +56,18 @@ def test_sensors_outside_training_get_the_universal_row(stage1):
     tokens = load_model(run).params["touch"]["sensor_tokens"]
     for row, name in enumerate(config.model.sensors):
         expected = row if name in TRAINED else config.model.universal_row
-        np.testing.assert_array_equal(tokens[row], params["touch"]["sensor_tokens"][expected], err_msg=name)
-    never = replace(config, objective=replace(config.objective, universal_start=0.0, universal_end=0.0))
+        np.testing.assert_array_equal(
+            tokens[row], params["touch"]["sensor_tokens"][expected], err_msg=name
+        )
+    never = replace(
+        config, objective=replace(config.objective, universal_start=0.0, universal_end=0.0)
+    )
     loaded = load_model(save_run(run.parent / "never", never, params, seen=TRAINED))
     rows = [config.model.sensors.index(name) for name in TRAINED]
     mean = params["touch"]["sensor_tokens"][rows].mean(axis=0)
-    np.testing.assert_array_equal(loaded.params["touch"]["sensor_tokens"][config.model.universal_row], mean)
+    np.testing.assert_array_equal(
+        loaded.params["touch"]["sensor_tokens"][config.model.universal_row], mean
+    )
     assert not loaded.universal_drawn
 
 
@@ -72,13 +79,16 @@ def test_the_authors_weights_are_known_by_their_table(tmp_path):
     write_heads(tmp_path, config.model)
     tokens = load_model(path).params["touch"]["sensor_tokens"]
     for row in range(len(SENSORS)):
-        np.testing.assert_array_equal(tokens[row], params["touch"]["sensor_tokens"][row if row < 5 else -1])
+        np.testing.assert_array_equal(
+            tokens[row], params["touch"]["sensor_tokens"][row if row < 5 else -1]
+        )
     stored = load_model(path, stored_rows=True)
     assert_same(stored.params, params)
     assert stored.trained_sensors == SENSORS[:5]
     few = replace(config.model, sensors=("digit", UNIVERSAL))
     write_safetensors(path, to_release(params_of(few), few), {})
-    assert load_model(path).trained_sensors is None  # of another table, and without metadata
+    # of another table, and without metadata
+    assert load_model(path).trained_sensors is None
 
 
 def start(config, **paths):
@@ -121,7 +131,9 @@ def test_a_new_sensor_keeps_the_tokens_of_the_old_ones(stage1, place):
     run, config, _ = stage1
     names = (*SENSORS[:place], "new_sensor", *SENSORS[place:])
     tokens = start(tiny_config(2, sensors=names), init=run)[1]["touch"]["sensor_tokens"]
-    old = dict(zip(config.model.sensors, load_model(run).params["touch"]["sensor_tokens"], strict=True))
+    old = dict(
+        zip(config.model.sensors, load_model(run).params["touch"]["sensor_tokens"], strict=True)
+    )
     for name, row in zip(names, tokens, strict=True):
         np.testing.assert_array_equal(row, old.get(name, old[UNIVERSAL]), err_msg=name)
 
@@ -143,7 +155,10 @@ def test_a_start_that_does_not_fit_names_the_options(stage1, tmp_path):
     wide = replace(touch, width=32, heads=1)
     for model, options in (
         ({"embed": 16}, "--model.embed 12"),
-        ({"embed": 16, "touch": wide}, "--model.embed 12 --model.touch.width 16 --model.touch.heads 2"),
+        (
+            {"embed": 16, "touch": wide},
+            "--model.embed 12 --model.touch.width 16 --model.touch.heads 2",
+        ),
         ({"touch": replace(touch, heads=1)}, "--model.touch.heads 2"),
         ({"activation": "quick_gelu"}, "--model.activation gelu"),
     ):
@@ -161,11 +176,15 @@ def test_a_start_that_does_not_fit_names_the_options(stage1, tmp_path):
     start(tiny_config(2), init=file)
     with pytest.raises(UserError, match=r"--model\.touch\.heads 2$"):
         start(tiny_config(2, touch=replace(touch, heads=1)), init=file)
-    export_safetensors(tmp_path / "half.safetensors", {"touch": params["touch"]}, load_model(run).export_metadata())
-    assert any(
-        "the decoder starts untrained" in note for note in start(tiny_config(1), init=tmp_path / "half.safetensors")[2]
+    export_safetensors(
+        tmp_path / "half.safetensors", {"touch": params["touch"]}, load_model(run).export_metadata()
     )
-    result = start(tiny_config(2), init=tmp_path / "half.safetensors")  # as the encoders of the package
+    assert any(
+        "the decoder starts untrained" in note
+        for note in start(tiny_config(1), init=tmp_path / "half.safetensors")[2]
+    )
+    # as the encoders of the package
+    result = start(tiny_config(2), init=tmp_path / "half.safetensors")
     assert not any("decoder" in note for note in result[2])
     assert np.array_equal(result[1]["touch"]["class_token"], params["touch"]["class_token"])
 
@@ -184,8 +203,10 @@ def test_clip_gives_the_towers_and_without_stage_one_the_touch_encoder(stage1, t
     text_only = replace(config, model=replace(config.model, image=None, lora_rank=0))
     params = start(text_only, clip=folder)[1]
     np.testing.assert_array_equal(params["touch"]["position"], clip["image"]["position"])
-    params = start(tiny_config(), clip=folder / "model.safetensors")[1]  # stage 1
-    for frame in params["touch"]["patch"]["kernel"]:  # repeated, not divided (golden Q1)
+    # stage 1
+    params = start(tiny_config(), clip=folder / "model.safetensors")[1]
+    # repeated, not divided (golden Q1)
+    for frame in params["touch"]["patch"]["kernel"]:
         np.testing.assert_array_equal(frame, clip["image"]["patch"]["kernel"])
 
 
@@ -193,7 +214,13 @@ def test_clip_gives_the_towers_and_without_stage_one_the_touch_encoder(stage1, t
 @pytest.mark.parametrize(
     ("file", "content"),
     [
-        ("config.json", {"text_config": {"hidden_act": "quick_gelu"}, "vision_config": {"hidden_act": "quick_gelu"}}),
+        (
+            "config.json",
+            {
+                "text_config": {"hidden_act": "quick_gelu"},
+                "vision_config": {"hidden_act": "quick_gelu"},
+            },
+        ),
         ("config.json", {"model_type": "clip", "vision_config": {}}),  # HF's default
         ("open_clip_config.json", {"model_cfg": {"quick_gelu": True}}),
     ],
@@ -203,7 +230,9 @@ def test_clip_weights_of_another_activation_are_refused(tmp_path, file, content,
     folder = save_clip(tmp_path / "clip", config.model, params_of(config.model))
     (folder / file).write_text(json.dumps(content))
     for path in (folder, folder / "model.safetensors"):
-        with pytest.raises(UserError, match=r"model\.safetensors .* --model\.activation quick_gelu"):
+        with pytest.raises(
+            UserError, match=r"model\.safetensors .* --model\.activation quick_gelu"
+        ):
             start(config if stage == 2 else tiny_config(), clip=path)
 
 
@@ -216,23 +245,30 @@ def test_clip_starts_the_touch_encoder(layout, own):
     model = replace(STAGE1, patch_encoder="sensor" if own else "shared")
     fresh = params_of(model, seed=1)
     params = first_params(fresh, model, clip=weights)
-    assert_same(params["decoder"], fresh["decoder"])  # kept, as the sensor tokens are
+    # kept, as the sensor tokens are
+    assert_same(params["decoder"], fresh["decoder"])
     np.testing.assert_array_equal(params["touch"]["sensor_tokens"], fresh["touch"]["sensor_tokens"])
     for part in ("class_token", "position", "pre_norm", "blocks", "post_norm", "projection"):
         assert_same({part: params["touch"][part]}, {part: tower["image"][part]})
     kernel = clip["vision_model.embeddings.patch_embedding.weight"]
-    inflated = np.repeat(kernel[:, None], 3, axis=1)  # golden Q1: not divided
+    # golden Q1: not divided
+    inflated = np.repeat(kernel[:, None], 3, axis=1)
     for row in params["touch"]["patch"]["kernel"] if own else [params["touch"]["patch"]["kernel"]]:
         one = {**params, "touch": {**params["touch"], "patch": {"kernel": row}}}
         theirs = to_release(one, STAGE1)["video_patch_embedding.weight"]
         np.testing.assert_allclose(theirs, inflated, rtol=1e-7)
-    assert_same({"fresh": fresh}, {"fresh": params_of(model, seed=1)})  # the given tree is not written to
+    # the given tree is not written to
+    assert_same({"fresh": fresh}, {"fresh": params_of(model, seed=1)})
 
 
 def test_files_of_every_kind_hold_the_same(write_torch, tmp_path):
     weights = weights_of(STAGE1)
     params = to_params(weights, STAGE1)
-    write_safetensors(tmp_path / "w.safetensors", {k: v.T.copy().T for k, v in weights.items()}, {"source": "test"})
+    write_safetensors(
+        tmp_path / "w.safetensors",
+        {k: v.T.copy().T for k, v in weights.items()},
+        {"source": "test"},
+    )
     np.savez(tmp_path / "w.npz", **weights)
     write_torch({"model": {key: tensor(value) for key, value in weights.items()}}, "w.pth")
     write_torch({key: tensor(value) for key, value in weights.items()}, "w.bin", legacy=True)
@@ -241,7 +277,9 @@ def test_files_of_every_kind_hold_the_same(write_torch, tmp_path):
     assert not list(tmp_path.glob(".*"))  # no leftovers of the atomic write
 
 
-@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod.", "model.", "model._orig_mod."])
+@pytest.mark.parametrize(
+    "prefix", ["module.", "_orig_mod.", "module._orig_mod.", "model.", "model._orig_mod."]
+)
 def test_prefixes_are_removed_in_every_format(write_torch, tmp_path, prefix):
     weights = {f"{prefix}{key}": value for key, value in weights_of(STAGE1).items()}
     write_safetensors(tmp_path / "w.safetensors", weights, {})
@@ -258,7 +296,9 @@ def test_weights_in_parts_are_read_by_their_index(tmp_path):
     weights = weights_of(STAGE1)
     homes = {key: f"model-0000{1 + i % 2}-of-00002.safetensors" for i, key in enumerate(weights)}
     for part in set(homes.values()):
-        write_safetensors(tmp_path / part, {key: weights[key] for key in weights if homes[key] == part}, {})
+        write_safetensors(
+            tmp_path / part, {key: weights[key] for key in weights if homes[key] == part}, {}
+        )
     with pytest.raises(UserError, match=r"one of 2 parts.*model\.safetensors\.index\.json"):
         read_weights(tmp_path / "model-00001-of-00002.safetensors")
     index = tmp_path / "model.safetensors.index.json"
@@ -278,7 +318,9 @@ def test_weights_that_are_not_finite_are_refused_by_name(tmp_path, form, value):
     config = tiny_config()
     params = params_of(config.model)
     params["decoder"]["mask_token"].flat[0] = value
-    path = save_run(tmp_path / "run", config, params) if form == "run" else tmp_path / "w.safetensors"
+    path = (
+        save_run(tmp_path / "run", config, params) if form == "run" else tmp_path / "w.safetensors"
+    )
     if form == "file":
         export_safetensors(path, params, {MODEL_KEY: to_json(config.model)})
     with pytest.raises(UserError, match="decoder/mask_token has values that are not finite"):
@@ -287,7 +329,10 @@ def test_weights_that_are_not_finite_are_refused_by_name(tmp_path, form, value):
 
 @pytest.mark.parametrize("name", ["w.pth", "w.safetensors", "w.npz"])
 def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
-    texts = {"a web page": "\n<!DOCTYPE html><html>", "a Git LFS pointer": "version https://git-lfs.github.com/spec/v1"}
+    texts = {
+        "a web page": "\n<!DOCTYPE html><html>",
+        "a Git LFS pointer": "version https://git-lfs.github.com/spec/v1",
+    }
     for kind, text in texts.items():
         (tmp_path / name).write_text(text)
         with pytest.raises(UserError, match=f"is {kind}"):
@@ -296,17 +341,22 @@ def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
 
 # torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x 3 image
 UP = [
-    [-0.220484018, 0.204530478, 2.152891397, 4.220484257], [1.355409384, 1.418546438, 2.801180124, 4.506895065],
-    [1.893125772, 1.390535593, 1.888761282, 3.028749228], [1.005151987, 0.140684366, 0.073182821, 0.851293325],
-]  # fmt: skip
+    [-0.220484018, 0.204530478, 2.152891397, 4.220484257],
+    [1.355409384, 1.418546438, 2.801180124, 4.506895065],
+    [1.893125772, 1.390535593, 1.888761282, 3.028749228],
+    [1.005151987, 0.140684366, 0.073182821, 0.851293325],
+]
 DOWN = [[0.572738647, 3.497573853], [1.071792603, 1.381332397]]
 
 
 @pytest.mark.parametrize("expected", [UP, DOWN])
 def test_equal_to_torch(expected):
-    table = np.concatenate([[[100.0, -100.0]], np.stack([np.arange(9) ** 2 % 7, -(np.arange(9) ** 2 % 7)], 1)])
+    table = np.concatenate(
+        [[[100.0, -100.0]], np.stack([np.arange(9) ** 2 % 7, -(np.arange(9) ** 2 % 7)], 1)]
+    )
     flat = np.ravel(expected)
     resized = resize_position(table.astype("f4"), 1 + len(flat))
     assert resized.dtype == np.float32
-    np.testing.assert_array_equal(resized[0], table[0])  # the class token's row
+    # the class token's row
+    np.testing.assert_array_equal(resized[0], table[0])
     np.testing.assert_allclose(resized[1:], np.stack([flat, -flat], 1), atol=1e-6)

@@ -47,18 +47,28 @@ def test_damaged_weights_of_the_package_are_refused(packaged):
 
 
 @pytest.mark.parametrize(
-    ("address", "revision"), [("hf://user/repo", None), (Path("hf://user/repo"), None), ("hf://user/repo@v1", "v1")]
+    ("address", "revision"),
+    [("hf://user/repo", None), (Path("hf://user/repo"), None), ("hf://user/repo@v1", "v1")],
 )
 def test_a_repository_of_the_hub_is_loaded(tmp_path, monkeypatch, address, revision):
-    folder, asked = write_encoder(tmp_path / "snapshot"), []
+    folder = write_encoder(tmp_path / "snapshot")
+    asked = []
 
-    needed = ["preprocessor_config.json", "model.safetensors.index.json", "sparsh.ckpt", "encoders/digit.pth"]
+    needed = [
+        "preprocessor_config.json",
+        "model.safetensors.index.json",
+        "sparsh.ckpt",
+        "encoders/digit.pth",
+    ]
     needed += ["calibration/0000.png", "config.json", "tokenizer.json", "model.safetensors"]
 
     def snapshot_download(repository, *, revision, allow_patterns):
         asked.append((repository, revision))
         names = [*needed, "flax_model.msgpack", "picture.png"]
-        assert list(huggingface_hub.utils.filter_repo_objects(names, allow_patterns=allow_patterns)) == needed
+        assert (
+            list(huggingface_hub.utils.filter_repo_objects(names, allow_patterns=allow_patterns))
+            == needed
+        )
         return str(folder)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
@@ -81,7 +91,11 @@ def test_a_repository_that_cannot_be_had_is_one_sentence(monkeypatch):
 def test_a_folder_to_upload_has_a_card_and_what_zero_shot_questions_need(tmp_path):
     folder = write_encoder(tmp_path / "mine")
     page = (folder / "README.md").read_text()
-    assert page.startswith("---\nlibrary_name: anytouch_jax\n") and "## Limits" in page and "| digit |" in page
+    assert (
+        page.startswith("---\nlibrary_name: anytouch_jax\n")
+        and "## Limits" in page
+        and "| digit |" in page
+    )
     encoder = at.load_encoder(folder)
     assert set(encoder.others) == {"text", "logit_scale"} and encoder.trained_sensors == ("digit",)
     assert encoder.config.model.match_head == "none"
@@ -92,4 +106,6 @@ def test_values_that_float16_cannot_hold_are_refused(tmp_path):
     params = at.build(config.model).init(jax.random.key(0))
     params["touch"]["class_token"] = params["touch"]["class_token"] + 1e6
     with pytest.raises(WeightsError, match="touch/class_token has values above 65504"):
-        registry.write_encoder(tmp_path / "large", Loaded(tmp_path, params, config, None, True, {}, True))
+        registry.write_encoder(
+            tmp_path / "large", Loaded(tmp_path, params, config, None, True, {}, True)
+        )

@@ -35,7 +35,10 @@ def mae(folder: Path) -> Path:
     """A ViT-MAE of Hugging Face with random arrays: 28 pixels, patches of 7, width 16."""
     *_, arrays = made(MAE, (16, 2, 2, 32), 7, {"grid": (1, 4, 4)}, (28, 28))
     folder.mkdir()
-    save_file({key: np.float32(0.3) * array for key, array in arrays.items()}, folder / "model.safetensors")
+    save_file(
+        {key: np.float32(0.3) * array for key, array in arrays.items()},
+        folder / "model.safetensors",
+    )
     (folder / "config.json").write_text(json.dumps({"num_attention_heads": 2}))
     return folder
 
@@ -44,16 +47,25 @@ def run_of(encoder, **changes) -> Config:
     """A run of stage 1 whose touch encoder has the form of a ViT."""
     form = encoder.form.model
     size = {name: getattr(form, name) for name in ("patch", "touch", "norm_eps")}
-    size |= {"image_size": encoder.image_size[0], "embed": form.touch.width, "decoder": Stack(8, 1, 2, 16)}
+    size |= {
+        "image_size": encoder.image_size[0],
+        "embed": form.touch.width,
+        "decoder": Stack(8, 1, 2, 16),
+    }
     return replace(preset("tiny"), model=touch_model(**size, pre_norm=False, **changes))
 
 
 @pytest.mark.parametrize("family", ["dinov2", "vit_mae"])
 def test_a_still_and_a_clip_of_equal_frames_give_the_class_token_of_the_file(family, tmp_path):
     """Layer scales, the bias of the patches and the kernel over three frames are exact."""
-    source = no_registers(OTHERS / "dinov2_registers_hf", tmp_path / "a") if family == "dinov2" else mae(tmp_path / "b")
+    source = (
+        no_registers(OTHERS / "dinov2_registers_hf", tmp_path / "a")
+        if family == "dinov2"
+        else mae(tmp_path / "b")
+    )
     encoder = load_encoder(source)
-    encoder = load_encoder(source, image_size=encoder.form.grid[1] * encoder.form.model.patch)  # stored positions
+    # stored positions
+    encoder = load_encoder(source, image_size=encoder.form.grid[1] * encoder.form.model.patch)
     assert encoder.family.name == family
     config = run_of(encoder, sensor_tokens=0)
     net = build(config.model)
@@ -79,9 +91,9 @@ def test_positions_are_resized_and_registers_left_out(tmp_path):
     params, notes, _ = load_start(fresh, config, init=source)
     assert params["touch"]["position"].shape == (config.model.patches + 1, config.model.touch.width)
     assert any("register tokens" in note for note in notes)
-    assert {name: np.shape(x) for name, x in params["touch"].items() if not isinstance(x, dict)} == {
-        name: x.shape for name, x in fresh["touch"].items() if not isinstance(x, dict)
-    }
+    assert {
+        name: np.shape(x) for name, x in params["touch"].items() if not isinstance(x, dict)
+    } == {name: x.shape for name, x in fresh["touch"].items() if not isinstance(x, dict)}
 
 
 def test_another_form_or_family_is_one_sentence(tmp_path):
@@ -89,9 +101,11 @@ def test_another_form_or_family_is_one_sentence(tmp_path):
     config = run_of(load_encoder(source))
     fresh = build(config.model).init(jax.random.key(0))
     wrong = {
-        "--model.no-pre-norm": {"pre_norm": True}, "--model.norm-eps 1e-12": {"norm_eps": 1e-5},
-        "--model.touch.width 16": {"touch": Stack(32, 2, 2, 32)}, "--model.activation": {"activation": "quick_gelu"},
-    }  # fmt: skip
+        "--model.no-pre-norm": {"pre_norm": True},
+        "--model.norm-eps 1e-12": {"norm_eps": 1e-5},
+        "--model.touch.width 16": {"touch": Stack(32, 2, 2, 32)},
+        "--model.activation": {"activation": "quick_gelu"},
+    }
     for option, change in wrong.items():
         with pytest.raises(UserError, match=option):
             load_start(fresh, replace(config, model=replace(config.model, **change)), init=source)

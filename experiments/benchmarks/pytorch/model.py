@@ -41,7 +41,8 @@ class TouchModel(nn.Module):
 
     def __init__(self, model: dict[str, Any]) -> None:
         super().__init__()
-        width, positions = model["touch"]["width"], (model["image_size"] // model["patch"]) ** 2 + 1
+        width = model["touch"]["width"]
+        positions = (model["image_size"] // model["patch"]) ** 2 + 1
         self.embeddings = nn.Module()
         self.embeddings.class_embedding = nn.Parameter(torch.zeros(width))
         self.embeddings.position_embedding = nn.Embedding(positions, width)
@@ -55,17 +56,26 @@ class TouchMAE(nn.Module):
 
     def __init__(self, model: dict[str, Any]) -> None:
         super().__init__()
-        self.patch, self.frames, width = model["patch"], model["frames"], model["touch"]["width"]
+        self.patch = model["patch"]
+        self.frames = model["frames"]
+        width = model["touch"]["width"]
         self.touch_model = TouchModel(model)
         size = (self.frames, self.patch, self.patch)
-        self.video_patch_embedding = nn.Conv3d(self.frames, width, (3, *size[1:]), (3, *size[1:]), bias=False)
-        self.sensor_token = nn.Parameter(torch.zeros(len(model["sensors"]), model["sensor_tokens"], width))
+        self.video_patch_embedding = nn.Conv3d(
+            self.frames, width, (3, *size[1:]), (3, *size[1:]), bias=False
+        )
+        self.sensor_token = nn.Parameter(
+            torch.zeros(len(model["sensors"]), model["sensor_tokens"], width)
+        )
         self.touch_projection = nn.Linear(width, model["embed"], bias=False)
-        inner, pixels = model["decoder"], self.patch**2 * 3
+        inner = model["decoder"]
+        pixels = self.patch**2 * 3
         self.decoder_embed = nn.Linear(model["embed"], inner["width"])
         self.mask_token = nn.Parameter(torch.zeros(1, 1, inner["width"]))
         positions = self.touch_model.embeddings.position_embedding.num_embeddings
-        self.decoder_pos_embed = nn.Parameter(torch.zeros(1, positions, inner["width"]), requires_grad=False)
+        self.decoder_pos_embed = nn.Parameter(
+            torch.zeros(1, positions, inner["width"]), requires_grad=False
+        )
         config = ViTConfig(
             hidden_size=inner["width"],
             intermediate_size=inner["mlp"],
@@ -97,12 +107,18 @@ class TouchMAE(nn.Module):
         return self.touch_model.encoder(inputs_embeds=x).last_hidden_state
 
     def embed(self, clip: Tensor, sensor: Tensor) -> Tensor:
-        return self.touch_projection(self.touch_model.post_layernorm(self.hidden(clip, sensor)[:, 0]))
+        return self.touch_projection(
+            self.touch_model.post_layernorm(self.hidden(clip, sensor)[:, 0])
+        )
 
-    def paint(self, clip: Tensor, sensor: Tensor, noise: Tensor, kept: int) -> tuple[Tensor, Tensor]:
+    def paint(
+        self, clip: Tensor, sensor: Tensor, noise: Tensor, kept: int
+    ) -> tuple[Tensor, Tensor]:
         order = torch.argsort(noise, dim=1)
         restore = torch.argsort(order, dim=1)
-        x = self.decoder_embed(self.touch_projection(self.hidden(clip[:, : self.frames], sensor, order[:, :kept])))
+        x = self.decoder_embed(
+            self.touch_projection(self.hidden(clip[:, : self.frames], sensor, order[:, :kept]))
+        )
         special = x.shape[1] - kept
         blank = self.mask_token.to(x.dtype).expand(len(x), noise.shape[1] - kept, -1)
         grid = torch.cat([x[:, special:], blank], dim=1)
@@ -156,7 +172,9 @@ class Stage2(nn.Module):
         self.logit_scale = nn.Parameter(torch.zeros(()))
         self.cross_sensor_head = nn.Linear(model["embed"], 1)
 
-    def align(self, b: dict[str, Tensor], noise: Tensor, kept: int, weights: list[float]) -> tuple[Tensor, Tensor]:
+    def align(
+        self, b: dict[str, Tensor], noise: Tensor, kept: int, weights: list[float]
+    ) -> tuple[Tensor, Tensor]:
         touch = self.touch_mae_model
         z = unit(touch.embed(b["clip"][:, : touch.frames], b["sensor"]))
         image = unit(self.visual_projection(self.vision_model(b["image"]).pooler_output))
@@ -166,7 +184,9 @@ class Stage2(nn.Module):
         total = weights[0] * both_ways(z[b["image_row"]], image, scale)
         total = total + weights[1] * both_ways(z[b["text_row"]], text, scale)
         if len(b["both_image"]):
-            total = total + weights[2] * both_ways(image[b["both_image"]], text[b["both_text"]], scale)
+            total = total + weights[2] * both_ways(
+                image[b["both_image"]], text[b["both_text"]], scale
+            )
         pixels, _ = touch.loss(b["clip"], b["sensor"], noise, kept)
         return total + pixels, z
 

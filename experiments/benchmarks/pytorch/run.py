@@ -28,7 +28,14 @@ from anytouch_jax.weights import convert, load, safetensors
 from experiments.benchmarks import machine, speed, variants
 from experiments.benchmarks.pytorch.keys import renamed
 from experiments.benchmarks.run import table_of
-from experiments.benchmarks.workloads import Workload, first_state, make_batch, normalised, values_of, workloads
+from experiments.benchmarks.workloads import (
+    Workload,
+    first_state,
+    make_batch,
+    normalised,
+    values_of,
+    workloads,
+)
 from experiments.records import write_record
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -36,7 +43,8 @@ WHAT = ("stage1", "stage2", "embed")
 RIVALS = ("eager float32", "compiled float32", "eager bfloat16", "compiled bfloat16")
 OURS = (variants.BASELINE, variants.Variant("bfloat16", variants.BFLOAT16))
 _SETTLE = 0.02  # seconds for our idle threads to stop spinning before the other process works
-LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4
+LOSS_TOLERANCE = 1e-5
+GRADIENT_TOLERANCE = 1e-4
 
 
 class Worker:
@@ -81,7 +89,9 @@ def spec(work: Workload) -> dict[str, Any]:
 def given(work: Workload) -> tuple[Any, np.ndarray]:
     """The batch and the masks' noise that both sides get."""
     rng = np.random.default_rng(1)
-    return make_batch(work), rng.random((work.samples, work.config.model.patches)).astype(np.float32)
+    return make_batch(work), rng.random((work.samples, work.config.model.patches)).astype(
+        np.float32
+    )
 
 
 def batch_file(work: Workload, path: Path) -> None:
@@ -95,7 +105,9 @@ def batch_file(work: Workload, path: Path) -> None:
 def reference(work: Workload, params: Any) -> dict[str, Any]:
     """Loss, output and gradients of ours in float64, gradients by the authors' key names."""
     batch, noise = given(work)
-    config = dataclasses.replace(work.config, model=dataclasses.replace(work.config.model, dtype="float64"))
+    config = dataclasses.replace(
+        work.config, model=dataclasses.replace(work.config.model, dtype="float64")
+    )
     with jax.enable_x64(True):
         args = jax.tree.map(speed.widened, (params, normalised(batch), noise))
         values = jax.device_get(jax.jit(values_of(config, work.trains))(*args))
@@ -119,7 +131,10 @@ def rival_errors(loss: float, file: Path, exact: dict[str, Any]) -> dict[str, fl
     grads = {key.removeprefix("grad/"): value for key, value in found.items()}
     wanted = {renamed(key): value for key, value in exact["gradient"].items()}
     left = {k: v for k, v in wanted.items() if k in grads}
-    lost = max((float(np.abs(v).max()) for k, v in wanted.items() if k not in grads and k not in UNUSED), default=0.0)
+    lost = max(
+        (float(np.abs(v).max()) for k, v in wanted.items() if k not in grads and k not in UNUSED),
+        default=0.0,
+    )
     if lost > 0:
         raise SystemExit("the rival has no gradient for a parameter that ours has one for")
     errors["loss"] = abs(loss - exact["loss"]) / abs(exact["loss"])
@@ -146,21 +161,28 @@ def compare(
     state = first_state(work.config)
     params = jax.device_get(merge(state.trainable, state.frozen))
     with TemporaryDirectory() as name:
-        folder, worker = Path(name), Worker(python)
+        folder = Path(name)
+        worker = Worker(python)
         try:
             safetensors.write_safetensors(
                 folder / "weights.safetensors", convert.to_release(params, work.config.model), {}
             )
             batch_file(work, folder / "batch.safetensors")
-            files = {"weights": str(folder / "weights.safetensors"), "batch": str(folder / "batch.safetensors")}
+            files = {
+                "weights": str(folder / "weights.safetensors"),
+                "batch": str(folder / "batch.safetensors"),
+            }
             about = worker.ask(do="setup", work=spec(work), **files)
             print(f"{work.name}: {about}", file=sys.stderr)
             exact = reference(work, params)
-            errors, notes = {}, {}
+            errors = {}
+            notes = {}
             for rival in rivals:
                 start = time.perf_counter()
                 try:
-                    answer = worker.ask(do="values", variant=rival, out=str(folder / "values.safetensors"))
+                    answer = worker.ask(
+                        do="values", variant=rival, out=str(folder / "values.safetensors")
+                    )
                 except RuntimeError as error:
                     notes[rival] = str(error)
                     continue
@@ -181,14 +203,25 @@ def check(work: Workload, rival: str, errors: dict[str, float]) -> None:
     limits = {"output": GRADIENT_TOLERANCE, "loss": LOSS_TOLERANCE, "gradient": GRADIENT_TOLERANCE}
     for what, limit in limits.items():
         if errors.get(what, 0.0) > limit:
-            raise SystemExit(f"{work.name}, PyTorch {rival}: {what} differs by {errors[what]:.2g}, more than {limit:g}")
+            raise SystemExit(
+                f"{work.name}, PyTorch {rival}: {what} differs by {errors[what]:.2g}, more than {limit:g}"
+            )
 
 
 def timed(
-    work: Workload, worker: Worker, errors: dict[str, Any], rounds: int, peak_size: int | None, state: Any, params: Any
+    work: Workload,
+    worker: Worker,
+    errors: dict[str, Any],
+    rounds: int,
+    peak_size: int | None,
+    state: Any,
+    params: Any,
 ) -> list[dict[str, Any]]:
     """All in turns; each row has its seconds, and its time over ours in float32."""
-    programs = [variants.compiled(v, work, state if work.trains else {"touch": params["touch"]}) for v in OURS]
+    programs = [
+        variants.compiled(v, work, state if work.trains else {"touch": params["touch"]})
+        for v in OURS
+    ]
     own = (
         speed.step_calls(programs, state)
         if work.trains
@@ -208,8 +241,10 @@ def timed(
     rate = operations / float(np.median(times[-1]))
     names = [f"ours, {v.name}" for v in OURS] + [f"PyTorch, {rival}" for rival in errors]
     wrong = [*ours_wrong, *errors.values()]
-    seconds = times[: len(own)] + [np.reshape(s[1:], (rounds, repeats)) for s in inside.values()]  # without the warm-up
-    seconds = [values[:, 1:] for values in seconds]  # in another's turn the memory of a step may go back to the system
+    # without the warm-up
+    seconds = times[: len(own)] + [np.reshape(s[1:], (rounds, repeats)) for s in inside.values()]
+    # in another's turn the memory of a step may go back to the system
+    seconds = [values[:, 1:] for values in seconds]
     base = np.median(seconds[0], axis=1)
     rows = []
     for name, values, error in zip(names, seconds, wrong, strict=True):
@@ -217,26 +252,37 @@ def timed(
         low, high = np.percentile(middle / base, [25, 75])
         rows.append(
             {
-                "name": name, "seconds": float(np.median(middle)), "ratio": float(np.median(middle / base)),
-                "ratio_iqr": float(high - low), "samples_per_second": work.samples / float(np.median(middle)),
+                "name": name,
+                "seconds": float(np.median(middle)),
+                "ratio": float(np.median(middle / base)),
+                "ratio_iqr": float(high - low),
+                "samples_per_second": work.samples / float(np.median(middle)),
                 "gflops": work.operations / float(np.median(middle)) / 1e9,
                 "best_ratio": float(values.min() / seconds[0].min()),
                 "peak_share": work.operations / float(np.median(middle)) / rate,
-                "p50": float(np.percentile(values, 50)), "p99": float(np.percentile(values, 99)), **error,
+                "p50": float(np.percentile(values, 50)),
+                "p99": float(np.percentile(values, 99)),
+                **error,
             }
-        )  # fmt: skip
+        )
     return rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", nargs="*", default=WHAT, metavar="|".join(WHAT))
-    parser.add_argument("--torch", type=Path, required=True, help="the Python that has torch and transformers")
+    parser.add_argument(
+        "--torch", type=Path, required=True, help="the Python that has torch and transformers"
+    )
     parser.add_argument("--preset", default="small", choices=("tiny", "small", "base", "large"))
     parser.add_argument("--batch", type=int)
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--rivals", nargs="*", default=list(RIVALS), choices=RIVALS)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench/torch.jsonl"), help="file of results")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/bench/torch.jsonl"), help="file of results"
+    )
     parser.add_argument("--peak-size", type=int, help="side of the matrices of the peak")
     options = parser.parse_args()
     if unknown := set(options.what) - {*WHAT}:
@@ -245,12 +291,22 @@ def main() -> None:
         parser.error(f"--torch {options.torch}: no such program; make bench-torch makes one")
     here = machine.describe()
     if here.load > 0.3 * here.cores:
-        print(f"load {here.load:.1f}: PyTorch's threads suffer more than ours from other work; wait", file=sys.stderr)
-    about = {"machine": dataclasses.asdict(here), "preset": options.preset, "rounds": options.rounds}
-    key, results = f"{options.preset}, {here.vectors}", dict[str, Any]()
+        print(
+            f"load {here.load:.1f}: PyTorch's threads suffer more than ours from other work; wait",
+            file=sys.stderr,
+        )
+    about = {
+        "machine": dataclasses.asdict(here),
+        "preset": options.preset,
+        "rounds": options.rounds,
+    }
+    key = f"{options.preset}, {here.vectors}"
+    results = dict[str, Any]()
     for what in options.what:
         for work in workloads(what, options.preset, options.batch):
-            results[work.name] = compare(work, options.torch, options.rounds, options.peak_size, tuple(options.rivals))
+            results[work.name] = compare(
+                work, options.torch, options.rounds, options.peak_size, tuple(options.rivals)
+            )
             write_record(options.out, key, about | {"results": results})
             print(f"### {work.name}\n\n{table_of(results[work.name]['rows'])}\n", flush=True)
     print(f"{options.out}, {key}", file=sys.stderr)

@@ -33,7 +33,8 @@ class Rival:
     """One workload: the model, its optimiser, its batch, and a loss for each variant."""
 
     def __init__(self, work: dict[str, Any], weights: str, batch: str) -> None:
-        self.work, model = work, work["model"]
+        self.work = work
+        model = work["model"]
         self.trains = work["kind"] != "embed"
         self.model = (Stage2 if work["stage"] == 2 else TouchMAE)(model)
         load(self.model, load_file(weights))
@@ -43,24 +44,33 @@ class Rival:
         self.noise = self.raw.pop("noise")
         self.losses: dict[bool, Any] = {}
         if work["kind"] == "align":  # places of the rows that have an image and a text
-            images, texts = self.raw["image_row"].tolist(), self.raw["text_row"].tolist()
+            images = self.raw["image_row"].tolist()
+            texts = self.raw["text_row"].tolist()
             both = [row for row in images if row in texts]
-            self.both = torch.tensor([images.index(r) for r in both]), torch.tensor([texts.index(r) for r in both])
+            self.both = (
+                torch.tensor([images.index(r) for r in both]),
+                torch.tensor([texts.index(r) for r in both]),
+            )
 
     def batch(self) -> dict[str, torch.Tensor]:
         """The batch as the model takes it, from uint8."""
         images = {"image": "image"}
         result = {
-            name: floats(x, images.get(name, "touch")) if x.dtype == torch.uint8 and x.ndim > 3 else x
+            name: floats(x, images.get(name, "touch"))
+            if x.dtype == torch.uint8 and x.ndim > 3
+            else x
             for name, x in self.raw.items()
         }
         if self.work["kind"] == "align":
             result["both_image"], result["both_text"] = self.both
         return result
 
-    def value(self, batch: dict[str, torch.Tensor], noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def value(
+        self, batch: dict[str, torch.Tensor], noise: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """(loss, output); an embedding has no loss."""
-        kind, kept = self.work["kind"], self.work["kept"]
+        kind = self.work["kind"]
+        kept = self.work["kept"]
         if kind == "embed":
             z = self.model.embed(batch["clip"], batch["sensor"]).float()
             return z.new_zeros(()), z
@@ -74,7 +84,8 @@ class Rival:
         compiled = "compiled" in variant
         if compiled not in self.losses:
             self.losses[compiled] = torch.compile(self.value) if compiled else self.value
-        inner, half = self.losses[compiled], "bfloat16" in variant
+        inner = self.losses[compiled]
+        half = "bfloat16" in variant
 
         def call(batch: dict[str, torch.Tensor], noise: torch.Tensor) -> Any:
             with torch.autocast("cpu", torch.bfloat16, enabled=half):
@@ -89,8 +100,13 @@ class Rival:
             loss, output = self.function(variant)(self.batch(), self.noise)
         if self.trains:
             loss.backward()
-        result = {f"grad/{k}": p.grad for k, p in self.model.named_parameters() if p.grad is not None}
-        save_file({k: v.detach().float().contiguous() for k, v in (result | {"output": output}).items()}, out)
+        result = {
+            f"grad/{k}": p.grad for k, p in self.model.named_parameters() if p.grad is not None
+        }
+        save_file(
+            {k: v.detach().float().contiguous() for k, v in (result | {"output": output}).items()},
+            out,
+        )
         self.model.zero_grad(set_to_none=True)
         return {"loss": float(loss.detach())}
 
@@ -118,7 +134,11 @@ def main() -> None:
             if what == "setup":
                 rival = Rival(**question)
                 count = sum(p.numel() for p in rival.model.parameters())
-                answer = {"torch": torch.__version__, "transformers": transformers.__version__, "parameters": count}
+                answer = {
+                    "torch": torch.__version__,
+                    "transformers": transformers.__version__,
+                    "parameters": count,
+                }
                 answer["threads"] = torch.get_num_threads()
             elif what == "values":
                 answer = rival.values(**question)
@@ -130,7 +150,9 @@ def main() -> None:
                     seconds.append(time.perf_counter() - start)
                 answer = {"seconds": seconds}
         except Exception as error:
-            answer = {"error": f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"}
+            answer = {
+                "error": f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
+            }
         answers.write(json.dumps(answer) + "\n")
 
 

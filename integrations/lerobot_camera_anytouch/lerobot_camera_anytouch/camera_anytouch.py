@@ -31,7 +31,9 @@ class AnyTouchCamera(Camera):
         if Path(str(config.index_or_path)).is_file():
             self._camera = FilmCamera(Path(str(config.index_or_path)))
         else:
-            inner = OpenCVCameraConfig(index_or_path=config.index_or_path, fps=config.fps, width=width, height=height)
+            inner = OpenCVCameraConfig(
+                index_or_path=config.index_or_path, fps=config.fps, width=width, height=height
+            )
             self._camera = OpenCVCamera(inner)
         self._gel = RunningGel()
 
@@ -48,17 +50,20 @@ class AnyTouchCamera(Camera):
     def connect(self, warmup: bool = True) -> None:
         """Open the camera and read the picture of the untouched gel. Without one it is estimated from the frames."""
         self._camera.connect(warmup=warmup)
-        self.width, self.height = self._camera.width, self._camera.height
+        self.width = self._camera.width
+        self.height = self._camera.height
         if self.config.rotate in (90, 270):
             self.width, self.height = self.height, self.width
         self.fps = self._camera.fps
         self._gel = RunningGel()
         if self.config.background:
-            self._gel.picture, self._gel.settled = decode(self.config.background), True
+            self._gel.picture = decode(self.config.background)
+            self._gel.settled = True
         self._gel.add(np.array(self._camera.read()))
         self.__dict__.pop("_measure", None)  # it has the last gel
         if self.config.depth:
-            self.fields()  # what cannot be measured fails here, and the encoder is ready for the first picture
+            # what cannot be measured fails here, and the encoder is ready for the first picture
+            self.fields()
 
     def disconnect(self) -> None:
         """Close the camera."""
@@ -89,19 +94,27 @@ class AnyTouchCamera(Camera):
         return self._oriented(self._camera.read_latest(max_age_ms=max_age_ms))
 
     def _ready(self, frame: np.ndarray) -> np.ndarray:
-        return self._encoder.preprocess(frame, self._untouched() if self._encoder.subtracts else None)
+        return self._encoder.preprocess(
+            frame, self._untouched() if self._encoder.subtracts else None
+        )
 
     def _measured(self, frame: np.ndarray) -> Fields:
         measure, row = self._measure
         aspect = np.full(1, np.log(frame.shape[0] / frame.shape[1]), np.float32)
-        return measure(self._encoder.encode_and_measure(self._ready(frame)[None, None], row, aspect)[1], [frame])
+        return measure(
+            self._encoder.encode_and_measure(self._ready(frame)[None, None], row, aspect)[1],
+            [frame],
+        )
 
     @cached_property
     def _measure(self) -> tuple[Measure, np.ndarray]:
-        encoder, config = self._encoder, self.config
+        encoder = self._encoder
+        config = self.config
         measure = encoder.measure_of(config.sensor, self._untouched(), config.width_mm)
         if measure.scale.width is None:
-            raise ValueError(f"nobody knows the mm that a picture of {config.sensor} shows: name width_mm")
+            raise ValueError(
+                f"nobody knows the mm that a picture of {config.sensor} shows: name width_mm"
+            )
         return measure, np.full(1, encoder.sensor_row(config.sensor), np.int32)
 
     @cached_property
@@ -125,4 +138,6 @@ class AnyTouchCamera(Camera):
             depth = self._measured(upright).at(*upright.shape[:2]).depth[0]
             grey = np.clip(255 * depth / self.config.white_mm, 0, 255).astype(np.uint8)
             return np.repeat(grey[..., None], 3, axis=2)
-        return subtract_background([upright], self._untouched())[0] if self.config.subtract else upright
+        if self.config.subtract:
+            return subtract_background([upright], self._untouched())[0]
+        return upright

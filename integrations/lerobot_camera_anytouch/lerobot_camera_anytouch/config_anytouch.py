@@ -37,4 +37,6 @@ class AnyTouchCameraConfig(CameraConfig):
         if self.flip not in ("none", "across", "down"):
             raise ValueError(f"flip is none, across or down, not {self.flip!r}")
         if not self.white_mm > 0:
-            raise ValueError(f"white_mm is the depth in mm that is white, above 0, not {self.white_mm}")
+            raise ValueError(
+                f"white_mm is the depth in mm that is white, above 0, not {self.white_mm}"
+            )

@@ -15,7 +15,8 @@ class FilmCamera:
     """A film at its frame rate, again and again, with the methods of a camera of LeRobot. Pictures are RGB."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._at = path, 0.0
+        self._path = path
+        self._at = 0.0
         self._film: LoopedFilm | None = None
         self._latest: np.ndarray | None = None
         self.width = self.height = self.fps = 0
@@ -40,7 +41,8 @@ class FilmCamera:
         whole, picture = self._film.retrieve() if self._film.grab() else (False, None)
         if not whole or picture is None:
             raise RuntimeError(f"the film {self._path} cannot be read")
-        self._latest, self._at = np.ascontiguousarray(picture[..., ::-1]), time.perf_counter()
+        self._latest = np.ascontiguousarray(picture[..., ::-1])
+        self._at = time.perf_counter()
         return self._latest
 
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
@@ -48,4 +50,6 @@ class FilmCamera:
 
     def read_latest(self, max_age_ms: int = 500) -> np.ndarray:
         is_new = self._latest is not None and time.perf_counter() - self._at < 1 / max(self.fps, 1)
-        return self._latest if is_new and self._latest is not None else self.read()
+        if is_new and self._latest is not None:
+            return self._latest
+        return self.read()

@@ -16,7 +16,18 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from anytouch_jax import __version__
-from anytouch_jax.cli import data, embed, export, info, measure, probe, retrieve, sensor, stream, train
+from anytouch_jax.cli import (
+    data,
+    embed,
+    export,
+    info,
+    measure,
+    probe,
+    retrieve,
+    sensor,
+    stream,
+    train,
+)
 from anytouch_jax.cli.arguments import RENAMED, parse_options
 from anytouch_jax.errors import CheckError, UserError, shorten
 
@@ -87,13 +98,17 @@ def _main(argv: Sequence[str] | None) -> int:
     words = args[1:] if group else args
     if not words or words[0] in ("-h", "--help"):
         print(_usage(group))
-        return 0 if words else 2
+        if words:
+            return 0
+        return 2
     name = f"{group} {words[0]}".strip()
     if name not in COMMANDS:
         print(_unknown(name, group), file=sys.stderr)
         return 2
     command = COMMANDS[name]
-    return guarded(f"anytouch {name}", lambda: command.run(command.parse(command.options, name, words[1:])))
+    return guarded(
+        f"anytouch {name}", lambda: command.run(command.parse(command.options, name, words[1:]))
+    )
 
 
 def guarded(program: str, run: Callable[[], int]) -> int:
@@ -111,9 +126,12 @@ def guarded(program: str, run: Callable[[], int]) -> int:
         sys.stdout.flush()
         return status
     except SystemExit as stop:  # the parser's, after --help or a usage error
-        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        if isinstance(stop.code, int):
+            return stop.code
+        return int(stop.code is not None)
     except UserError as error:
-        sentence, status = str(error), 1 if isinstance(error, CheckError) else 2
+        sentence = str(error)
+        status = 1 if isinstance(error, CheckError) else 2
     except BrokenPipeError:  # the reader of our output closed it (| head)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
@@ -121,7 +139,9 @@ def guarded(program: str, run: Callable[[], int]) -> int:
         advice = ". Free some space." if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         sentence = f"{error.filename or 'a file'}: {error.strerror or error}{advice}"
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):  # XLA's is a RuntimeError
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(
+            error
+        ):  # XLA's is a RuntimeError
             raise
         less = "Use a smaller --batch, --size, --gallery or --preset, or --model.remat in training."
         sentence = f"there is not enough memory. {less}"
@@ -134,17 +154,22 @@ def guarded(program: str, run: Callable[[], int]) -> int:
 
 def _missing_devices() -> UserError | None:
     """Return the error of a JAX_PLATFORMS that jax cannot use, which it raises as one of many types; None otherwise."""
-    platforms, jax = os.environ.get("JAX_PLATFORMS", ""), sys.modules.get("jax")
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    jax = sys.modules.get("jax")
     if platforms in ("", "cpu") or jax is None:
         return None
     try:
         jax.devices()
     except Exception:
-        return UserError(f"JAX_PLATFORMS is {platforms!r}, which jax cannot use here: unset it, or install jax for it")
+        return UserError(
+            f"JAX_PLATFORMS is {platforms!r}, which jax cannot use here: unset it, or install jax for it"
+        )
     return None
 
 
-def _show_warning(default: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any) -> None:
+def _show_warning(
+    default: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any
+) -> None:
     """Print a UserWarning of the library as a sentence, without the line of code that Python shows."""
     if category is UserWarning:
         print(shorten(str(message)), file=sys.stderr)
@@ -154,7 +179,11 @@ def _show_warning(default: Callable[..., None], message: Warning | str, category
 
 def _usage(group: str = "") -> str:
     """Return the help that lists the commands of a group, or all of them."""
-    shown = {name: command for name, command in COMMANDS.items() if not group or name.startswith(f"{group} ")}
+    shown = {
+        name: command
+        for name, command in COMMANDS.items()
+        if not group or name.startswith(f"{group} ")
+    }
     width = max(map(len, shown))
     lines = "\n".join(f"  {name:{width}}  {command.summary}" for name, command in shown.items())
     about = GROUPS.get(group, "One representation of touch for many camera-based tactile sensors.")

@@ -17,26 +17,45 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from anytouch_jax.config.parsing import check
 from anytouch_jax.errors import UserError
 
-DEFAULT = "anytouch-tiny"  # the encoder of commands without --model; `weights.registry` has its files
+# the encoder of commands without --model; `weights.registry` has its files
+DEFAULT = "anytouch-tiny"
 
 # Old names of commands, and of options: each applies to a command without an option of the old name.
 RENAMED = {
-    **{name: f"anytouch data {name}" for name in ("simulate", "index", "contact", "verify", "annotate", "pack")},
+    **{
+        name: f"anytouch data {name}"
+        for name in ("simulate", "index", "contact", "verify", "annotate", "pack")
+    },
     "convert": "anytouch export --to safetensors, or --to release",
-    "pour": "make pouring", "translate": "make translation", "bench": "make bench", "parity": "make parity",
-    "--run": "--model", "--input": "--data", "--clip": "--clip-weights", "--loader": "--data", "--loop": "--run",
-    "--stream": "the command `anytouch stream`", "--tasks": "the command `anytouch probe tasks`",
-    "--benchmark": "the command `anytouch probe benchmark`", "--names": "--to safetensors or --to release",
-    "--optim.clip-norm": "--optim.grad-clip", "--objective.centre": "--objective.center-embeddings",
-}  # fmt: skip
+    "pour": "make pouring",
+    "translate": "make translation",
+    "bench": "make bench",
+    "parity": "make parity",
+    "--run": "--model",
+    "--input": "--data",
+    "--clip": "--clip-weights",
+    "--loader": "--data",
+    "--loop": "--run",
+    "--stream": "the command `anytouch stream`",
+    "--tasks": "the command `anytouch probe tasks`",
+    "--benchmark": "the command `anytouch probe benchmark`",
+    "--names": "--to safetensors or --to release",
+    "--optim.clip-norm": "--optim.grad-clip",
+    "--objective.centre": "--objective.center-embeddings",
+}
 
 _TAKES = {int: "a whole number", float: "a number"}
 
 
 def parse_options(
-    kind: Any, name: str, args: Sequence[str], default: Any = None, *, add_help: bool = True,
+    kind: Any,
+    name: str,
+    args: Sequence[str],
+    default: Any = None,
+    *,
+    add_help: bool = True,
     others: Mapping[str, str] | None = None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Return the record `kind` of the options in `args`.
 
     `others` are options of the command that are parsed elsewhere. Raises UserError for words that are no options, for
@@ -49,9 +68,14 @@ def parse_options(
     if not (add_help and {"-h", "--help"} & {*args}):
         check_words(name.partition(" [")[0], [*options_of(kind, default)], args, others or {})
     # The text of an option explains a default that is None or empty.
-    hint = tyro.conf.arg(help_behavior_hint=lambda value: "" if value in ("None", "") else f"(default: {value})")
+    hint = tyro.conf.arg(
+        help_behavior_hint=lambda value: "" if value in ("None", "") else f"(default: {value})"
+    )
     kept = get_type_hints(kind, include_extras=True)
-    marks = {field.name: (hint, *[tyro.conf.DisallowNone] * (field.default is None)) for field in fields(kind)}
+    marks = {
+        field.name: (hint, *[tyro.conf.DisallowNone] * (field.default is None))
+        for field in fields(kind)
+    }
     hints = {name: Annotated[kept[name], *more] for name, more in marks.items()}
     about = {"__doc__": kind.__doc__, "__module__": kind.__module__, "__annotations__": hints}
     shown = type(kind.__name__, (kind,), about)
@@ -60,12 +84,17 @@ def parse_options(
     try:
         with contextlib.redirect_stderr(printed):
             options = tyro.cli(
-                shown, prog=f"anytouch {name}", args=args, config=[tyro.conf.AvoidSubcommands], add_help=add_help,
+                shown,
+                prog=f"anytouch {name}",
+                args=args,
+                config=[tyro.conf.AvoidSubcommands],
+                add_help=add_help,
                 **extra,
-            )  # fmt: skip
+            )
     except SystemExit as stop:
         error: BaseException | None = stop
-        while error is not None:  # a record that refuses its values: tyro draws a box around the error
+        # a record that refuses its values: tyro draws a box around the error
+        while error is not None:
             if isinstance(error, UserError):
                 raise error from None
             error = error.__context__
@@ -78,7 +107,9 @@ def parse_options(
 def expand_home(arg: str) -> str:
     """Return `arg` with the home folder for the ~ of --out=~/x, which shells leave alone."""
     name, equals, value = arg.partition("=")
-    return name + equals + os.path.expanduser(value) if name.startswith("--") else arg
+    if name.startswith("--"):
+        return name + equals + os.path.expanduser(value)
+    return arg
 
 
 def spelled(field: str) -> str:
@@ -128,7 +159,8 @@ def options_of(kind: Any, default: Any = None, prefix: str = "") -> Iterator[Opt
 
     hints = get_type_hints(kind, include_extras=True)
     for field in fields(kind):
-        hint, marks = hints[field.name], tuple[Any, ...]()
+        hint = hints[field.name]
+        marks = tuple[Any, ...]()
         if get_origin(hint) is Annotated:
             hint, *rest = get_args(hint)
             marks = tuple(rest)
@@ -150,7 +182,10 @@ def options_of(kind: Any, default: Any = None, prefix: str = "") -> Iterator[Opt
 
 
 def check_words(
-    command: str, options: Sequence[Option], args: Sequence[str], others: Mapping[str, str] = types.MappingProxyType({})
+    command: str,
+    options: Sequence[Option],
+    args: Sequence[str],
+    others: Mapping[str, str] = types.MappingProxyType({}),
 ) -> None:
     """Raise UserError for words `args` that are no options (`others` are elsewhere), and for values that are unfit."""
     advice = f"see anytouch {command} --help"
@@ -161,19 +196,25 @@ def check_words(
             named["--" + ".".join([*section, f"no-{last}"])] = option
     positional = [option for option in options if option.is_positional]
     given: list[tuple[Option, str, list[str]]] = []
-    room, only_values = 0, False
+    room = 0
+    only_values = False
     for arg in args:
         if arg == "--" and not only_values:
             only_values = True
         elif is_option(arg) and not only_values:
-            name, equals, value = option_of(arg), "=" in arg, arg.partition("=")[2]
+            name = option_of(arg)
+            equals = "=" in arg
+            value = arg.partition("=")[2]
             if name not in named:
                 raise UserError(_unknown(name, {**others, **{one: one for one in named}}, advice))
-            option, values = named[name], [value] if equals else []
+            option = named[name]
+            values = [value] if equals else []
             if option.is_flag and equals:
                 raise UserError(f"{name} takes no value: {advice}")
             given.append((option, name, values))
-            room = 0 if option.is_flag else -1 if option.is_list else len(option.kinds) - len(values)
+            room = (
+                0 if option.is_flag else -1 if option.is_list else len(option.kinds) - len(values)
+            )
         elif room:
             given[-1][2].append(arg)
             room -= 1
@@ -182,14 +223,27 @@ def check_words(
             given.append((option, option.name, [arg]))
             room = -1 if option.is_list else len(option.kinds) - 1
         else:
-            missing = next((one.name for one in options if one.is_required and one not in [g[0] for g in given]), "")
+            missing = next(
+                (
+                    one.name
+                    for one in options
+                    if one.is_required and one not in [g[0] for g in given]
+                ),
+                "",
+            )
             guess = f"did you mean {missing} {arg}?" if missing else advice
             raise UserError(f"{arg!r} belongs to no option: {guess}")
     for option, name, values in given:
         _check_values(option, name, values, advice)
     present = [option for option, _, _ in given]
-    if missing_names := [option.name for option in options if option.is_required and option not in present]:
-        listed = f"{', '.join(missing_names[:-1])} and {missing_names[-1]}" if missing_names[1:] else missing_names[0]
+    if missing_names := [
+        option.name for option in options if option.is_required and option not in present
+    ]:
+        listed = (
+            f"{', '.join(missing_names[:-1])} and {missing_names[-1]}"
+            if missing_names[1:]
+            else missing_names[0]
+        )
         raise UserError(f"{listed} {'are' if missing_names[1:] else 'is'} missing: {advice}")
     for option, name, _ in given:
         if option.takes_several and [one[0] for one in given].count(option) > 1:
@@ -198,17 +252,27 @@ def check_words(
 
 def is_option(arg: str) -> bool:
     """Return whether a word is an option, and not a number such as -1."""
-    return arg.startswith("-") and arg.lstrip("-")[:1].isalpha() and arg.lstrip("-").lower() not in ("inf", "nan")
+    return (
+        arg.startswith("-")
+        and arg.lstrip("-")[:1].isalpha()
+        and arg.lstrip("-").lower() not in ("inf", "nan")
+    )
 
 
 def _unknown(name: str, known: Mapping[str, str], advice: str) -> str:
     near = get_close_matches(name, known, 1)
-    return f"there is no option {name[:60]}: " + (f"did you mean {known[near[0]]}?" if near else advice)
+    return f"there is no option {name[:60]}: " + (
+        f"did you mean {known[near[0]]}?" if near else advice
+    )
 
 
 def _check_values(option: Option, name: str, values: Sequence[str], advice: str) -> None:
     """Raise UserError for a number of values or a value that the option does not take."""
-    if option.is_flag or (option.may_be_none and list(values) == ["None"]) or (option.may_be_empty and not values):
+    if (
+        option.is_flag
+        or (option.may_be_none and list(values) == ["None"])
+        or (option.may_be_empty and not values)
+    ):
         return
     if option.takes_several and (right := _without_commas(option, values)):
         shown = " ".join(right) if option.is_positional else f"{name} {' '.join(right)}"
@@ -227,7 +291,9 @@ def _check_values(option: Option, name: str, values: Sequence[str], advice: str)
             if value not in choices:
                 near = get_close_matches(value, choices, 1)
                 hint = f": did you mean {near[0]}?" if near else ""
-                raise UserError(f"{name} takes {', '.join(choices[:-1])} or {choices[-1]}, not {value[:60]!r}{hint}")
+                raise UserError(
+                    f"{name} takes {', '.join(choices[:-1])} or {choices[-1]}, not {value[:60]!r}{hint}"
+                )
         elif kind in _TAKES:
             try:
                 kind(value)
@@ -240,8 +306,18 @@ def _without_commas(option: Option, values: Sequence[str]) -> list[str]:
     marks = ","
     if len(option.kinds) > 1:  # 640x480, digit=5
         marks += "=" if str in option.kinds else "x"
-    if not any(mark in value for value in values for mark in marks) or any(Path(value).exists() for value in values):
+    if not any(mark in value for value in values for mark in marks) or any(
+        Path(value).exists() for value in values
+    ):
         return []
-    right = [word for value in values for word in re.split(rf"[{marks}\s]+", value.strip("[]() ")) if word]
-    fits = not option.is_list and len(values) == len(option.kinds)  # a text may hold a comma
-    return [] if fits and str in option.kinds else right
+    right = [
+        word
+        for value in values
+        for word in re.split(rf"[{marks}\s]+", value.strip("[]() "))
+        if word
+    ]
+    # a text may hold a comma
+    fits = not option.is_list and len(values) == len(option.kinds)
+    if fits and str in option.kinds:
+        return []
+    return right

@@ -16,7 +16,17 @@ from tyro.conf import Positional
 
 from anytouch_jax.bars import bar
 from anytouch_jax.cli import output
-from anytouch_jax.config.parsing import Above0, Below1, Count, Finite, NotNegative, Range, Seed, Share, Threads
+from anytouch_jax.config.parsing import (
+    Above0,
+    Below1,
+    Count,
+    Finite,
+    NotNegative,
+    Range,
+    Seed,
+    Share,
+    Threads,
+)
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
@@ -41,16 +51,21 @@ class SimulateOptions:
     seed: Seed = 0  # Random seed.
     grade: Literal["fine", "coarse"] = "fine"
     """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""
-    fidelity: Literal["fast", "exact"] = "fast"  # Solve contact in a few rounds, or to convergence.
-    frames: Count[int] = 10  # Frames of a recording. They show a part of one gesture, with pauses and regrasps.
+    # Solve contact in a few rounds, or to convergence.
+    fidelity: Literal["fast", "exact"] = "fast"
+    # Frames of a recording. They show a part of one gesture, with pauses and regrasps.
+    frames: Count[int] = 10
     objects: Count[int] = 200  # Number of objects.
     depth: NotNegative[tuple[float, float]] = (0.3, 1.0)  # Range of the deepest press, mm.
     vision: Share = 0.7  # Share of the recordings with a photograph.
     text: Share = 0.7  # Share of the recordings with a caption.
-    held_out: Below1 = 0.25  # Share of the objects in the test split, by pairs of primitive and texture.
-    first: NotNegative[int] = 0  # Number of the first touch. Others give other touches of the same objects and splits.
+    # Share of the objects in the test split, by pairs of primitive and texture.
+    held_out: Below1 = 0.25
+    # Number of the first touch. Others give other touches of the same objects and splits.
+    first: NotNegative[int] = 0
     fields: tuple[str, ...] = ()  # Fields to write as .npy: displacement, pressure, shear.
-    size: NotNegative[int] = 224  # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
+    # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
+    size: NotNegative[int] = 224
     units: Literal["each", "one"] = "each"
     """each simulates a new device for every recording; one uses one device of each sensor, mounted straight."""
     threads: Threads = 2  # Threads that render photographs and write files.
@@ -63,23 +78,31 @@ def run_simulate(options: SimulateOptions) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
-    scenes = Scenes(**{name: value for name, value in vars(options).items() if name not in ("out", "threads")})
+    scenes = Scenes(
+        **{name: value for name, value in vars(options).items() if name not in ("out", "threads")}
+    )
     if missing := _missing_splits(scenes):
-        output.log(f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or more.")
+        output.log(
+            f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or more."
+        )
     last = -1
     with bar(options.touches, "touches") as advance, _exit_on_interrupt():
 
         def report(done: int, of: int) -> None:
             nonlocal last
             if last < 0 and done < of:
-                output.log(f"compiling the contact solver for {', '.join(scenes.sensors)}: about a minute at first")
+                output.log(
+                    f"compiling the contact solver for {', '.join(scenes.sensors)}: about a minute at first"
+                )
             elif not sys.stderr.isatty() and 10 * done // of > 10 * last // of:
                 output.log(f"{done} of {of} touches")
             last = done
             advance(done)
 
         path = simulate(scenes, options.out, threads=options.threads, progress=report)
-    output.log(f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}")
+    output.log(
+        f"{path}: {options.touches} touches by {', '.join(scenes.sensors)}{_unconverged(path)}"
+    )
     return 0
 
 
@@ -95,7 +118,9 @@ def _exit_on_interrupt() -> Iterator[None]:
         from rich.console import Console
 
         Console(stderr=True).show_cursor()  # which the bar hides
-        output.log("interrupted: finished touches are kept. Run the same command again to continue.")
+        output.log(
+            "interrupted: finished touches are kept. Run the same command again to continue."
+        )
         os._exit(130)
 
     signal.signal(signal.SIGINT, end)
@@ -110,7 +135,8 @@ def _missing_splits(scenes: Scenes) -> list[str]:
     from anytouch_jax.sim.scene import draw_touch, objects_and_splits
 
     splits = objects_and_splits(scenes)[1]
-    numbers = range(scenes.first, scenes.first + min(scenes.touches, len(splits)))  # one turn of each object
+    # one turn of each object
+    numbers = range(scenes.first, scenes.first + min(scenes.touches, len(splits)))
     present = {draw_touch(scenes, number, splits).split for number in numbers}
     return [name for name in ("val", "test") if scenes.held_out and name not in present]
 
@@ -121,9 +147,15 @@ def _unconverged(manifest: Path) -> str:
 
     if "label.converged" not in pq.read_schema(manifest).names:
         return ""
-    column = pq.read_table(manifest, columns=["label.converged"])["label.converged"].drop_null().to_numpy()
+    column = (
+        pq.read_table(manifest, columns=["label.converged"])["label.converged"]
+        .drop_null()
+        .to_numpy()
+    )
     count = int((column < 1).sum())
-    return f". {count} of {len(column)} frames did not converge (label.converged)" if count else ""
+    if count:
+        return f". {count} of {len(column)} frames did not converge (label.converged)"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -140,26 +172,35 @@ class DatasetOptions:
 
     name: Positional[str]  # Name of the dataset.
     root: Positional[Path]  # Folder that holds the unpacked dataset.
-    out: Path | None = None  # Manifest to write, .parquet or .csv, in ROOT or above it (default: ROOT/NAME.parquet).
-    keep: bool = False  # Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path.
-    val: Share = 0.05  # Share of the objects or recordings in split val, for a dataset without splits.
-    test: Share = 0.05  # Share of the objects or recordings in split test, for a dataset without splits.
+    # Manifest to write, .parquet or .csv, in ROOT or above it (default: ROOT/NAME.parquet).
+    out: Path | None = None
+    # Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path.
+    keep: bool = False
+    # Share of the objects or recordings in split val, for a dataset without splits.
+    val: Share = 0.05
+    # Share of the objects or recordings in split test, for a dataset without splits.
+    test: Share = 0.05
     lists: Path | None = None  # Folder of the dataset's list files, if they are not in ROOT.
-    task: Literal["material", "rough"] = "material"  # touch_and_go: the task whose lists decide the split.
+    # touch_and_go: the task whose lists decide the split.
+    task: Literal["material", "rough"] = "material"
     fold: NotNegative[int] = 0  # feel: the fold k whose split_<k>.npy decides the split.
-    export: bool = False  # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
+    # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
+    export: bool = False
     sensor: str | None = None
     """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new name."""
     split_by: str | None = None
     """recordings: what is held out: object, recording (a single picture is one), a column of the labels, or the part of
     the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default: object. For single pictures: recording."""
-    singles: bool = False  # recordings: every picture is a touch alone. By default names decide, and a few pictures.
+    # recordings: every picture is a touch alone. By default names decide, and a few pictures.
+    singles: bool = False
     films: bool = False  # recordings: every folder of pictures is a film.
-    order: Literal["names", "times"] = "names"  # recordings: order frames by their names, or by the times of the files.
+    # recordings: order frames by their names, or by the times of the files.
+    order: Literal["names", "times"] = "names"
     labels: Path | None = None
     """recordings: CSV table with a column object, sequence or both. Each other column becomes label.NAME, but unit,
     touch and text keep their names."""
-    url: str | None = None  # gelsight_mini_pretrain, fota, webdataset: address of the shards, as s3://BUCKET/FOLDER.
+    # gelsight_mini_pretrain, fota, webdataset: address of the shards, as s3://BUCKET/FOLDER.
+    url: str | None = None
     keys: tuple[str, ...] = ()
     """lerobot, freetacman: tactile cameras. bags: topics of tactile images. webdataset: fields, as left.jpg."""
     values: tuple[str, ...] = ()
@@ -171,8 +212,12 @@ def run_index(options: DatasetOptions) -> int:
     from anytouch_jax.data import readers
 
     place = ("name", "root", "out", "keep")
-    settings = readers.IndexOptions(**{name: value for name, value in vars(options).items() if name not in place})
-    report = readers.index(options.name, options.root, options.out, options=settings, keep=options.keep)
+    settings = readers.IndexOptions(
+        **{name: value for name, value in vars(options).items() if name not in place}
+    )
+    report = readers.index(
+        options.name, options.root, options.out, options=settings, keep=options.keep
+    )
     if report.written:
         output.log(f"{report.written:,} pictures were written into {options.root}")
     print("\n".join(report.lines()))
@@ -191,7 +236,8 @@ class ContactOptions:
 
     manifest: Positional[Path]  # Manifest to mark (.csv, .parquet).
     out: Path | None = None  # Manifest to write (default: NAME_contact, next to the manifest).
-    drop: bool = False  # Drop frames without contact. The split background and unknown frames stay.
+    # Drop frames without contact. The split background and unknown frames stay.
+    drop: bool = False
     threshold: NotNegative[tuple[tuple[str, float], ...]] = ()
     """Contact threshold of the score by sensor, as in: digit 5 gelsight 7."""
     background: tuple[str, ...] = ()
@@ -199,10 +245,14 @@ class ContactOptions:
     share: Share = 0.0
     """Also require this share (0 to 1) of the highest score of the recording. This removes the start and end of a
     contact. --picture and --check ignore it."""
-    picture: Path | None = None  # PNG of kept and dropped frames by score. Look at it before you trust a threshold.
-    check: bool = False  # Print precision and recall against a reference column. Writes a manifest only with --out.
-    reference: str | None = None  # Column for --check (default: label.force, label.contact or label.contact_score).
-    above: Finite[float | None] = None  # Value of the reference column above which a frame is in contact.
+    # PNG of kept and dropped frames by score. Look at it before you trust a threshold.
+    picture: Path | None = None
+    # Print precision and recall against a reference column. Writes a manifest only with --out.
+    check: bool = False
+    # Column for --check (default: label.force, label.contact or label.contact_score).
+    reference: str | None = None
+    # Value of the reference column above which a frame is in contact.
+    above: Finite[float | None] = None
     threads: Threads = 2  # Threads that read pictures.
 
 
@@ -216,42 +266,62 @@ def run_contact(options: ContactOptions) -> int:
     if not options.check:
         output.refuse_unused(options, ("reference", "above"), "without --check")
     elif options.out is None:
-        output.refuse_unused(options, ("drop",), "on --check, which writes a manifest only with --out")
+        output.refuse_unused(
+            options, ("drop",), "on --check, which writes a manifest only with --out"
+        )
     manifest = manifests.read(options.manifest)
-    target = options.out or (None if options.check else output.default_target(options.manifest, "contact"))
+    target = options.out or (
+        None if options.check else output.default_target(options.manifest, "contact")
+    )
     if target is not None:
         output.check_new(manifest, target)
     output.check_apart(out=target, picture=options.picture)
     if options.picture is not None:
         frames = map(manifest.file, range(len(manifest))) if options.picture.exists() else ()
-        output.check_folder(options.picture, "--picture", read=(*manifest.files, *frames), suffix=".png")
+        output.check_folder(
+            options.picture, "--picture", read=(*manifest.files, *frames), suffix=".png"
+        )
     thresholds = dict(options.threshold)
-    contact.threshold_of_rows(manifest, thresholds, options.share)  # raises for a mistake, before the work
+    # raises for a mistake, before the work
+    contact.threshold_of_rows(manifest, thresholds, options.share)
     if options.check:
         contact.reference_contact(manifest, options.reference)
     if not np.isnan(contact.known_contact(manifest)).any() and not options.check:
         output.refuse_unused(
-            options, ("threshold", "share", "background"), "on rows that all have a label.contact, which is kept"
+            options,
+            ("threshold", "share", "background"),
+            "on rows that all have a label.contact, which is kept",
         )
     backgrounds = contact.read_backgrounds(manifest, options.background)
     scores = contact.contact_scores(manifest, backgrounds=backgrounds, workers=options.threads)
     if target is not None and scores.gels:
         folder = target.with_name(f"{target.stem}_backgrounds")
         manifest = contact.store_backgrounds(manifest, scores, folder)
-        output.log(f"{folder}: {len(scores.gels)} pictures of the untouched gel, now the background_path of their rows")
-    share, drop = options.share, options.drop
-    marked, report = contact.mark_contact(manifest, scores, thresholds=thresholds, share=share, drop=drop)
+        output.log(
+            f"{folder}: {len(scores.gels)} pictures of the untouched gel, now the background_path of their rows"
+        )
+    share = options.share
+    drop = options.drop
+    marked, report = contact.mark_contact(
+        manifest, scores, thresholds=thresholds, share=share, drop=drop
+    )
     print("\n".join(report.lines()))
     if options.check:
         quality = contact.contact_quality(
-            manifest, scores, reference=options.reference, above=options.above, thresholds=thresholds
+            manifest,
+            scores,
+            reference=options.reference,
+            above=options.above,
+            thresholds=thresholds,
         )
         print("\n".join(quality.lines()))
     if options.picture is not None:
         picture = contact.contact_sheet(manifest, scores, options.picture, thresholds=thresholds)
         output.log(f"{picture}: kept and dropped frames")
     if target is not None:
-        print(f"{output.write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact")
+        print(
+            f"{output.write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact"
+        )
     return 0
 
 
@@ -267,8 +337,10 @@ class VerifyOptions:
     manifests: Positional[tuple[Path, ...]]  # Manifests to check together (.csv, .parquet).
     repair: Path | None = None
     """Write a repaired copy: without unusable rows and files and repeated rows, with swapped folders exchanged."""
-    commercial_only: Path | None = None  # Write a copy with rows that certainly allow commercial use, after --repair.
-    swap: tuple[str, ...] = ()  # With --repair: exchange touch image and photograph in these datasets. Look first.
+    # Write a copy with rows that certainly allow commercial use, after --repair.
+    commercial_only: Path | None = None
+    # With --repair: exchange touch image and photograph in these datasets. Look first.
+    swap: tuple[str, ...] = ()
     decode: bool = True  # Decode every picture. --no-decode only checks that the files exist.
     objects: bool = False  # Report an object in two splits as an error.
     threads: Threads = 4  # Threads that read files.
@@ -281,17 +353,24 @@ def run_verify(options: VerifyOptions) -> int:
     from anytouch_jax.data.prepare import verify
 
     if options.swap and options.repair is None:
-        raise UserError("--swap exchanges files in the repaired copy. Name that copy with --repair.")
-    output.check_apart(repair=options.repair, commercial_only=options.commercial_only, out=options.out)
+        raise UserError(
+            "--swap exchanges files in the repaired copy. Name that copy with --repair."
+        )
+    output.check_apart(
+        repair=options.repair, commercial_only=options.commercial_only, out=options.out
+    )
     manifest = manifests.read(options.manifests)
     verify.check_swap(manifest, options.swap)
     for target in (options.repair, options.commercial_only):
         if target is not None:
             output.check_new(manifest, target)
     if options.commercial_only is not None:
-        verify.commercial_only(manifest)  # raises for a manifest without such rows, before the work
+        # raises for a manifest without such rows, before the work
+        verify.commercial_only(manifest)
     output.check_folder(options.out, read=manifest.files)
-    report = verify.verify(manifest, decode=options.decode, objects=options.objects, threads=options.threads)
+    report = verify.verify(
+        manifest, decode=options.decode, objects=options.objects, threads=options.threads
+    )
     print(report.to_markdown(), end="")
     if options.out is not None:
         atomic_write(options.out, report.to_json())
@@ -304,7 +383,8 @@ def run_verify(options: VerifyOptions) -> int:
         print("\n".join(f"* {sentence}" for sentence in repaired.done or ("nothing to repair",)))
         for sentence in repaired.left:
             print(f"* left to you: {sentence}")
-        manifest, errors = repaired.manifest, [sentence for sentence in errors if sentence in repaired.left]
+        manifest = repaired.manifest
+        errors = [sentence for sentence in errors if sentence in repaired.left]
     if options.commercial_only is not None:
         commercial = verify.commercial_only(manifest)
         target = output.write_new(commercial.manifest, options.commercial_only)
@@ -312,7 +392,9 @@ def run_verify(options: VerifyOptions) -> int:
             f"{target}: {len(commercial.manifest):,} rows, without {commercial.non_commercial:,} non-commercial rows "
             f"and {commercial.unknown:,} rows of unknown licence"
         )
-    return 1 if errors else 0
+    if errors:
+        return 1
+    return 0
 
 
 @dataclass(frozen=True)
@@ -327,18 +409,22 @@ class AnnotateOptions:
 
     manifest: Positional[Path]  # Manifest with photographs or phrases (.csv, .parquet).
     out: Path | None = None  # Manifest to write (default: NAME_captions, next to the manifest).
-    answers: Path | None = None  # Folder that keeps every answer (default: NAME_answers, next to the manifest).
-    url: str = "https://api.openai.com/v1"  # Base address of an OpenAI-compatible endpoint. A local one needs no key.
+    # Folder that keeps every answer (default: NAME_answers, next to the manifest).
+    answers: Path | None = None
+    # Base address of an OpenAI-compatible endpoint. A local one needs no key.
+    url: str = "https://api.openai.com/v1"
     vlm: str = "gpt-4o"  # Name of the vision-language model.
     key_variable: str = "OPENAI_API_KEY"  # Environment variable that holds the key.
     yes: bool = False  # Do not ask for confirmation.
     estimate: bool = False  # Print the estimate and stop.
-    price_in: NotNegative[float | None] = None  # Price of a million input tokens, for the estimate.
+    # Price of a million input tokens, for the estimate.
+    price_in: NotNegative[float | None] = None
     price_out: NotNegative[float | None] = None  # Price of a million output tokens.
     limit: Count[int | None] = None  # Number of captions to ask for, to look at a sample first.
     captions: Path | None = None
     """Read captions from this table (.csv, .parquet) with a key column and `text`, and ask no model."""
-    key: str | None = None  # Column that joins --captions and the manifest: caption_id, sequence, object, path, ...
+    # Column that joins --captions and the manifest: caption_id, sequence, object, path, ...
+    key: str | None = None
     sheet: Path | None = None  # HTML page of captions with their pictures, to check by eye.
     sheet_count: Count[int] = 40  # Captions on that page.
     split: str | None = None  # Only rows of this split.
@@ -347,11 +433,13 @@ class AnnotateOptions:
     second_image: str = "image2_path"  # Column of a second photograph, for the prompt object.
     overwrite: bool = False  # Also ask for rows that have a caption.
     threads: Threads = 4  # Questions at a time.
-    side: Annotated[int, Range(16, math.inf, "16 or more")] = 512  # Longest side of the pictures that are sent, pixels.
+    # Longest side of the pictures that are sent, pixels.
+    side: Annotated[int, Range(16, math.inf, "16 or more")] = 512
     timeout: Above0[float] = 60.0  # Seconds to wait for an answer.
     tries: Count[int] = 5  # Tries for a question.
     max_tokens: Count[int] = 200  # Largest number of tokens of an answer.
-    token_field: str = "max_tokens"  # Name of that limit in the protocol. Newer models need max_completion_tokens.
+    # Name of that limit in the protocol. Newer models need max_completion_tokens.
+    token_field: str = "max_tokens"
     temperature: NotNegative[float | None] = 0.0  # Temperature. None is not sent.
     json_mode: bool = True  # Ask for a JSON object. Use --no-json-mode for servers without it.
 
@@ -383,26 +471,40 @@ def run_annotate(options: AnnotateOptions) -> int:
     output.check_apart(out=target, sheet=options.sheet)
     output.check_folder(options.sheet, "--sheet", read=manifest.files)
     if options.captions is not None:
-        table, overwrite = options.captions, options.overwrite
+        table = options.captions
+        overwrite = options.overwrite
         captioned, notes = attach_text(manifest, table, key=options.key, overwrite=overwrite)
         for note in notes:
             output.log(note)
         count = int(captioned.present("text").sum())
-        print(f"{output.write_new(captioned, target)}: {count:,} of {len(captioned):,} rows have a caption")
+        print(
+            f"{output.write_new(captioned, target)}: {count:,} of {len(captioned):,} rows have a caption"
+        )
         return 0
     annotated = annotate(
-        manifest, _endpoint(options), options.answers or output.default_target(options.manifest, "answers", ""),
-        confirm=lambda estimate: _confirm(options, estimate), price_in=options.price_in,
-        price_out=options.price_out, threads=options.threads, side=options.side, split=options.split,
-        families=dict(options.family), overwrite=options.overwrite, second_image=options.second_image,
-        limit=options.limit, log=output.log,
-    )  # fmt: skip
+        manifest,
+        _endpoint(options),
+        options.answers or output.default_target(options.manifest, "answers", ""),
+        confirm=lambda estimate: _confirm(options, estimate),
+        price_in=options.price_in,
+        price_out=options.price_out,
+        threads=options.threads,
+        side=options.side,
+        split=options.split,
+        families=dict(options.family),
+        overwrite=options.overwrite,
+        second_image=options.second_image,
+        limit=options.limit,
+        log=output.log,
+    )
     _print_summary(annotated)
     if options.sheet is not None:
         sheet = sample_sheet(manifest, annotated.captions, options.sheet, count=options.sheet_count)
         output.log(f"{sheet}: captions to check")
     print(f"{output.write_new(annotated.manifest, target)}: {len(annotated.captions):,} captions")
-    return 1 if annotated.failures else 0
+    if annotated.failures:
+        return 1
+    return 0
 
 
 def _endpoint(options: AnnotateOptions) -> Endpoint:
@@ -418,11 +520,14 @@ def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:
         raise SystemExit(0)  # nothing is sent
     if not estimate.questions:
         return True
-    _endpoint(options).read_key()  # raises for a missing key, before the question
+    # raises for a missing key, before the question
+    _endpoint(options).read_key()
     if options.yes:
         return True
     if not sys.stdin.isatty():
-        raise UserError("There is no terminal to confirm on. Add --yes, or --estimate to print the estimate only.")
+        raise UserError(
+            "There is no terminal to confirm on. Add --yes, or --estimate to print the estimate only."
+        )
     try:
         return input("Ask now? [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:
@@ -430,11 +535,15 @@ def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:
 
 
 def _print_summary(annotated: CaptionResult) -> None:
-    print(f"{annotated.requests:,} questions, {annotated.tokens_in:,} tokens in, {annotated.tokens_out:,} tokens out")
+    print(
+        f"{annotated.requests:,} questions, {annotated.tokens_in:,} tokens in, {annotated.tokens_out:,} tokens out"
+    )
     for reason, count in annotated.left_out.items():
         print(f"left out, {reason}: {count:,} rows")
     for failure in annotated.failures[:5]:
-        output.log(f"no caption for {failure.where} and the {failure.rows} rows of its touch: {failure.reason}")
+        output.log(
+            f"no caption for {failure.where} and the {failure.rows} rows of its touch: {failure.reason}"
+        )
     if len(annotated.failures) > 5:
         output.log(f"and {len(annotated.failures) - 5} more, listed in failures.jsonl")
 
@@ -449,7 +558,8 @@ class PackOptions:
     """
 
     manifests: Positional[tuple[Path, ...]]  # Manifests to pack into one (.csv, .parquet).
-    out: Path | None = None  # Folder for manifest.parquet and the shards (default: NAME_packed, next to the manifest).
+    # Folder for manifest.parquet and the shards (default: NAME_packed, next to the manifest).
+    out: Path | None = None
     shard_mb: Count[int] = 256  # Size of a shard, MiB.
     threads: Threads = 4  # Threads that read files.
 
@@ -461,7 +571,13 @@ def run_pack(options: PackOptions) -> int:
 
     manifest = manifests.read(options.manifests)
     folder = options.out or output.default_target(options.manifests[0], "packed", "")
-    target = pack(manifest, folder, shard_bytes=options.shard_mb << 20, threads=options.threads, log=output.log)
+    target = pack(
+        manifest,
+        folder,
+        shard_bytes=options.shard_mb << 20,
+        threads=options.threads,
+        log=output.log,
+    )
     print(
         f"{target}: {len(manifest):,} rows. Train on it as on any manifest. Check a copy with sha256sum -c SHA256SUMS."
     )

@@ -29,10 +29,14 @@ if TYPE_CHECKING:
 class SensorOptions:
     """The options that embed, measure and stream share."""
 
-    model: Path = Path(DEFAULT)  # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
-    sensor: str | None = None  # Sensor of the frames. Without it, or if it is unknown, the universal tokens are used.
-    background: Path | None = None  # Picture of the untouched gel: it is subtracted, and decides contact.
-    rotate: Literal[0, 90, 180, 270] = 0  # Turn the frames clockwise by so many degrees, before anything else.
+    # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
+    model: Path = Path(DEFAULT)
+    # Sensor of the frames. Without it, or if it is unknown, the universal tokens are used.
+    sensor: str | None = None
+    # Picture of the untouched gel: it is subtracted, and decides contact.
+    background: Path | None = None
+    # Turn the frames clockwise by so many degrees, before anything else.
+    rotate: Literal[0, 90, 180, 270] = 0
     flip: Literal["none", "across", "down"] = "none"
     """Mirror the frames after that: across exchanges left and right, down exchanges top and bottom."""
 
@@ -41,7 +45,8 @@ class SensorOptions:
 class FrameOptions(SensorOptions):
     """The options that embed and stream share."""
 
-    frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for clips (in segments of three).
+    # Frames of a touch: 1 for stills, 3 or more for clips (in segments of three).
+    frames: Count[int] = 1
     pooling: Literal["class", "mean", "both"] | None = None
     """Features: the class token, the mean of the patch tokens, or both (default: that of --head, else class)."""
     join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a long clip are joined.
@@ -62,13 +67,15 @@ class EmbedOptions(FrameOptions):
     Example: anytouch embed --data frames/ --sensor digit --out features.npz
     """
 
-    data: tuple[Path, ...]  # Manifests (.csv, .parquet), or one folder of frames, picture or video.
+    # Manifests (.csv, .parquet), or one folder of frames, picture or video.
+    data: tuple[Path, ...]
     out: Path  # The .npz to write: features (n, d), rows (n,), key/* (n,).
     split: str | None = None  # Only this split of a manifest.
     batch: Count[int] = 64  # Frames at a time.
     on_bad_sample: Literal["error", "skip"] = "error"
     """Stop at a row or picture that cannot be read, or skip it, count it and name the first."""
-    column: str | None = None  # Also write the features into the LeRobot data set of the manifest, as this feature.
+    # Also write the features into the LeRobot data set of the manifest, as this feature.
+    column: str | None = None
 
 
 def run(options: EmbedOptions) -> int:
@@ -77,14 +84,20 @@ def run(options: EmbedOptions) -> int:
 
     data, is_manifest = options.data[0], takes_manifest(options, options.data, ("split", "column"))
     if data.is_file() and not is_manifest:
-        refuse_unused(options, ("on_bad_sample",), "with a video, which cannot be read after a bad frame")
+        refuse_unused(
+            options, ("on_bad_sample",), "with a video, which cannot be read after a bad frame"
+        )
     check_folder(options.out, read=(options.model, *options.data), suffix=".npz")
     encoder, pooling, head = load_inputs(options)
     about: dict[str, str] = {}
     if is_manifest:
-        features = _embed_manifest(encoder, options, pooling, encoder.gels if head is None else head.gels)
+        features = _embed_manifest(
+            encoder, options, pooling, encoder.gels if head is None else head.gels
+        )
     else:
-        row, preprocess, gate, about = frames_input(encoder, options, data, encoder.gels if head is None else head.gels)
+        row, preprocess, gate, about = frames_input(
+            encoder, options, data, encoder.gels if head is None else head.gels
+        )
         features = _embed_frames(encoder, options, pooling, row, preprocess, gate)
         features.gels.update(gels_of(preprocess, options))
         log_universal(encoder, options)
@@ -95,7 +108,9 @@ def run(options: EmbedOptions) -> int:
     for line in spread_lines(features.values):
         log(line)
     skipped = f", {features.skipped} skipped" if features.skipped else ""
-    print(f"{options.out}: {len(features.values)} features of {features.values.shape[1]} values{skipped}")
+    print(
+        f"{options.out}: {len(features.values)} features of {features.values.shape[1]} values{skipped}"
+    )
     return 0
 
 
@@ -103,17 +118,25 @@ def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequen
     """Return whether --data names manifests; else it is one folder, picture or video. Raises UserError."""
     if all(path.suffix.lower() in (".csv", ".parquet") for path in data):
         per_row = ("sensor", "background", "rotate", "flip")
-        refuse_unused(options, per_row, "with a manifest, whose rows name their sensor and background")
+        refuse_unused(
+            options, per_row, "with a manifest, whose rows name their sensor and background"
+        )
         return True
     if len(data) != 1:
-        raise UserError(f"--data takes several manifests, or one folder or video, not {len(data)} paths")
+        raise UserError(
+            f"--data takes several manifests, or one folder or video, not {len(data)} paths"
+        )
     if not data[0].exists():
-        raise UserError(f"there is no manifest, folder or video at {data[0]}. Give another path with --data.")
+        raise UserError(
+            f"there is no manifest, folder or video at {data[0]}. Give another path with --data."
+        )
     refuse_unused(options, of_rows, "with a folder or a video, which has no splits and no columns")
     return False
 
 
-def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean", "both"], LinearHead | None]:
+def load_inputs(
+    options: FrameOptions,
+) -> tuple[Encoder, Literal["class", "mean", "both"], LinearHead | None]:
     """Return the encoder, the pooling and the head that `options` name. Raises UserError if they do not fit."""
     from anytouch_jax.encoder.encoder import check_frames, load_encoder
     from anytouch_jax.encoder.linear_head import load_head
@@ -135,21 +158,33 @@ def load_inputs(options: FrameOptions) -> tuple[Encoder, Literal["class", "mean"
 
 
 def save_features(
-    out: Path, encoder: Encoder, features: Features, head: LinearHead | None, options: FrameOptions,
+    out: Path,
+    encoder: Encoder,
+    features: Features,
+    head: LinearHead | None,
+    options: FrameOptions,
     about: dict[str, str],
-) -> None:  # fmt: skip
+) -> None:
     """Write features to `out`, with what a `head` predicts, and metadata; log a sensor that is not the one named."""
     from anytouch_jax.encoder.embed import save_npz
 
     if head is not None and len(features.values):
-        features = replace(features, predictions=features.predictions | _predictions(head, features.values))
+        features = replace(
+            features, predictions=features.predictions | _predictions(head, features.values)
+        )
         sensors = features.keys.get("sensor")
         names = {options.sensor} - {None} if sensors is None else set(sensors.tolist())
         for name in sorted(map(str, names) if head.calibration is not None else ()):
             values = features.values if sensors is None else features.values[sensors == name]
-            if head.calibration is not None and (warning := head.calibration.sensor_warning(head.scaled(values), name)):
+            if head.calibration is not None and (
+                warning := head.calibration.sensor_warning(head.scaled(values), name)
+            ):
                 log(warning)
-    about |= {"encoder": encoder.source, "weights": encoder.fingerprint, "dtype": encoder.config.model.dtype}
+    about |= {
+        "encoder": encoder.source,
+        "weights": encoder.fingerprint,
+        "dtype": encoder.config.model.dtype,
+    }
     save_npz(out, features, about | {"frames": str(options.frames), "join": options.join})
 
 
@@ -159,7 +194,12 @@ def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
         label, p = head(values)
         return {"label": label, "p": p.max(1)}
     assessed = head.assess(values)
-    about = {"set": assessed.in_set, "classes": head.classes, "novelty": assessed.novelty, "novel": assessed.novel}
+    about = {
+        "set": assessed.in_set,
+        "classes": head.classes,
+        "novelty": assessed.novelty,
+        "novel": assessed.novel,
+    }
     return {"label": assessed.label, "p": assessed.p.max(1), **about}
 
 
@@ -171,13 +211,23 @@ def frames_input(
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.linear_head import ContactGate
 
-    row, sensor = encoder.sensor_row(options.sensor or UNIVERSAL, log), options.sensor or UNIVERSAL
+    row = encoder.sensor_row(options.sensor or UNIVERSAL, log)
+    sensor = options.sensor or UNIVERSAL
     if options.background is not None and not encoder.subtracts:
-        log("--background only decides contact: this encoder was trained on frames without background subtraction")
+        log(
+            "--background only decides contact: this encoder was trained on frames without background subtraction"
+        )
     known = {name: as_taken(gel, options.rotate, options.flip) for name, gel in known.items()}
     picture, background = choose_gel(encoder, options.background, data, known)
-    preprocess = Preprocess(encoder, picture, rotate=options.rotate, flip=options.flip, known=known, log=log)
-    about = {"background": background, "rotate": str(options.rotate), "sensor": sensor, "flip": options.flip}
+    preprocess = Preprocess(
+        encoder, picture, rotate=options.rotate, flip=options.flip, known=known, log=log
+    )
+    about = {
+        "background": background,
+        "rotate": str(options.rotate),
+        "sensor": sensor,
+        "flip": options.flip,
+    }
     return row, preprocess, ContactGate(preprocess, sensor), about
 
 
@@ -193,9 +243,13 @@ def choose_gel(
     from anytouch_jax.data.images import BACKGROUND, decode, list_images
 
     stored = list_images(data)[1].get(BACKGROUND) if data.is_dir() else None
-    picture, what, count = None, "not subtracted", 0
+    picture = None
+    what = "not subtracted"
+    count = 0
     if named is not None or (stored is not None and not (known and encoder.subtracts)):
-        picture, what = decode(named or stored), str(named or stored) if encoder.subtracts else what  # type: ignore[arg-type]
+        # type: ignore[arg-type]
+        picture = decode(named or stored)
+        what = str(named or stored) if encoder.subtracts else what
     elif encoder.subtracts and not data.exists():
         what = "a picture of the head, or a running estimate" if known else "a running estimate"
         what = what if known or encoder.needs_background else "not subtracted"
@@ -205,9 +259,11 @@ def choose_gel(
         if why:
             log(gels.other_unit(why))
         if gel is not None and (not why or (not stored and count < gels.FEWEST)):
-            picture, what = gel, "the picture that the head was fitted with"
+            picture = gel
+            what = "the picture that the head was fitted with"
         elif stored or count >= gels.FEWEST:
-            picture, what = look, str(stored) if stored else f"estimated from {count} frames of {data}"
+            picture = look
+            what = str(stored) if stored else f"estimated from {count} frames of {data}"
         elif encoder.needs_background:
             raise UserError(
                 f"{data} has too few frames to estimate the untouched gel, which is subtracted. Give {gels.FEWEST} or "
@@ -256,10 +312,14 @@ def log_if_cut(video: Path, count: int) -> None:
 
     reported = count_frames(video)
     if 0.98 * reported > count + 2:  # some containers only estimate it
-        log(f"{video} reports {reported} frames and {count} could be read. The file may be incomplete.")
+        log(
+            f"{video} reports {reported} frames and {count} could be read. The file may be incomplete."
+        )
 
 
-def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any, known: Mapping[str, np.ndarray]) -> Features:
+def _embed_manifest(
+    encoder: Encoder, options: EmbedOptions, pooling: Any, known: Mapping[str, np.ndarray]
+) -> Features:
     import numpy as np
 
     from anytouch_jax.data.gels import UnitGels
@@ -273,13 +333,25 @@ def _embed_manifest(encoder: Encoder, options: EmbedOptions, pooling: Any, known
     if gels is not None:
         log(gels.report(usable))
     rows, values = embedding.embed_rows(
-        encoder, manifest, usable, options.frames, pooling, options.join, batch=options.batch,
-        on_bad_sample=options.on_bad_sample, gels=gels, log=log,
-    )  # fmt: skip
-    keys = {name: manifest.text_column(name)[rows] for name in ("path", "sensor", "sequence", "split")}
+        encoder,
+        manifest,
+        usable,
+        options.frames,
+        pooling,
+        options.join,
+        batch=options.batch,
+        on_bad_sample=options.on_bad_sample,
+        gels=gels,
+        log=log,
+    )
+    keys = {
+        name: manifest.text_column(name)[rows] for name in ("path", "sensor", "sequence", "split")
+    }
     keys["frame_index"] = np.asarray(manifest.column("frame_index"))[rows]
     others = ("object", "unit", "index", "timestamp")
-    more = [name for name in manifest.table.column_names if name in others or name.startswith("label.")]
+    more = [
+        name for name in manifest.table.column_names if name in others or name.startswith("label.")
+    ]
     keys |= {name: embedding.plain_column(manifest, name)[rows] for name in more}
     touched = {} if options.head is None else {"contact": contact_of_rows(manifest, rows, gels)}
     pictures = {} if gels is None else gels.pictures(rows)
@@ -296,18 +368,23 @@ def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray
         rows = rows[~fields]
     usable = rows if frames == 1 else np.intersect1d(rows, manifest.clips(frames)[:, -1])
     if len(usable) < len(rows):
-        log(f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {frames} frames and are left out")
+        log(
+            f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {frames} frames and are left out"
+        )
     return usable
 
 
-def contact_of_rows(manifest: Manifest, rows: np.ndarray, gels: UnitGels | None = None) -> np.ndarray:
+def contact_of_rows(
+    manifest: Manifest, rows: np.ndarray, gels: UnitGels | None = None
+) -> np.ndarray:
     """Return the contact of `rows` (n,): label.contact, or by the untouched gel; NaN if unknown."""
     import numpy as np
 
     from anytouch_jax.data.gels import UnitGels
     from anytouch_jax.data.prepare import contact
 
-    known, limits = contact.known_contact(manifest)[rows], contact.threshold_of_rows(manifest, None, 0.0)[rows]
+    known = contact.known_contact(manifest)[rows]
+    limits = contact.threshold_of_rows(manifest, None, 0.0)[rows]
     unknown = rows[np.isnan(known)]
     score = contact.contact_scores(manifest, unknown, gels=gels or UnitGels(manifest)).score[rows]
     return np.where(np.isnan(known), np.where(np.isnan(score), np.nan, score > limits), known)
@@ -320,18 +397,31 @@ def _write_columns(root: Path, column: str, features: Features) -> None:
     from anytouch_jax.data.readers.lerobot import camera_names, write_features
 
     if "index" not in features.keys or not (root / "meta" / "info.json").is_file():
-        raise UserError(f"--column is for a manifest that `data index lerobot` wrote into the data set, not in {root}")
-    unit, numbers = features.keys["unit"], features.keys["index"]
+        raise UserError(
+            f"--column is for a manifest that `data index lerobot` wrote into the data set, not in {root}"
+        )
+    unit = features.keys["unit"]
+    numbers = features.keys["index"]
     cameras = np.unique(unit).tolist()
-    names = [column] if len(cameras) == 1 else [f"{column}.{name}" for name in camera_names(cameras)]
+    names = (
+        [column] if len(cameras) == 1 else [f"{column}.{name}" for name in camera_names(cameras)]
+    )
     rows = [unit == camera for camera in cameras]
-    write_features(root, {name: (features.values[own], numbers[own]) for name, own in zip(names, rows, strict=True)})
+    write_features(
+        root,
+        {name: (features.values[own], numbers[own]) for name, own in zip(names, rows, strict=True)},
+    )
     for name, own in zip(names, rows, strict=True):
         print(f"{root}: {own.sum()} features as {name}")
 
 
 def _embed_frames(
-    encoder: Encoder, options: EmbedOptions, pooling: Any, row: int, preprocess: Preprocess, gate: ContactGate
+    encoder: Encoder,
+    options: EmbedOptions,
+    pooling: Any,
+    row: int,
+    preprocess: Preprocess,
+    gate: ContactGate,
 ) -> Features:
     """Embed every clip of consecutive frames of a folder or a video, keyed by its last frame."""
     import numpy as np
@@ -339,7 +429,9 @@ def _embed_frames(
     from anytouch_jax.data.images import count_frames
     from anytouch_jax.encoder.embed import embed_frames
 
-    data, times, contact = options.data[0], list[float](), list[float]()
+    data = options.data[0]
+    times = list[float]()
+    contact = list[float]()
 
     def frames() -> Iterator[tuple[int, str, np.ndarray | None]]:
         for number, name, frame in numbered_frames(data, options.on_bad_sample, times):
@@ -347,9 +439,15 @@ def _embed_frames(
             yield number, name, frame
 
     features = embed_frames(
-        encoder, tracked(frames(), "frames embedded", count_frames(data)), row, preprocess, length=options.frames,
-        pooling=pooling, join=options.join, batch=options.batch,
-    )  # fmt: skip
+        encoder,
+        tracked(frames(), "frames embedded", count_frames(data)),
+        row,
+        preprocess,
+        length=options.frames,
+        pooling=pooling,
+        join=options.join,
+        batch=options.batch,
+    )
     features.predictions["contact"] = np.asarray(contact)[features.rows]
     if "path" not in features.keys:
         log_if_cut(data, len(times))
@@ -357,7 +455,9 @@ def _embed_frames(
     return features
 
 
-def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[tuple[int, str, np.ndarray | None]]:
+def numbered_frames(
+    data: Path, on_bad_sample: str, times: list[float]
+) -> Iterator[tuple[int, str, np.ndarray | None]]:
     """Yield number, name and RGB u8 pixels of each frame; the frames of a video have no names.
 
     A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped, and the
@@ -378,7 +478,8 @@ def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Itera
     files, others = images.list_images(data)
     if others:
         log(f"{', '.join(file.name for file in others.values())}: not a frame, not embedded")
-    start = skipped = 0  # `start` is the first frame number of a finger: no clip spans two fingers
+    # `start` is the first frame number of a finger: no clip spans two fingers
+    start = skipped = 0
     for names in split_series([file.name for file in files]).values():
         numbers = [start + number for number in frame_numbers(names)]
         start = numbers[-1] + 2

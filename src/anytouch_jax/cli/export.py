@@ -19,8 +19,17 @@ if TYPE_CHECKING:
 _INT8 = ("int8", "data", "fields")
 # What two networks must share to be interpolated.
 _SAME = (
-    "touch", "patch", "patch_encoder", "image_size", "frames", "embed", "norm_eps", "pre_norm", "activation", "sensors",
-)  # fmt: skip
+    "touch",
+    "patch",
+    "patch_encoder",
+    "image_size",
+    "frames",
+    "embed",
+    "norm_eps",
+    "pre_norm",
+    "activation",
+    "sensors",
+)
 
 
 @dataclass(frozen=True)
@@ -39,20 +48,28 @@ class ExportOptions:
     out: Path | None = None  # The file to write. Weights must end in .safetensors, ONNX in .onnx.
     card: Path | None = None
     """Write a folder to upload instead: config.json, model.safetensors as float16, and README.md, the model card."""
-    notes: Path | None = None  # Markdown for the card: the data with their licences, results, limits.
+    # Markdown for the card: the data with their licences, results, limits.
+    notes: Path | None = None
     to: Literal["jax", "onnx", "safetensors", "release"] = "jax"
     """jax: the touch encoder as a program. onnx: the same for onnxruntime and OpenVINO. safetensors: all weights
     by this package's names. release: weights by the names of the authors' files."""
     int8: bool = False  # onnx: integer products of 8 bits, calibrated on 200 touches of --data.
-    fields: bool = False  # onnx: also the outputs of depth, shear, contact and force, see OUT.json.
-    data: tuple[Path, ...] = ()  # onnx: manifests (.csv, .parquet) with touches like those to come.
-    frames: Count[int] = 1  # jax, onnx: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
-    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")  # jax: the platforms it runs on.
-    pooling: Literal["class", "mean", "both"] = "class"  # jax, onnx: class token, mean of patch tokens, or both.
-    join: Literal["mean", "sum", "concat"] = "mean"  # jax: how the segments of a long clip are joined.
+    # onnx: also the outputs of depth, shear, contact and force, see OUT.json.
+    fields: bool = False
+    # onnx: manifests (.csv, .parquet) with touches like those to come.
+    data: tuple[Path, ...] = ()
+    # jax, onnx: frames of a touch. 1 for stills, 3 or more for clips (in segments of three).
+    frames: Count[int] = 1
+    # jax: the platforms it runs on.
+    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
+    # jax, onnx: class token, mean of patch tokens, or both.
+    pooling: Literal["class", "mean", "both"] = "class"
+    # jax: how the segments of a long clip are joined.
+    join: Literal["mean", "sum", "concat"] = "mean"
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
-    between: Path | None = None  # Weights: the run or file that MODEL was trained from, to interpolate between the two.
+    # Weights: the run or file that MODEL was trained from, to interpolate between the two.
+    between: Path | None = None
     share: Share = 0.5  # Weights: position from BETWEEN (0) to MODEL (1).
 
 
@@ -64,13 +81,19 @@ def run(options: ExportOptions) -> int:
     if options.out is None:
         raise UserError("Name the file to write with --out, or a folder to upload with --card.")
     if options.to not in ("jax", "onnx"):
-        refuse_unused(options, ("frames", "platforms", "pooling", "join", "dtype", *_INT8), f"with --to {options.to}")
+        refuse_unused(
+            options,
+            ("frames", "platforms", "pooling", "join", "dtype", *_INT8),
+            f"with --to {options.to}",
+        )
         return _export_weights(options)
     onnx = options.to == "onnx"
     foreign = ("platforms", "join", "dtype") if onnx else _INT8
     refuse_unused(options, ("between", "share", *foreign), f"with --to {options.to}")
     if options.int8 != bool(options.data):
-        raise UserError("--int8 is calibrated on the touches of manifests: give both --int8 and --data, or neither.")
+        raise UserError(
+            "--int8 is calibrated on the touches of manifests: give both --int8 and --data, or neither."
+        )
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.export import describes, export
     from anytouch_jax.train.mesh import enable_compilation_cache
@@ -81,14 +104,25 @@ def run(options: ExportOptions) -> int:
     refuse_join(options, encoder.config.model.frames)
     names = ("frames", "platforms", "pooling", "join")
     about = export(
-        encoder, options.out, form="onnx" if onnx else "jax",
-        fields=options.fields, **(_calibration(encoder, options) if options.int8 else {}),
+        encoder,
+        options.out,
+        form="onnx" if onnx else "jax",
+        fields=options.fields,
+        **(_calibration(encoder, options) if options.int8 else {}),
         **{name: getattr(options, name) for name in names},
-    )  # fmt: skip
-    print(f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; {about['input']}")
-    print(f"largest difference from the live model: {about['worst_difference']:.1e} of the largest feature")
+    )
+    print(
+        f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; {about['input']}"
+    )
+    print(
+        f"largest difference from the live model: {about['worst_difference']:.1e} of the largest feature"
+    )
     if options.int8:
-        print("in int8 {worst_difference:.1e}, mean cosine {cosine:.4f}, on {touches} touches".format(**about["int8"]))
+        print(
+            "in int8 {worst_difference:.1e}, mean cosine {cosine:.4f}, on {touches} touches".format(
+                **about["int8"]
+            )
+        )
     print(f"{describes(options.out)}: how to call it")
     return 0
 
@@ -103,11 +137,16 @@ def _calibration(encoder: Encoder, options: ExportOptions) -> dict[str, Any]:
     from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
     from anytouch_jax.encoder.engines import CALIBRATION
 
-    manifest, clips = manifests.read(options.data), list[np.ndarray]()
+    manifest = manifests.read(options.data)
+    clips = list[np.ndarray]()
     gels = UnitGels(manifest)
-    rows = rows_with_gel(encoder, gels, usable_rows(manifest, np.arange(len(manifest)), options.frames), log)
+    rows = rows_with_gel(
+        encoder, gels, usable_rows(manifest, np.arange(len(manifest)), options.frames), log
+    )
     if len(rows) < CALIBRATION:
-        raise UserError(f"--int8 needs {CALIBRATION} touches and --data has {len(rows)}. Name more manifests.")
+        raise UserError(
+            f"--int8 needs {CALIBRATION} touches and --data has {len(rows)}. Name more manifests."
+        )
     rows = rows[np.linspace(0, len(rows) - 1, CALIBRATION).astype(int)]
 
     def keep(part: np.ndarray, _: np.ndarray) -> np.ndarray:
@@ -117,21 +156,37 @@ def _calibration(encoder: Encoder, options: ExportOptions) -> dict[str, Any]:
     given, _ = embed_rows(encoder, manifest, rows, options.frames, edit=keep, gels=gels, log=log)
     sensors = manifest.text_column("sensor")[given]
     ids = np.array([encoder.sensor_row(name, lambda _: None) for name in sensors], np.int32)
-    return {"calibration": (np.concatenate(clips), ids), "gels": gels.pictures(given) if encoder.subtracts else None}
+    return {
+        "calibration": (np.concatenate(clips), ids),
+        "gels": gels.pictures(given) if encoder.subtracts else None,
+    }
 
 
 def _export_card(options: ExportOptions, folder: Path) -> int:
     from anytouch_jax.encoder.encoder import find_tokenizer
     from anytouch_jax.weights import load, registry
 
-    file_only = ("to", "frames", "platforms", "pooling", "join", "dtype", "between", "share", "out", *_INT8)
+    file_only = (
+        "to",
+        "frames",
+        "platforms",
+        "pooling",
+        "join",
+        "dtype",
+        "between",
+        "share",
+        "out",
+        *_INT8,
+    )
     refuse_unused(options, file_only, "with --card, which writes all weights of MODEL")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} is not an empty folder. Name a new one with --card.")
     check_folder(folder)
     notes = "" if options.notes is None else options.notes.read_text(encoding="utf-8")
     source = registry.locate(options.model)
-    written = registry.write_encoder(folder, load.load_model(source), notes, tokenizer=find_tokenizer(source))
+    written = registry.write_encoder(
+        folder, load.load_model(source), notes, tokenizer=find_tokenizer(source)
+    )
     size = (written / registry.WEIGHTS).stat().st_size
     print(f"{written}: {size / 1e6:.1f} MB of weights, {registry.CARD} and README.md")
     return 0
@@ -141,17 +196,24 @@ def _export_weights(options: ExportOptions) -> int:
     assert options.out is not None
     from anytouch_jax.weights import convert, load, safetensors, tree
 
-    source, before = options.model, options.between
+    source = options.model
+    before = options.between
     if before is None:
         refuse_unused(options, ("share",), "without --between")
     read = [path for path in (source, before) if path is not None and not path.is_dir()]
     check_folder(options.out, read=read, suffix=".safetensors")
     loaded = load.load_model(source, stored_rows=True)
-    params, model, about = loaded.params, loaded.config.model, loaded.export_metadata()
+    params = loaded.params
+    model = loaded.config.model
+    about = loaded.export_metadata()
     if before is not None:
         other = load.load_model(before, stored_rows=True)
-        differ = [name for name in _SAME if getattr(other.config.model, name) != getattr(model, name)]
-        grounds = [one.get(safetensors.BACKGROUND_KEY, "keep") for one in (other.export_metadata(), about)]
+        differ = [
+            name for name in _SAME if getattr(other.config.model, name) != getattr(model, name)
+        ]
+        grounds = [
+            one.get(safetensors.BACKGROUND_KEY, "keep") for one in (other.export_metadata(), about)
+        ]
         if differ := differ + ["background"] * (grounds[0] != grounds[1]):
             raise UserError(
                 f"{before} and {source} have different networks ({', '.join(differ)}). --between takes the run that "
@@ -160,15 +222,23 @@ def _export_weights(options: ExportOptions) -> int:
         params = tree.interpolate(other.params, params, options.share)
         about |= {"source": f"{options.share:g} of the way from {before} to {source}"}
     if options.to == "safetensors":
-        safetensors.export_safetensors(options.out, params, about | {safetensors.MODEL_KEY: to_json(model)})
+        safetensors.export_safetensors(
+            options.out, params, about | {safetensors.MODEL_KEY: to_json(model)}
+        )
     else:
         if not {"touch", "decoder"} <= params.keys():
-            raise UserError(f"{source} lacks the touch encoder or decoder of the authors' files. Use --to safetensors.")
+            raise UserError(
+                f"{source} lacks the touch encoder or decoder of the authors' files. Use --to safetensors."
+            )
         params, model = _universal_last(params, model)
         if "matcher" in params and model.match_head == "mlp":
-            log("the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the authors' code ignores")
+            log(
+                "the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the authors' code ignores"
+            )
         if params.pop("force", None) is not None:
-            log("the force heads are left out: the authors' files have none. Use --to safetensors to keep them.")
+            log(
+                "the force heads are left out: the authors' files have none. Use --to safetensors to keep them."
+            )
         about |= {safetensors.MODEL_KEY: to_json(model), "format": "pt"}
         arrays = convert.to_release(params, model, allow_extra=True)
         safetensors.write_safetensors(options.out, arrays, about)
@@ -176,7 +246,9 @@ def _export_weights(options: ExportOptions) -> int:
     return 0
 
 
-def _universal_last(params: dict[str, Any], model: ModelConfig) -> tuple[dict[str, Any], ModelConfig]:
+def _universal_last(
+    params: dict[str, Any], model: ModelConfig
+) -> tuple[dict[str, Any], ModelConfig]:
     """Return the same model with its universal tokens in the last row, where the authors' code reads them (id -1)."""
     import numpy as np
 
@@ -186,4 +258,6 @@ def _universal_last(params: dict[str, Any], model: ModelConfig) -> tuple[dict[st
         return params, model
     names = (*(name for name in model.sensors if name != UNIVERSAL), UNIVERSAL)
     rows = match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
-    return params | {"touch": params["touch"] | {"sensor_tokens": rows}}, replace(model, sensors=names)
+    return params | {"touch": params["touch"] | {"sensor_tokens": rows}}, replace(
+        model, sensors=names
+    )

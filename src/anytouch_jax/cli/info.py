@@ -34,9 +34,11 @@ class InfoOptions:
     """
 
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
-    health: bool = False  # Check every sensor unit of a manifest, and print a verdict and what to do.
+    # Check every sensor unit of a manifest, and print a verdict and what to do.
+    health: bool = False
     picture: Path | None = None  # PNG with a picture and the verdict of each unit, with --health.
-    model: Path | None = None  # Does this encoder see contact? With --health, on rows with contact or background.
+    # Does this encoder see contact? With --health, on rows with contact or background.
+    model: Path | None = None
 
 
 def run(options: InfoOptions) -> int:
@@ -60,15 +62,25 @@ def _health(options: InfoOptions) -> int:
     table = manifests.read(options.paths)
     units = list(health.read_units(table))
     if not units:
-        raise UserError("No picture of a sensor can be read. Check the manifest with `anytouch data verify`.")
-    results = health.check_units(units, {unit.sensor: health.known_gels(unit.sensor) for unit in units})
+        raise UserError(
+            "No picture of a sensor can be read. Check the manifest with `anytouch data verify`."
+        )
+    results = health.check_units(
+        units, {unit.sensor: health.known_gels(unit.sensor) for unit in units}
+    )
     if options.model is not None:
         results = [_seen_by(options.model, table, unit) for unit in results]
     marks = {True: "", False: "FAULT ", None: "? "}
     for unit in results:
-        rows = [(check.name, marks[check.ok] + check.value, "" if check.ok else check.advice) for check in unit.checks]
+        rows = [
+            (check.name, marks[check.ok] + check.value, "" if check.ok else check.advice)
+            for check in unit.checks
+        ]
         print(f"\n{shorten(f'{unit.sensor} {unit.unit}')}: {unit.rows:,} frames, {unit.verdict}\n")
-        cells = [(name, shorten(value), advice if value.startswith("FAULT") else "") for name, value, advice in rows]
+        cells = [
+            (name, shorten(value), advice if value.startswith("FAULT") else "")
+            for name, value, advice in rows
+        ]
         print_table(markdown_table(("check", "value", "what to do"), cells))
     if options.picture is not None:
         health.health_sheet(results, options.picture)
@@ -93,9 +105,16 @@ def _seen_by(model: Path, table: Manifest, unit: UnitHealth) -> UnitHealth:
     rows = np.flatnonzero(here & (table.text_column("split") != "background"))
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, 96).astype(int))] if len(rows) else rows
     touched = contact_of_rows(table, rows)
-    rows, touched = rows[~np.isnan(touched)], touched[~np.isnan(touched)] > 0
-    kept, values = embed_rows(load_encoder(model), table, rows, log=log) if len(rows) else (rows, np.zeros((0, 1)))
-    return replace(unit, checks=(*unit.checks, contact_visible(values, touched[np.isin(rows, kept)])))
+    rows = rows[~np.isnan(touched)]
+    touched = touched[~np.isnan(touched)] > 0
+    kept, values = (
+        embed_rows(load_encoder(model), table, rows, log=log)
+        if len(rows)
+        else (rows, np.zeros((0, 1)))
+    )
+    return replace(
+        unit, checks=(*unit.checks, contact_visible(values, touched[np.isin(rows, kept)]))
+    )
 
 
 def _lines(path: Path) -> list[str]:
@@ -108,10 +127,13 @@ def _lines(path: Path) -> list[str]:
     if str(path) == "cameras":
         from anytouch_jax.data.cameras import list_cameras
 
-        return [line for camera in list_cameras() for line in camera.lines()] or ["no camera is connected"]
+        return [line for camera in list_cameras() for line in camera.lines()] or [
+            "no camera is connected"
+        ]
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
-    suffix, description = path.suffix.lower(), path.with_name(f"{path.name}.json")
+    suffix = path.suffix.lower()
+    description = path.with_name(f"{path.name}.json")
     weights = None
     if path.is_dir() or (suffix in _WEIGHTS and suffix != ".npz" and not description.is_file()):
         from anytouch_jax.weights.families import load_family
@@ -154,9 +176,15 @@ def _pictures(path: Path) -> list[str]:
         what = f"a folder of {len(files)} pictures" if path.is_dir() else "a picture"
         return [f"{path}: {what} of {width} x {height} pixels", use]
     film = images.open_video(path)
-    names = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+    names = (
+        cv2.CAP_PROP_FRAME_COUNT,
+        cv2.CAP_PROP_FRAME_WIDTH,
+        cv2.CAP_PROP_FRAME_HEIGHT,
+        cv2.CAP_PROP_FPS,
+    )
     count, wide, high, rate = (film.get(name) for name in names)
-    codec, is_film = format_of(film), film.isOpened() and film.read()[0]
+    codec = format_of(film)
+    is_film = film.isOpened() and film.read()[0]
     film.release()
     if not is_film:
         return []
@@ -171,7 +199,8 @@ def _named(name: str) -> str:
     from anytouch_jax.weights import registry
 
     card = registry.read_card(name)
-    size, sensors = sum(card["parameters"].values()) / 1e6, ", ".join(card["trained_sensors"] or ["unknown"])
+    size = sum(card["parameters"].values()) / 1e6
+    sensors = ", ".join(card["trained_sensors"] or ["unknown"])
     return f"{name}: {size:.1f} M parameters, {card['image_size']} pixels, trained on {sensors}"
 
 
@@ -181,13 +210,24 @@ def _folder(path: Path) -> list[str]:
     from anytouch_jax.data.manifest.schema import is_manifest
     from anytouch_jax.weights.checkpoint import steps
 
-    tables = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
+    tables = [
+        file
+        for file in sorted(path.iterdir())
+        if file.suffix.lower() in _TABLES and is_manifest(file)
+    ]
     tables.sort(key=lambda file: file.stem != "manifest")
     if steps(path / "checkpoints") or not tables:
-        is_run = (path / "checkpoints").exists() or not any(file.suffix.lower() in SUFFIXES for file in path.iterdir())
-        return _run(path) if is_run else _pictures(path)
+        is_run = (path / "checkpoints").exists() or not any(
+            file.suffix.lower() in SUFFIXES for file in path.iterdir()
+        )
+        if is_run:
+            return _run(path)
+        return _pictures(path)
     others = ", ".join(sorted(file.name for file in tables[1:]))
-    return [*_manifest(tables[0]), *([f"other manifests in this folder: {others}"] if others else [])]
+    return [
+        *_manifest(tables[0]),
+        *([f"other manifests in this folder: {others}"] if others else []),
+    ]
 
 
 def _run(path: Path) -> list[str]:
@@ -195,26 +235,39 @@ def _run(path: Path) -> list[str]:
 
     metadata = checkpoint.read_metadata(path)
     config: Config = from_json(metadata["config"])
-    source, loss = metadata.get("source") or {}, metadata.get("metrics", {}).get("loss")
-    saved, best = checkpoint.steps(path / "checkpoints"), checkpoint.best_of(path / "checkpoints")
+    source = metadata.get("source") or {}
+    loss = metadata.get("metrics", {}).get("loss")
+    saved = checkpoint.steps(path / "checkpoints")
+    best = checkpoint.best_of(path / "checkpoints")
     model = [_model(config.model), _sensors(config.model, metadata.get("seen"))]
     if "sensor" in source:
-        frames, minutes = source["frames"], source.get("minutes")
-        how = f"trained on {minutes:g} minutes of simulated touches" if minutes else f"fitted to {frames} frames"
+        frames = source["frames"]
+        minutes = source.get("minutes")
+        how = (
+            f"trained on {minutes:g} minutes of simulated touches"
+            if minutes
+            else f"fitted to {frames} frames"
+        )
         adapted = f"tokens of {source['sensor']} {how}"
         lines = [f"{path}: the run {source['run']}, with {adapted}", *model]
     else:
         checkpoints = f", checkpoints at {', '.join(map(str, saved))}" if saved else ""
         checkpoints += "" if best is None else f" (lowest loss at {best})"
-        starts = [f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None]
+        starts = [
+            f"{name} {source[name]}" for name in ("init", "clip") if source.get(name) is not None
+        ]
         content = f" (content {metadata['data'][:12]})" if metadata.get("data") else ""
         lines = [
             f"{path}: a run of stage {config.stage}, step {metadata['step']} of {config.run.steps}{checkpoints}",
             f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
-            *model, f"background: {config.data.background}", f"started from {', '.join(starts) or 'random weights'}",
+            *model,
+            f"background: {config.data.background}",
+            f"started from {', '.join(starts) or 'random weights'}",
             f"data: {', '.join(config.data.manifests) or 'unknown'}{content}",
-        ]  # fmt: skip
-        lines += [] if loss is None else [f"loss {loss:.4g}, the mean since the previous checkpoint"]
+        ]
+        lines += (
+            [] if loss is None else [f"loss {loss:.4g}, the mean since the previous checkpoint"]
+        )
     try:
         checkpoint.checked(checkpoint.resolve(path, None))
     except checkpoint.CheckpointError as error:
@@ -265,8 +318,12 @@ def _weights(path: Path, weights: Weights | None = None) -> list[str]:
     elif not load.clip_activation(path):
         lines.append("The activation is unknown. OpenAI's CLIP wants quick_gelu.")
     if unknown:
-        lines.append(f"Its head counts are unknown ({', '.join(unknown)}): a config.json gives them.")
-    if infinite := next((name for name, array in weights.items() if not np.isfinite(array).all()), ""):
+        lines.append(
+            f"Its head counts are unknown ({', '.join(unknown)}): a config.json gives them."
+        )
+    if infinite := next(
+        (name for name, array in weights.items() if not np.isfinite(array).all()), ""
+    ):
         lines.append(f"{infinite} is not finite, so that these weights cannot embed anything.")
     return lines
 
@@ -287,10 +344,12 @@ def _manifest(path: Path) -> list[str]:
     return [
         f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, {summary.clips:,} clips of "
         "three frames",
-        f"splits: {counts('split')}", f"sensors: {counts('sensor')}",
-        f"rows with {', '.join(filled) or 'no optional column'}", f"labels: {listed(labels) or 'none'}",
+        f"splits: {counts('split')}",
+        f"sensors: {counts('sensor')}",
+        f"rows with {', '.join(filled) or 'no optional column'}",
+        f"labels: {listed(labels) or 'none'}",
         f"content {summary.digest[:12]}",
-    ]  # fmt: skip
+    ]
 
 
 def _arrays(path: Path) -> list[str]:
@@ -300,7 +359,9 @@ def _arrays(path: Path) -> list[str]:
 
     is_small = path.stat().st_size < _SPREAD_BYTES
     try:
-        arrays = read_arrays(path, only=lambda name: name.startswith("about/") or (is_small and name == "features"))
+        arrays = read_arrays(
+            path, only=lambda name: name.startswith("about/") or (is_small and name == "features")
+        )
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}.") from None
     if {"format", "mark", "classes"} <= arrays.keys():
@@ -315,11 +376,18 @@ def _arrays(path: Path) -> list[str]:
         ]
     if not {"features", "rows"} <= arrays.keys():
         return []
-    values, rows = arrays["features"], arrays["rows"]
+    values = arrays["features"]
+    rows = arrays["rows"]
     if values.ndim != 2 or values.dtype.kind not in "fiu" or rows.shape != values.shape[:1]:
-        raise UserError(f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}.")
+        raise UserError(
+            f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}."
+        )
     keys = ", ".join(name.removeprefix("key/") for name in arrays if name.startswith("key/"))
-    about = {name.removeprefix("about/"): str(arrays[name])[:200] for name in arrays if name.startswith("about/")}
+    about = {
+        name.removeprefix("about/"): str(arrays[name])[:200]
+        for name in arrays
+        if name.startswith("about/")
+    }
     return [
         f"{path}: {len(values):,} features of {values.shape[1]}, with {keys or 'row numbers'}",
         *(f"{name}: {text}" for name, text in about.items()),

@@ -34,8 +34,10 @@ class MeasureOptions(embed.SensorOptions):
     OUT.csv, next to the .npz, has a line a frame: force, torque, depth, area, centre and slip.
     """
 
-    data: tuple[Path, ...]  # Manifests (.csv, .parquet), or one folder of frames, picture or video.
-    out: Path  # The .npz to write, with maps of every frame. Its numbers go to a .csv of the same name.
+    # Manifests (.csv, .parquet), or one folder of frames, picture or video.
+    data: tuple[Path, ...]
+    # The .npz to write, with maps of every frame. Its numbers go to a .csv of the same name.
+    out: Path
     width_mm: Above0[float | None] = None
     """What the width of the picture shows, in mm. Known sensors need none. For others lengths are else shares of it."""
     split: str | None = None  # Only this split of a manifest.
@@ -62,18 +64,27 @@ def run(options: MeasureOptions) -> int:
     from anytouch_jax.files import atomic_path
 
     is_manifest = embed.takes_manifest(options, options.data, ("split",))
-    table, read = options.out.with_suffix(".csv"), (options.model, *options.data)
+    table = options.out.with_suffix(".csv")
+    read = (options.model, *options.data)
     check_folder(options.out, read=read, suffix=".npz")
     check_folder(table, read=read)
     check_folder(options.ply, "--ply", read=read, suffix=".ply")
     if options.film is not None:
-        check_folder(options.film, "--film", read=read, suffix=".avi" if options.film.suffix == ".avi" else ".mp4")
+        check_folder(
+            options.film,
+            "--film",
+            read=read,
+            suffix=".avi" if options.film.suffix == ".avi" else ".mp4",
+        )
     check_apart(out=options.out, film=options.film, ply=options.ply)
     encoder = load_encoder(options.model)
     if not encoder.measures:
         raise fields.missing(encoder.source)
     touches = (_of_manifest if is_manifest else _of_frames)(encoder, options)
-    parts, names, times, lines = list[fields.Fields](), list[str](), list[float](), list[dict[str, Any]]()
+    parts = list[fields.Fields]()
+    names = list[str]()
+    times = list[float]()
+    lines = list[dict[str, Any]]()
     deepest: tuple[float, Any, Any] = (-np.inf, None, None)
     film = None if options.film is None else _Film(options.film)
     for some, measured in _measured(encoder, touches, options.width_mm):
@@ -82,7 +93,13 @@ def run(options: MeasureOptions) -> int:
             line = measured.summary(row)
             names.append(touch.name)
             times.append(touch.time)
-            lines.append({"frame": touch.name, "time": None if touch.time != touch.time else touch.time, **line})
+            lines.append(
+                {
+                    "frame": touch.name,
+                    "time": None if touch.time != touch.time else touch.time,
+                    **line,
+                }
+            )
             if film is not None:
                 film.add(fields.overlay(touch.frames[-1], measured, row))
             if line["depth"] > deepest[0]:
@@ -90,15 +107,23 @@ def run(options: MeasureOptions) -> int:
     if film is not None:
         film.close()
     if not lines:
-        raise UserError(f"there are no frames to measure in {options.data[0]}. Check the path, and --split.")
+        raise UserError(
+            f"there are no frames to measure in {options.data[0]}. Check the path, and --split."
+        )
     if options.ply is not None:
         fields.write_surface(options.ply, *deepest[1:])
     with atomic_path(table) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
         writer.writerows(lines)
-    arrays: dict[str, Any] = fields.stacked(parts) | {"name": np.array(names), "time": np.array(times)}
-    arrays |= {"about/encoder": np.array(encoder.source), "about/weights": np.array(encoder.fingerprint)}
+    arrays: dict[str, Any] = fields.stacked(parts) | {
+        "name": np.array(names),
+        "time": np.array(times),
+    }
+    arrays |= {
+        "about/encoder": np.array(encoder.source),
+        "about/weights": np.array(encoder.fingerprint),
+    }
     with atomic_path(options.out) as part, open(part, "wb") as file:
         np.savez(file, **arrays)
     if not is_manifest:
@@ -120,11 +145,18 @@ def _measured(
             logged.add(sentence)
             log(sentence)
 
-    for _, group in groupby(touches, lambda touch: (touch.sensor, id(touch.background), touch.frames.shape)):
+    for _, group in groupby(
+        touches, lambda touch: (touch.sensor, id(touch.background), touch.frames.shape)
+    ):
         while part := tuple(islice(group, _BATCH)):
             frames = np.stack([touch.frames for touch in part])
             first = part[0]
-            yield part, encoder.measure(frames, first.background, first.sensor, width_mm=width_mm, log=once)
+            yield (
+                part,
+                encoder.measure(
+                    frames, first.background, first.sensor, width_mm=width_mm, log=once
+                ),
+            )
 
 
 def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
@@ -135,9 +167,12 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     from anytouch_jax.data.images import count_frames
     from anytouch_jax.data.transforms import orient_frame
 
-    data, length = options.data[0], encoder.config.model.frames
+    data = options.data[0]
+    length = encoder.config.model.frames
     gel, _ = embed.choose_gel(encoder, options.background, data, {})
-    times, ring, last = list[float](), list[np.ndarray](), -1
+    times = list[float]()
+    ring = list[np.ndarray]()
+    last = -1
     background = None if gel is None else orient_frame(gel, options.rotate, options.flip)
     for number, name, frame in tracked(
         embed.numbered_frames(data, "error", times), "frames measured", count_frames(data)
@@ -145,9 +180,12 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
         assert frame is not None  # an unreadable one is an error
         frame = np.ascontiguousarray(orient_frame(frame, options.rotate, options.flip))
         is_next = number == last + 1 and ring and ring[-1].shape == frame.shape
-        ring, last = [*(ring if is_next else [frame] * length), frame][-length:], number
+        ring = [*(ring if is_next else [frame] * length), frame][-length:]
+        last = number
         time = times[-1] if times else float("nan")
-        yield _Touch(name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background)
+        yield _Touch(
+            name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background
+        )
     if times:
         embed.log_if_cut(data, len(times))
 
@@ -161,7 +199,8 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder.embed import rows_with_gel
 
-    manifest, length = manifests.read(options.data), encoder.config.model.frames
+    manifest = manifests.read(options.data)
+    length = encoder.config.model.frames
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     rows = embed.usable_rows(manifest, rows, 1)
     gels = UnitGels(manifest)
@@ -169,7 +208,8 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
         log(gels.report(rows))
     rows = rows_with_gel(encoder, gels, rows, log)
     before = {later: earlier for earlier, later in manifest.clips(2).tolist()}
-    sensors, picture = manifest.text_column("sensor"), lru_cache(length)(decode)
+    sensors = manifest.text_column("sensor")
+    picture = lru_cache(length)(decode)
     gel_of = gels.shared(lambda gel: gel)
     for row in tracked(rows.tolist(), "frames measured", len(rows)):
         clip = [row]
@@ -178,14 +218,21 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
         frames = [picture(manifest.file(one)) for one in reversed(clip)]
         gel = gel_of(row) if encoder.subtracts else None
         same = [frame if frame.shape == frames[-1].shape else frames[-1] for frame in frames]
-        yield _Touch(str(manifest.column("path")[row].as_py()), float("nan"), np.stack(same), str(sensors[row]), gel)
+        yield _Touch(
+            str(manifest.column("path")[row].as_py()),
+            float("nan"),
+            np.stack(same),
+            str(sensors[row]),
+            gel,
+        )
 
 
 class _Film:
     """A film of pictures RGB u8 of one size, that of the first: others are scaled to it."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._size = path, (0, 0)
+        self._path = path
+        self._size = (0, 0)
         self._writer: Any = None
 
     def add(self, picture: np.ndarray) -> None:
@@ -194,9 +241,13 @@ class _Film:
         if self._writer is None:
             code = "MJPG" if self._path.suffix == ".avi" else "mp4v"
             self._size = (picture.shape[1], picture.shape[0])
-            self._writer = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*code), 30, self._size)
+            self._writer = cv2.VideoWriter(
+                str(self._path), cv2.VideoWriter.fourcc(*code), 30, self._size
+            )
             if not self._writer.isOpened():
-                raise UserError(f"{self._path} cannot be written as a film on this computer. Name an .avi file.")
+                raise UserError(
+                    f"{self._path} cannot be written as a film on this computer. Name an .avi file."
+                )
         shown = picture if picture.shape[1::-1] == self._size else cv2.resize(picture, self._size)
         self._writer.write(shown[..., ::-1])
 

@@ -45,18 +45,24 @@ def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:
     defaults = {field.name: field.default for field in fields(options)}
     changed = [spelled(name) for name in names if getattr(options, name) != defaults[name]]
     if changed:
-        raise UserError(f"{', '.join(changed)} {'has' if len(changed) == 1 else 'have'} no effect {reason}. Remove it.")
+        raise UserError(
+            f"{', '.join(changed)} {'has' if len(changed) == 1 else 'have'} no effect {reason}. Remove it."
+        )
 
 
 def refuse_join(options: Any, segment: int) -> None:
     """Raise UserError for --join where a touch of `options.frames` frames is one segment, of `segment` at most."""
     if (options.frames or 1) <= segment:
-        refuse_unused(options, ("join",), f"on touches of up to {segment} frames, which have one segment")
+        refuse_unused(
+            options, ("join",), f"on touches of up to {segment} frames, which have one segment"
+        )
 
 
 def default_target(manifest: Path, word: str, suffix: str | None = None) -> Path:
     """Return the default place of a result: `<name>_<word>` in the folder of `manifest`."""
-    return manifest.with_name(f"{manifest.stem}_{word}{manifest.suffix if suffix is None else suffix}")
+    return manifest.with_name(
+        f"{manifest.stem}_{word}{manifest.suffix if suffix is None else suffix}"
+    )
 
 
 def check_new(manifest: Manifest, path: Path) -> Path:
@@ -66,7 +72,9 @@ def check_new(manifest: Manifest, path: Path) -> Path:
 
     target = path.expanduser().resolve()
     if target.is_file() and not is_manifest(target):
-        raise UserError(f"{target} exists and is no manifest. Name another file with --out, or remove it.")
+        raise UserError(
+            f"{target} exists and is no manifest. Name another file with --out, or remove it."
+        )
     manifests.placed(manifest, target)
     check_folder(target, read=manifest.files)
     return target
@@ -103,7 +111,9 @@ def check_folder(
         writable = os.access(path.parent, os.W_OK)
     except OSError as error:
         reason = error.strerror or error
-        raise UserError(f"the folder {path.parent} cannot be made: {reason}. Choose another {option}.") from None
+        raise UserError(
+            f"the folder {path.parent} cannot be made: {reason}. Choose another {option}."
+        ) from None
     if not writable:
         raise UserError(f"the folder {path.parent} cannot be written to. Choose another {option}.")
 
@@ -122,4 +132,6 @@ def check_apart(**outputs: Path | None) -> None:
         if path is not None:
             other = options.setdefault(path.expanduser().resolve(), name)
             if other != name:
-                raise UserError(f"{spelled(other)} and {spelled(name)} name the same file. Give each another name.")
+                raise UserError(
+                    f"{spelled(other)} and {spelled(name)} name the same file. Give each another name."
+                )

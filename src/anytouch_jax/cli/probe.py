@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from anytouch_jax.cli.arguments import DEFAULT
-from anytouch_jax.cli.output import check_apart, check_folder, check_home, log, log_default, print_table, refuse_unused
+from anytouch_jax.cli.output import (
+    check_apart,
+    check_folder,
+    check_home,
+    log,
+    log_default,
+    print_table,
+    refuse_unused,
+)
 from anytouch_jax.config.parsing import Count, Finite, NotNegative, Range
 from anytouch_jax.errors import UserError
 
@@ -45,14 +53,19 @@ class LabelOptions(ProbeOptions):
     """Leave out each value of this column in turn instead of using the splits, such as object for slip."""
     where: Finite[tuple[str, float] | None] = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
-    frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
-    pooling: Literal["class", "mean", "both"] = "class"  # Features: class token, mean of the patch tokens, or both.
+    # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
+    frames: Count[int] = 1
+    # Features: class token, mean of the patch tokens, or both.
+    pooling: Literal["class", "mean", "both"] = "class"
     seeds: NotNegative[int] = 5  # Bootstrap resamples of the training groups.
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says so."""
-    details: bool = False  # Also print parts of the test rows: classes that alignment may have named, and others.
-    save: Path | None = None  # Write the linear head of one --model as .npz, for embed --head and stream --head.
-    coverage: Inner = 0.9  # Share of touches whose set of classes holds the true one, of a saved head.
+    # Also print parts of the test rows: classes that alignment may have named, and others.
+    details: bool = False
+    # Write the linear head of one --model as .npz, for embed --head and stream --head.
+    save: Path | None = None
+    # Share of touches whose set of classes holds the true one, of a saved head.
+    coverage: Inner = 0.9
     false_alarms: Inner = 0.05  # Share of known touches that a saved head calls novel.
 
 
@@ -63,10 +76,13 @@ class BatteryOptions(ProbeOptions):
     seeds: NotNegative[int] = 5  # Random splits of the groups.
     train_sensors: tuple[str, ...] = ()  # Train on these sensors only.
     test_sensors: tuple[str, ...] = ()  # Test on these sensors only.
-    train_units: tuple[str, ...] = ()  # Train on these units only. Patterns such as cam0_* are allowed.
+    # Train on these units only. Patterns such as cam0_* are allowed.
+    train_units: tuple[str, ...] = ()
     test_units: tuple[str, ...] = ()  # Test on these units only.
-    max_rows: Count[int | None] = None  # Largest number of rows per task, drawn with a fixed seed.
-    cache: Path | None = None  # Folder that caches features by content, so that each frame is encoded once.
+    # Largest number of rows per task, drawn with a fixed seed.
+    max_rows: Count[int | None] = None
+    # Folder that caches features by content, so that each frame is encoded once.
+    cache: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -83,8 +99,10 @@ class TasksOptions(BatteryOptions):
     protocol: Literal["honest", "published"] = "honest"
     """published also reports the choice on the test split, as in the authors' code."""
     frames: Count[int | None] = None  # Frames of a touch (default: those of each task).
-    pooling: Literal["class", "mean", "both"] = "class"  # Features: class token, mean of the patch tokens, or both.
-    join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a clip longer than the model's are joined.
+    # Features: class token, mean of the patch tokens, or both.
+    pooling: Literal["class", "mean", "both"] = "class"
+    # How the segments of a clip longer than the model's are joined.
+    join: Literal["mean", "sum", "concat"] = "mean"
     order: Literal["right", "shuffled", "repeated"] = "right"
     """Order of the frames of a clip: as recorded, shuffled, or the last frame repeated."""
     counterfactual: bool = False
@@ -109,11 +127,21 @@ def run_label(options: LabelOptions) -> int:
     from anytouch_jax.evaluate.statistics import label_verdicts
 
     if options.leave_out is not None:
-        refuse_unused(options, ("group", "seeds", "protocol", "save"), "with --leave-out, which makes its own folds")
+        refuse_unused(
+            options,
+            ("group", "seeds", "protocol", "save"),
+            "with --leave-out, which makes its own folds",
+        )
     if options.save is not None and len(_models(options)) != 1:
-        raise UserError(f"--save writes the head of one encoder. Give one --model, not {len(options.model)}.")
+        raise UserError(
+            f"--save writes the head of one encoder. Give one --model, not {len(options.model)}."
+        )
     if options.save is None:
-        refuse_unused(options, ("coverage", "false_alarms"), "without --save, which writes the calibrated head")
+        refuse_unused(
+            options,
+            ("coverage", "false_alarms"),
+            "without --save, which writes the calibrated head",
+        )
     check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
     settings = _settings(options)
@@ -152,7 +180,11 @@ def _run_counterfactual(options: TasksOptions, settings: dict[str, Any]) -> int:
     from anytouch_jax.evaluate.probing import probe_table
     from anytouch_jax.files import atomic_write
 
-    refuse_unused(options, ("features", "order", "controls"), "with --counterfactual, which makes its own controls")
+    refuse_unused(
+        options,
+        ("features", "order", "controls"),
+        "with --counterfactual, which makes its own controls",
+    )
     out = settings.pop("out")
     results, gains = probe_counterfactual(**settings, log=log)
     print_table(probe_table(results["results"], results["paper"]))
@@ -194,5 +226,9 @@ def _models(options: ProbeOptions) -> tuple[Path, ...]:
 
 
 def _files_read(options: ProbeOptions) -> tuple[Path, ...]:
-    records = [run / name for run in options.model for name in ("config.json", "metrics.jsonl", "tokenizer.json")]
+    records = [
+        run / name
+        for run in options.model
+        for name in ("config.json", "metrics.jsonl", "tokenizer.json")
+    ]
     return (*options.data, *options.model, *options.features, *records)

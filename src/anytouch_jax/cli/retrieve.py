@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from anytouch_jax.cli.arguments import DEFAULT
-from anytouch_jax.cli.output import check_folder, check_home, log, log_default, print_table, refuse_unused
+from anytouch_jax.cli.output import (
+    check_folder,
+    check_home,
+    log,
+    log_default,
+    print_table,
+    refuse_unused,
+)
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
 from anytouch_jax.config.parsing import Count, Range, Seed
 from anytouch_jax.errors import UserError
@@ -33,18 +40,25 @@ class RetrieveOptions:
     list the stored touches nearest to --query instead.
     """
 
-    data: Path | None = None  # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
+    # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
+    data: Path | None = None
     index: Path | None = None  # Features of `anytouch embed` to search in, of any sensors.
-    query: str | None = None  # What to look for in --index: a picture, a folder or video (last clip), or a sentence.
+    # What to look for in --index: a picture, a folder or video (last clip), or a sentence.
+    query: str | None = None
     sensor: str | None = None  # Sensor of the query. Without it the universal tokens are used.
     background: Path | None = None  # Picture of the untouched gel of the query.
     count: Count[int] = 10  # Nearest touches to list.
-    approximate: bool = False  # Search in the nearest cells alone (FAISS), for very many features.
-    model: tuple[Path, ...] = ()  # Encoders to compare: names, run folders or weights files (default: anytouch-tiny).
+    # Search in the nearest cells alone (FAISS), for very many features.
+    approximate: bool = False
+    # Encoders to compare: names, run folders or weights files (default: anytouch-tiny).
+    model: tuple[Path, ...] = ()
     split: str = "test"  # Split to retrieve in.
-    frames: Count[int] = 1  # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
-    pooling: Literal["class", "mean", "both"] = "class"  # Features: class token, mean of the patch tokens, or both.
-    gallery: Annotated[int, Range(2, math.inf, "2 or more, with the touch")] = 50  # Touches in a gallery.
+    # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each deepest frame.
+    frames: Count[int] = 1
+    # Features: class token, mean of the patch tokens, or both.
+    pooling: Literal["class", "mean", "both"] = "class"
+    # Touches in a gallery.
+    gallery: Annotated[int, Range(2, math.inf, "2 or more, with the touch")] = 50
     by_chance: bool = False  # Draw the galleries at random, not by similarity.
     seeds: Count[int] = 5  # Galleries drawn for each query, with --by-chance.
     controls: bool = True
@@ -56,7 +70,9 @@ def run_retrieve(options: RetrieveOptions) -> int:
     """Score cross-sensor retrieval, or search an index, print a table, and write JSON with --out."""
     if options.index is not None:
         return _search(options)
-    refuse_unused(options, ("query", "sensor", "background", "count", "approximate"), "without --index")
+    refuse_unused(
+        options, ("query", "sensor", "background", "count", "approximate"), "without --index"
+    )
     if options.data is None:
         raise UserError("Give a manifest with --data, or features to search in with --index.")
     import numpy as np
@@ -75,7 +91,9 @@ def run_retrieve(options: RetrieveOptions) -> int:
         refuse_unused(options, ("seeds",), "without --by-chance")
     check_folder(options.out, read=(options.data, *options.model))
     enable_compilation_cache()
-    encoders = {str(path): features.load_encoder(path) for path in options.model or (Path(DEFAULT),)}
+    encoders = {
+        str(path): features.load_encoder(path) for path in options.model or (Path(DEFAULT),)
+    }
     if options.controls:
         encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
     for encoder in encoders.values():
@@ -88,17 +106,21 @@ def run_retrieve(options: RetrieveOptions) -> int:
     for encoder in encoders.values():
         rows = embedding.rows_with_gel(encoder, gels, rows, log)
     settings: dict[str, Any] = {
-        "gallery_size": options.gallery, "match": None if options.by_chance else retrieval.COVARIATES,
+        "gallery_size": options.gallery,
+        "match": None if options.by_chance else retrieval.COVARIATES,
         "seeds": options.seeds,
-    }  # fmt: skip
-    retrieval.cross_sensor_retrieval(table, {}, rows, **settings)  # raises for an impossible gallery, before the work
+    }
+    # raises for an impossible gallery, before the work
+    retrieval.cross_sensor_retrieval(table, {}, rows, **settings)
     log(gels.report(rows))
     values: dict[str, Any] = {}
     for name, encoder in encoders.items():
         how = (options.frames, options.pooling)
         kept, values[name] = embedding.embed_rows(encoder, table, rows, *how, gels=gels, log=log)
         if len(kept) < len(rows):
-            raise UserError(f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest first.")
+            raise UserError(
+                f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest first."
+            )
     if options.controls:
         pixels = partial(background_difference, gels=gels)
         for name, make in ((PIXELS, pixels), (VECTOR, retrieval.contact_vector)):
@@ -106,8 +128,21 @@ def run_retrieve(options: RetrieveOptions) -> int:
                 values[name] = make(table, rows)
             except UserError as error:
                 log(f"no control by {name}: {error}")
-    scores = retrieval.cross_sensor_retrieval(table, values, rows, metrics={VECTOR: "euclidean"}, **settings)
-    head = ("features", "query", "gallery", "centred", "recall@1", "95 %", "recall@5", "chance", "of", "queries")
+    scores = retrieval.cross_sensor_retrieval(
+        table, values, rows, metrics={VECTOR: "euclidean"}, **settings
+    )
+    head = (
+        "features",
+        "query",
+        "gallery",
+        "centred",
+        "recall@1",
+        "95 %",
+        "recall@5",
+        "chance",
+        "of",
+        "queries",
+    )
     print_table(markdown_table(head, [_cells(score) for score in scores]))
     for note in dict.fromkeys(note for score in scores for note in score.notes):
         log(note)
@@ -129,7 +164,9 @@ def _search(options: RetrieveOptions) -> int:
     others = ("data", "split", "frames", "pooling", "gallery", "by_chance", "seeds", "controls")
     refuse_unused(options, others, "with --index, whose features are searched")
     if options.query is None or options.index is None:
-        raise UserError("Give what to look for with --query: a picture, a folder, a video or a sentence.")
+        raise UserError(
+            "Give what to look for with --query: a picture, a folder, a video or a sentence."
+        )
     if len(options.model) > 1:
         raise UserError(f"A search takes one encoder, not {len(options.model)}. Give one --model.")
     check_folder(options.out, read=(options.index, *options.model))
@@ -138,7 +175,10 @@ def _search(options: RetrieveOptions) -> int:
     encoder = load_encoder((options.model or (Path(DEFAULT),))[0])
     index.check(encoder.source, encoder.fingerprint)
     ids, cosines = index.search(_query(options, encoder, index.about, index.gels), options.count)
-    hits = [{"cosine": f"{cosine:.3f}"} | index.describe(row) for row, cosine in zip(ids[0], cosines[0], strict=True)]
+    hits = [
+        {"cosine": f"{cosine:.3f}"} | index.describe(row)
+        for row, cosine in zip(ids[0], cosines[0], strict=True)
+    ]
     head = list(hits[0])
     print_table(markdown_table(head, [[shorten(hit[name]) for name in head] for hit in hits]))
     if options.out is not None:
@@ -149,7 +189,10 @@ def _search(options: RetrieveOptions) -> int:
 
 
 def _query(
-    options: RetrieveOptions, encoder: Encoder, about: dict[str, str], known: Mapping[str, np.ndarray]
+    options: RetrieveOptions,
+    encoder: Encoder,
+    about: dict[str, str],
+    known: Mapping[str, np.ndarray],
 ) -> np.ndarray:
     """Return features (1, d) of a picture, of the last clip of a folder or video, or of a sentence."""
     import numpy as np
@@ -158,19 +201,30 @@ def _query(
     from anytouch_jax.data import images
     from anytouch_jax.encoder.base import Preprocess
 
-    path, pooling = Path(str(options.query)), about.get("pooling", "class")
+    path = Path(str(options.query))
+    pooling = about.get("pooling", "class")
     length = int(about.get("frames", "1")) if about.get("frames", "1").isdecimal() else 1
     if not path.exists():
-        refuse_unused(options, ("sensor", "background"), f"on the sentence {path!s:.60}. There is no such file")
+        refuse_unused(
+            options,
+            ("sensor", "background"),
+            f"on the sentence {path!s:.60}. There is no such file",
+        )
         if pooling != "class":
-            raise UserError(f"A sentence is compared with features of pooling class, not {pooling}. Embed again.")
+            raise UserError(
+                f"A sentence is compared with features of pooling class, not {pooling}. Embed again."
+            )
         return encoder.encode_text(str(options.query))
     if (files := images.picture_files(path)) is None:
         frames = list(images.frames_from_video(path))[-length:]
     else:
-        frames = [images.decode(file) for file in (files if path.is_dir() else files * length)[-length:]]
+        frames = [
+            images.decode(file) for file in (files if path.is_dir() else files * length)[-length:]
+        ]
     if len(frames) < length:
-        raise UserError(f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more frames.")
+        raise UserError(
+            f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more frames."
+        )
     preprocess = Preprocess(encoder, choose_gel(encoder, options.background, path, known)[0])
     clip = np.stack([preprocess(frame) for frame in frames])[None]
     join: Any = about.get("join", "mean")
@@ -179,7 +233,12 @@ def _query(
 
 def _cells(score: Any) -> tuple[str, ...]:
     interval = "-" if score.low is None else f"{100 * score.low:.1f} to {100 * score.high:.1f}"
-    shares = (f"{100 * score.top1:.1f} %", interval, f"{100 * score.top5:.1f} %", f"{100 * score.chance1:.1f} %")
+    shares = (
+        f"{100 * score.top1:.1f} %",
+        interval,
+        f"{100 * score.top5:.1f} %",
+        f"{100 * score.chance1:.1f} %",
+    )
     centred = "yes" if score.centred else "no"
     sizes = (str(score.gallery), str(score.queries))
     return (score.name, score.query_sensor, score.gallery_sensor, centred, *shares, *sizes)
@@ -195,9 +254,12 @@ class ReportOptions:
     data: Path  # Manifest of simulated scenes, or one with the same columns.
     stage1: Path  # Run folder of stage 1.
     stage2: Path  # Run folder of stage 2.
-    out: Path  # Folder for report.html (one file with its pictures), report.md, report.json, figures/.
-    touches: Count[int] = 200  # Touches of the test split to use, and half as many of train and val.
-    gallery: Annotated[int, Range(2, math.inf, "2 or more")] = 50  # Touches in a retrieval gallery.
+    # Folder for report.html (one file with its pictures), report.md, report.json, figures/.
+    out: Path
+    # Touches of the test split to use, and half as many of train and val.
+    touches: Count[int] = 200
+    # Touches in a retrieval gallery.
+    gallery: Annotated[int, Range(2, math.inf, "2 or more")] = 50
     seed: Seed = 0  # Random seed.
 
 
@@ -209,7 +271,13 @@ def run_report(options: ReportOptions) -> int:
     check_home(options.out)
     enable_compilation_cache()
     demo_report(
-        options.data, options.stage1, options.stage2, options.out, log,
-        touches=options.touches, gallery_size=options.gallery, seed=options.seed,
-    )  # fmt: skip
+        options.data,
+        options.stage1,
+        options.stage2,
+        options.out,
+        log,
+        touches=options.touches,
+        gallery_size=options.gallery,
+        seed=options.seed,
+    )
     return 0

@@ -26,12 +26,15 @@ class FitOptions:
     `data simulate --sensors`, `train --simulated.sensors` and `adapt --sensor` take it like the name of a sensor.
     """
 
-    frames: Annotated[Path, Positional]  # Folder of pictures of one unit, upright and not cropped.
+    # Folder of pictures of one unit, upright and not cropped.
+    frames: Annotated[Path, Positional]
     name: str  # Name of the sensor.
     width_mm: Above0[float]  # Width of the gel that a picture shows, mm.
     out: Path  # Folder to write, NAME.sensor.
-    background: Path | None = None  # Picture of the untouched gel. Without it, the median of all pictures.
-    ball_mm: Above0[float | None] = None  # All presses are of a ball of this diameter, mm. Its slopes are known.
+    # Picture of the untouched gel. Without it, the median of all pictures.
+    background: Path | None = None
+    # All presses are of a ball of this diameter, mm. Its slopes are known.
+    ball_mm: Above0[float | None] = None
 
 
 def run_fit(options: FitOptions) -> int:
@@ -48,14 +51,21 @@ def run_fit(options: FitOptions) -> int:
     background = options.background or named.get("background")
     gel = None if background is None else to_rgb(decode(background), background)
     fitted = fit_sensor(
-        [to_rgb(decode(file), file) for file in files], options.name, options.width_mm, options.out, background=gel,
+        [to_rgb(decode(file), file) for file in files],
+        options.name,
+        options.width_mm,
+        options.out,
+        background=gel,
         ball_mm=options.ball_mm,
-    )  # fmt: skip
+    )
     for part, words in fitted.numbers.sure.items():
         log(f"{part}: {words}")
     log("simulating touches of it, about two minutes at the first time")
-    seen, picture = fitted.seen, options.out / "look.png"
-    share = compare(seen.frames[seen.pressed], seen.gel, options.out, picture, ball_mm=options.ball_mm)
+    seen = fitted.seen
+    picture = options.out / "look.png"
+    share = compare(
+        seen.frames[seen.pressed], seen.gel, options.out, picture, ball_mm=options.ball_mm
+    )
     print(f"{options.out}: {options.name}, {fitted.colour.source}")
     print(
         f"{picture}: real pictures above simulated ones. A linear classifier knows one from the other in {share:.0%} "
@@ -74,15 +84,18 @@ class AdaptOptions:
     that find fewer simulated touches than the universal ones are not saved. With --data, tokens are fitted to --labels.
     """
 
-    sensor: str  # Folder NAME.sensor of `anytouch sensor fit`, or a name in the column sensor of the manifest.
+    # Folder NAME.sensor of `anytouch sensor fit`, or a name in the column sensor of the manifest.
+    sensor: str
     out: Path  # Run folder to write, for embed, probe and retrieve.
-    model: Path = Path(DEFAULT)  # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
+    # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
+    model: Path = Path(DEFAULT)
     minutes: Above0[float] = 6.0  # Minutes of training on simulated touches.
     deep: bool = False  # Train the first blocks too, and hold the features of known sensors.
     data: tuple[Path, ...] = ()  # Manifests with labelled frames of the sensor in split train.
     frames: NotNegative[int] = 100
     """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
-    labels: str | None = None  # Label column whose classes the frames are fitted to. Known sensors need examples.
+    # Label column whose classes the frames are fitted to. Known sensors need examples.
+    labels: str | None = None
     steps: Count[int] = 200  # Steps of the fit.
     seed: Seed = 0  # Random seed.
 
@@ -102,7 +115,9 @@ def run_adapt(options: AdaptOptions) -> int:
             f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as --sensor"
         )
     else:
-        refuse_unused(options, ("minutes", "deep"), "with --data, where the frames are what is fitted")
+        refuse_unused(
+            options, ("minutes", "deep"), "with --data, where the frames are what is fitted"
+        )
     if not options.frames:
         refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
     check_empty(options.out)
@@ -112,9 +127,15 @@ def run_adapt(options: AdaptOptions) -> int:
         return _simulated(options)
     table = manifests.read([str(path) for path in options.data])
     adapted = adapt(
-        options.model, table, options.sensor, frames=options.frames, labels=options.labels, steps=options.steps,
-        seed=options.seed, log=log,
-    )  # fmt: skip
+        options.model,
+        table,
+        options.sensor,
+        frames=options.frames,
+        labels=options.labels,
+        steps=options.steps,
+        seed=options.seed,
+        log=log,
+    )
     save(adapted, options.model, options.out)
     if not options.frames:
         print(f"{options.out}: {options.sensor} has the universal tokens")
@@ -135,9 +156,14 @@ def _simulated(options: AdaptOptions) -> int:
     state = options.out.with_name(f"{options.out.name}.part.npz")
     log("compiling the simulator: about two minutes at first")
     adapted = adapt_by_simulation(
-        options.model, options.sensor, minutes=options.minutes, deep=options.deep, state=state, seed=options.seed,
+        options.model,
+        options.sensor,
+        minutes=options.minutes,
+        deep=options.deep,
+        state=state,
+        seed=options.seed,
         log=log,
-    )  # fmt: skip
+    )
     if adapted is None:
         log(f"interrupted: {state} keeps the state. Run the same command again to continue.")
         return 130

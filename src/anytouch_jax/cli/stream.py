@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 class CameraOptions:
     """What a camera is asked for. The log says what it gives."""
 
-    camera_size: Count[tuple[int, int] | None] = None  # Camera: width and height of its pictures, pixels.
+    # Camera: width and height of its pictures, pixels.
+    camera_size: Count[tuple[int, int] | None] = None
     camera_fps: Above0[float | None] = None  # Camera: frames a second.
     camera_format: str | None = None  # Camera: format, four letters such as MJPG or YUYV.
 
@@ -39,7 +40,9 @@ class CameraOptions:
 
         form = self.camera_format
         if form is not None and not (len(form) == 4 and form.isascii() and form.isalnum()):
-            raise UserError(f"--camera-format takes four letters such as MJPG or YUYV, not {form[:40]!r}.")
+            raise UserError(
+                f"--camera-format takes four letters such as MJPG or YUYV, not {form[:40]!r}."
+            )
         return CameraSettings(self.camera_size, self.camera_fps, form)
 
 
@@ -57,19 +60,22 @@ class StreamOptions(CameraOptions, embed.FrameOptions):
     """Camera or video file. A camera is a number such as 0, a part of its name, its serial, /dev/video0, or an address
     http:// or rtsp://. `anytouch info cameras` lists them."""
     out: Path  # The .npz to write, or - for one JSON line per frame on standard output.
-    stride: Count[int] = 1  # Frames from one frame of a clip to the next, as in the training data.
+    # Frames from one frame of a clip to the next, as in the training data.
+    stride: Count[int] = 1
     reuse: NotNegative[float] = 0.0
     """Reuse features while no place changes by more than so many times the camera's noise (0: while frames are
     equal)."""
     fields: bool = False
     """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with deviations. Shear and
     slip need --frames 3."""
-    width_mm: Above0[float | None] = None  # --fields: mm that the picture's width shows. Known sensors need none.
+    # --fields: mm that the picture's width shows. Known sensors need none.
+    width_mm: Above0[float | None] = None
 
 
 def run_stream(options: StreamOptions) -> int:
     """Embed frame by frame, write features or JSON lines, then print the latency."""
-    lines, settings = str(options.out) == "-", options.settings()
+    lines = str(options.out) == "-"
+    settings = options.settings()
     data = Path(options.data)
     if not lines:
         check_folder(options.out, read=(options.model, data), suffix=".npz")
@@ -81,7 +87,8 @@ def run_stream(options: StreamOptions) -> int:
     from anytouch_jax.encoder import stream
     from anytouch_jax.encoder.embed import Features
 
-    source, live = stream.open_source(options.data, settings, log)  # first: it fails within a second
+    # first: it fails within a second
+    source, live = stream.open_source(options.data, settings, log)
     if not live:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "with a film")
     encoder, pooling, head = embed.load_inputs(options)
@@ -89,15 +96,29 @@ def run_stream(options: StreamOptions) -> int:
     if options.fields:
         gel = None if options.background is None else decode(options.background)
         turned: dict[str, Any] = {"rotate": options.rotate, "flip": options.flip}
-        measure = encoder.measure_of(options.sensor or UNIVERSAL, gel, options.width_mm, log, **turned)
+        measure = encoder.measure_of(
+            options.sensor or UNIVERSAL, gel, options.width_mm, log, **turned
+        )
     known = encoder.gels if head is None else head.gels
     row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
     embedded = stream.stream(
-        encoder, source, preprocess, live=live, sensor=row, frames=options.frames, stride=options.stride,
-        pooling=pooling, join=options.join, log=log, contact=gate, reuse=options.reuse,
+        encoder,
+        source,
+        preprocess,
+        live=live,
+        sensor=row,
+        frames=options.frames,
+        stride=options.stride,
+        pooling=pooling,
+        join=options.join,
+        log=log,
+        contact=gate,
+        reuse=options.reuse,
         measure=measure,
-    )  # fmt: skip
-    result = stream.collect(embedded, (lambda frame: _print_line(frame, live, head)) if lines else None)
+    )
+    result = stream.collect(
+        embedded, (lambda frame: _print_line(frame, live, head)) if lines else None
+    )
     if result.error is not None and not result.total:
         raise result.error
     if not live and not result.interrupted:
@@ -112,7 +133,9 @@ def run_stream(options: StreamOptions) -> int:
         if live and len(result.numbers):
             about |= {"started": f"{result.started:.6f}"}
             about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}
-        features = Features(result.values, result.numbers, {"frame_index": result.numbers, "time": result.time})
+        features = Features(
+            result.values, result.numbers, {"frame_index": result.numbers, "time": result.time}
+        )
         features.keys.update(reused=result.reused, estimated=result.estimated)
         features.gels.update(embed.gels_of(preprocess, options))
         features.predictions.update(result.fields or {})
@@ -129,7 +152,8 @@ def run_stream(options: StreamOptions) -> int:
 
 
 def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
-    values = [float(str(value)) for value in frame.values]  # the shortest digits of the same float32
+    # the shortest digits of the same float32
+    values = [float(str(value)) for value in frame.values]
     line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
     if live:
         line |= {"picture": frame.picture, "missed": frame.missed}
@@ -160,12 +184,15 @@ class ViewOptions(CameraOptions):
 
     paths: Positional[tuple[str, ...]] = ()  # What to show, several at once.
     live: bool = False  # Play films as if they came from a camera.
-    model: Path = Path(DEFAULT)  # Encoder of a camera: a name, a run, a weights file, or hf://user/repo.
+    # Encoder of a camera: a name, a run, a weights file, or hf://user/repo.
+    model: Path = Path(DEFAULT)
     sensor: str | None = None  # Sensor of a camera. Without it, the universal tokens are used.
-    head: Path | None = None  # Show the class of a camera's touch by this head of `anytouch probe label --save`.
+    # Show the class of a camera's touch by this head of `anytouch probe label --save`.
+    head: Path | None = None
     out: Path = Path("recordings")
     """Folder for recordings of a camera, with their manifest.parquet, and for the head that they teach."""
-    host: str = "127.0.0.1"  # Address to listen on. For any but this machine's own, the page asks for a token.
+    # Address to listen on. For any but this machine's own, the page asks for a token.
+    host: str = "127.0.0.1"
     port: Annotated[int, Range(1, 65535, "1 to 65535")] = 8765  # Port to listen on.
 
 
@@ -176,27 +203,44 @@ def run_view(options: ViewOptions) -> int:
     except ModuleNotFoundError as error:
         if error.name not in ("starlette", "uvicorn"):
             raise
-        raise UserError('The page needs starlette and uvicorn: pip install "anytouch_jax[view]"') from None
+        raise UserError(
+            'The page needs starlette and uvicorn: pip install "anytouch_jax[view]"'
+        ) from None
     from anytouch_jax.data.cameras import camera_of
 
     tables = (".csv", ".parquet", ".npz")
-    played = [one for one in options.paths if Path(one).is_file() and Path(one).suffix.lower() not in tables]
+    played = [
+        one
+        for one in options.paths
+        if Path(one).is_file() and Path(one).suffix.lower() not in tables
+    ]
     played = played if options.live else []
     cameras = [path for path in options.paths if path in played or camera_of(path) is not None]
     if not cameras and options.paths:
-        refuse_unused(options, ("model", "sensor", "head", "out"), "without a camera, or a film with --live")
+        refuse_unused(
+            options, ("model", "sensor", "head", "out"), "without a camera, or a film with --live"
+        )
     if len(cameras) == len(played) and options.paths:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "without a camera")
     if len(cameras) > 1:
-        raise UserError(f"One camera can be shown at a time, not {len(cameras)}. Start another page for the next.")
+        raise UserError(
+            f"One camera can be shown at a time, not {len(cameras)}. Start another page for the next."
+        )
     begin = time.perf_counter()
-    sources = server.open_sources([Path(path) for path in options.paths or ("examples",) if path not in cameras])
+    sources = server.open_sources(
+        [Path(path) for path in options.paths or ("examples",) if path not in cameras]
+    )
     if not options.paths:
         sources.insert(0, server.StartPage(lambda camera: _open_camera(options, camera, sources)))
     for camera in cameras:
         sources.append(_open_camera(options, camera, sources))
     log(f"opened in {time.perf_counter() - begin:.1f} s")
-    server.serve(sources, options.host, options.port, lambda at: print(f"Open {at} (Ctrl-C stops)", flush=True))
+    server.serve(
+        sources,
+        options.host,
+        options.port,
+        lambda at: print(f"Open {at} (Ctrl-C stops)", flush=True),
+    )
     return 0
 
 
@@ -215,6 +259,12 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
     spaces: list[Any] = [source for source in sources if source.kind == "space"]
     return Live(
-        camera, encoder, sensor=options.sensor, head=head, space=spaces[0] if spaces else None, out=options.out,
-        camera=options.settings(), log=log,
-    )  # fmt: skip
+        camera,
+        encoder,
+        sensor=options.sensor,
+        head=head,
+        space=spaces[0] if spaces else None,
+        out=options.out,
+        camera=options.settings(),
+        log=log,
+    )

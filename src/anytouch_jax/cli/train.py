@@ -30,10 +30,19 @@ from anytouch_jax.errors import Terminated, UserError
 
 # Fields that one stage alone reads.
 _STAGE_2_FIELDS = (
-    "objective.alpha_tv", "objective.alpha_tl", "objective.alpha_vl", "objective.match_weight", "objective.match_keep",
-    "objective.groups", "objective.center_embeddings", "model.match_head", "model.lora_rank", "model.lora_alpha",
-    "model.temperature", "data.negatives",
-)  # fmt: skip
+    "objective.alpha_tv",
+    "objective.alpha_tl",
+    "objective.alpha_vl",
+    "objective.match_weight",
+    "objective.match_keep",
+    "objective.groups",
+    "objective.center_embeddings",
+    "model.match_head",
+    "model.lora_rank",
+    "model.lora_alpha",
+    "model.temperature",
+    "data.negatives",
+)
 _RECONSTRUCTION_FIELDS = ("objective.mask_ratio", "objective.norm_pix_loss", "objective.next_frame")
 
 
@@ -49,20 +58,27 @@ class TrainOptions:
 
     data: tuple[Path, ...]  # Manifests (.csv or .parquet) to train on.
     run: Path  # Run folder: config.json, metrics.jsonl, checkpoints/, figures/.
-    stage: Literal[1, 2] = 1  # 1 learns from pixels. 2 aligns touch, vision and text, and matches sensors.
+    # 1 learns from pixels. 2 aligns touch, vision and text, and matches sensors.
+    stage: Literal[1, 2] = 1
     preset: PresetName = "tiny"  # Sizes of the network. large is the paper's.
-    recipe: Literal["paper", "release"] = "paper"  # Follow the paper's text, or the authors' released code.
+    # Follow the paper's text, or the authors' released code.
+    recipe: Literal["paper", "release"] = "paper"
     towers: Literal["scratch", "pretrained"] = "scratch"
     """Stage 2: train small image and text towers, or start from CLIP weights (--clip-weights)."""
-    baseline: str = "anytouch"  # Train a baseline or an ablation: unitouch, tlv_link, t3, static_only, no_matching, ...
-    init: Path | None = None  # Start from this stage-1 run or weights file: AnyTouch, DINOv2, ViT-MAE, ViT or CLIP.
-    clip_weights: Path | None = None  # CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json.
+    # Train a baseline or an ablation: unitouch, tlv_link, t3, static_only, no_matching, ...
+    baseline: str = "anytouch"
+    # Start from this stage-1 run or weights file: AnyTouch, DINOv2, ViT-MAE, ViT or CLIP.
+    init: Path | None = None
+    # CLIP weights (HF or OpenCLIP): a file, or a folder with tokenizer.json.
+    clip_weights: Path | None = None
     steps: Count[int | None] = None  # Steps of the whole schedule (default: 1000).
-    stop_after: NotNegative[int | None] = None  # Stop after this many steps, without changing the schedule.
+    # Stop after this many steps, without changing the schedule.
+    stop_after: NotNegative[int | None] = None
     save_every: NotNegative[int | None] = None  # Steps between checkpoints (default: 200).
     batch: Count[int | None] = None  # Samples per step (default: the preset's).
     seed: Seed = 0  # Random seed.
-    on_bad_sample: Literal["error", "skip"] = "error"  # Stop at a sample that cannot be read, or replace and count it.
+    # Stop at a sample that cannot be read, or replace and count it.
+    on_bad_sample: Literal["error", "skip"] = "error"
     tensorboard: bool = False  # Also write TensorBoard events.
     curve: bool = False  # Draw the loss in the terminal while training.
 
@@ -92,15 +108,20 @@ def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequ
     plain, sections = _split_sections([arg for arg in args if arg != "--help-all"])
     defaults = TrainOptions((), Path("runs/stage1")) if list_all else None
     names = [option.name for option in options_of(Sections)]
-    others = {f"--{name.rpartition('.')[2]}": name for name in reversed(names)} | {name: name for name in names}
+    others = {f"--{name.rpartition('.')[2]}": name for name in reversed(names)} | {
+        name: name for name in names
+    }
     options = parse_options(kind, name, plain, defaults, others=others)
     config = _configure(options)
     if not sections and not list_all:
         return TrainRequest(options, config)
     default = Sections(*(getattr(config, section) for section in get_type_hints(Sections)))
-    help_name, words = "train [the options of --help]", ["--help"] if list_all else sections
+    help_name = "train [the options of --help]"
+    words = ["--help"] if list_all else sections
     plain_names = {option.name: option.name for option in options_of(TrainOptions)}
-    section = parse_options(Sections, help_name, words, default, add_help=list_all, others=plain_names)
+    section = parse_options(
+        Sections, help_name, words, default, add_help=list_all, others=plain_names
+    )
     return TrainRequest(options, replace(config, **vars(section)))
 
 
@@ -110,18 +131,26 @@ def run(request: TrainRequest) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache, joined
     from anytouch_jax.train.progress import terminating
 
-    options, config = request[0], _with_own_sensors(request[1])
+    options = request[0]
+    config = _with_own_sensors(request[1])
     _refuse_unread(options, config)
     try:
         with terminating():
             enable_compilation_cache()
             with joined() as place:
                 result = pretrain(
-                    config, options.run, init=options.init, clip=options.clip_weights, stop_after=options.stop_after,
-                    log=log, curve=options.curve,
-                )  # fmt: skip
+                    config,
+                    options.run,
+                    init=options.init,
+                    clip=options.clip_weights,
+                    stop_after=options.stop_after,
+                    log=log,
+                    curve=options.curve,
+                )
     except Terminated:
-        log(f"stopped by SIGTERM before the first step of {options.run}. Run the same command again to continue.")
+        log(
+            f"stopped by SIGTERM before the first step of {options.run}. Run the same command again to continue."
+        )
         return 0
     if result.interrupted == signal.SIGINT:
         return 130
@@ -137,21 +166,31 @@ def _with_own_sensors(config: Config) -> Config:
         return config
     from anytouch_jax.sim.sensing.own import read_numbers
 
-    names = dict.fromkeys((*config.model.sensors, *(read_numbers(folder).name for folder in folders)))
+    names = dict.fromkeys(
+        (*config.model.sensors, *(read_numbers(folder).name for folder in folders))
+    )
     return replace(config, model=replace(config.model, sensors=tuple(names)))
 
 
 def _configure(options: TrainOptions, *, usual: bool = False) -> Config:
     """Return the configuration of the preset and recipe, changed by the short options (unless `usual`) and baseline."""
     short = {
-        "data.manifests": tuple(map(str, options.data)), "data.on_bad_sample": options.on_bad_sample,
-        "data.batch_size": options.batch, "run.seed": options.seed, "run.steps": options.steps,
-        "run.save_every": options.save_every, "run.tensorboard": options.tensorboard,
-    }  # fmt: skip
-    config = preset(options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers)
+        "data.manifests": tuple(map(str, options.data)),
+        "data.on_bad_sample": options.on_bad_sample,
+        "data.batch_size": options.batch,
+        "run.seed": options.seed,
+        "run.steps": options.steps,
+        "run.save_every": options.save_every,
+        "run.tensorboard": options.tensorboard,
+    }
+    config = preset(
+        options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers
+    )
     if usual:
         return presets.apply_baseline(options.baseline, config)
-    config = config.with_settings({name: value for name, value in short.items() if value is not None})
+    config = config.with_settings(
+        {name: value for name, value in short.items() if value is not None}
+    )
     return presets.apply_baseline(options.baseline, config)
 
 
@@ -163,9 +202,13 @@ def _refuse_unread(options: TrainOptions, config: Config) -> None:
     if options.stage == 2 and options.init and not baseline.starts_from_stage1:
         raise UserError(f"baseline {baseline.name} has no stage 1. Remove --init.")
     if options.stage == 1 and options.towers == "pretrained" and not options.clip_weights:
-        raise UserError("--towers pretrained starts the touch encoder of stage 1 from CLIP. Add --clip-weights.")
+        raise UserError(
+            "--towers pretrained starts the touch encoder of stage 1 from CLIP. Add --clip-weights."
+        )
     if options.stage == 2 and options.clip_weights and options.towers != "pretrained":
-        raise UserError("--clip-weights needs --towers pretrained in stage 2. Add it, or remove --clip-weights.")
+        raise UserError(
+            "--clip-weights needs --towers pretrained in stage 2. Add it, or remove --clip-weights."
+        )
     unread = dict.fromkeys(_STAGE_2_FIELDS, "in stage 1")
     if options.stage == 2:
         reads = () if config.reconstructs else _RECONSTRUCTION_FIELDS

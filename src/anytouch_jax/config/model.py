@@ -12,14 +12,24 @@ from anytouch_jax.shown import shown_short
 
 UNIVERSAL = "universal"
 SENSORS = (
-    "gelsight", "digit", "gelslim", "gelsight_mini", "duragel", "9dtact", "allsight", "tacto", "taxim", UNIVERSAL,
-)  # fmt: skip
+    "gelsight",
+    "digit",
+    "gelslim",
+    "gelsight_mini",
+    "duragel",
+    "9dtact",
+    "allsight",
+    "tacto",
+    "taxim",
+    UNIVERSAL,
+)
 _MOST = 1 << 20  # of every size: a damaged configuration must not ask for the whole memory
 Size = Annotated[int, Range(1, _MOST, f"1 to {_MOST}")]
 Number = Annotated[int, Range(0, _MOST, f"0 to {_MOST}")]
 FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
 OWN_SENSOR = ".sensor"  # ending of a folder of `anytouch sensor fit`
-OTHER_SENSORS = ("dtact", "tactip")  # sensors without tokens whose names are nearly those of others
+# sensors without tokens whose names are nearly those of others
+OTHER_SENSORS = ("dtact", "tactip")
 _LETTERS = 2  # by which a misspelt name differs from the right one
 
 
@@ -40,11 +50,14 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
     def digits(sensor: str) -> int:
         return sum(map(str.isdecimal, sensor))
 
-    names, word = {*known, *FIELD_SENSORS, *SENSORS}, plain(name)
+    names = {*known, *FIELD_SENSORS, *SENSORS}
+    word = plain(name)
     if name in names or word in OTHER_SENSORS:
         return
     alike = [sensor for sensor in sorted(names) if abs(len(sensor) - len(name)) <= _LETTERS]
-    apart, nearest = min(((letters_apart(word, plain(one)), one) for one in alike), default=(_LETTERS + 1, ""))
+    apart, nearest = min(
+        ((letters_apart(word, plain(one)), one) for one in alike), default=(_LETTERS + 1, "")
+    )
     if apart <= _LETTERS and digits(word) <= digits(nearest):
         raise SpellingError(
             f"sensor {name!r} is not known: did you mean {nearest}? The name of a new sensor differs from it by more "
@@ -76,7 +89,8 @@ class TextTower:
     stack: Stack
     vocab: Size = 49408  # Tokens of the vocabulary.
     length: Size = 77  # Tokens of a caption, with start and end.
-    end_token: NotNegative[int | None] = None  # Token to pool, at its first position. None pools the largest id (CLIP).
+    # Token to pool, at its first position. None pools the largest id (CLIP).
+    end_token: NotNegative[int | None] = None
 
     def __post_init__(self) -> None:
         check(self, "--model.text.")
@@ -95,30 +109,41 @@ class ModelConfig:
     image: Stack | None = None  # Image tower. Stage 1 has none.
     text: TextTower | None = None  # Text tower. Stage 1 has none.
     frames: Size = 3  # Frames of a clip.
-    sensors: tuple[str, ...] = SENSORS  # Sensors with tokens. "universal" serves all other sensors.
+    # Sensors with tokens. "universal" serves all other sensors.
+    sensors: tuple[str, ...] = SENSORS
     sensor_tokens: Number = 5  # Tokens of each sensor.
-    activation: Literal["gelu", "quick_gelu"] = "gelu"  # Activation of the encoders. OpenAI CLIP needs quick_gelu.
+    # Activation of the encoders. OpenAI CLIP needs quick_gelu.
+    activation: Literal["gelu", "quick_gelu"] = "gelu"
     norm_eps: NotNegative[float] = 1e-5  # Epsilon of layer norms.
-    pre_norm: bool = True  # Layer norm before the blocks of the touch encoder (CLIP). DINOv2 and MAE have none.
+    # Layer norm before the blocks of the touch encoder (CLIP). DINOv2 and MAE have none.
+    pre_norm: bool = True
     decoder_norm_eps: NotNegative[float] = 1e-12  # Epsilon of the decoder's layer norms.
-    decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
+    # Give the decoder the sensor tokens before encoding (release).
+    decoder_sensor_tokens: bool = False
     patch_encoder: Literal["shared", "sensor"] = "shared"  # One, or one a sensor (T3).
     fields: Number = 0  # Channels of the decoder of depth, shear, contact and force. 0: none.
-    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
+    # linear is the release, cosine is ours.
+    match_head: Literal["mlp", "linear", "cosine", "none"] = "none"
     lora_rank: Number = 0  # Rank of the image tower's LoRA. 0: off.
     lora_alpha: Finite[float] = 16.0  # Scale of LoRA, divided by its rank.
     temperature: Above0[float] = 0.07  # Temperature of InfoNCE at the start. It is learned.
-    dtype: Literal["float32", "bfloat16", "float64"] = "float32"  # Type of the arithmetic. Parameters are float32.
-    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"  # Implementation. auto takes the fastest here.
+    # Type of the arithmetic. Parameters are float32.
+    dtype: Literal["float32", "bfloat16", "float64"] = "float32"
+    # Implementation. auto takes the fastest here.
+    attention: Literal["auto", "xla", "mapped", "cudnn"] = "auto"
     remat: bool = False  # Recompute activations in the backward pass. Saves memory, takes time.
 
     def __post_init__(self) -> None:
         check(self, "--model.")
         if self.decoder.width % 4:
-            width = f"a multiple of 4 (sines and cosines of rows and columns), not {self.decoder.width}"
+            width = (
+                f"a multiple of 4 (sines and cosines of rows and columns), not {self.decoder.width}"
+            )
             raise ConfigError(f"--model.decoder.width must be {width}")
         if self.image_size % self.patch:
-            raise ConfigError(f"image_size {self.image_size} must be a multiple of patch {self.patch}")
+            raise ConfigError(
+                f"image_size {self.image_size} must be a multiple of patch {self.patch}"
+            )
         if len(set(self.sensors)) != len(self.sensors):
             raise ConfigError(f"a sensor is named twice in {self.sensors}")
         if UNIVERSAL not in self.sensors:
@@ -137,10 +162,13 @@ class ModelConfig:
     def sensor_row(self, name: str) -> int:
         """Return the row of a sensor. Raises ConfigError if the table does not have it."""
         if name in FIELD_SENSORS:
-            raise ConfigError(f"sensor {name!r} measures a force field and has no images. Leave it out of training.")
+            raise ConfigError(
+                f"sensor {name!r} measures a force field and has no images. Leave it out of training."
+            )
         check_spelling(name, self.sensors)
         if name not in self.sensors:
-            known, table = ", ".join(self.sensors), " ".join(self.sensors)
+            known = ", ".join(self.sensors)
+            table = " ".join(self.sensors)
             raise ConfigError(
                 f"unknown sensor {name!r}. Choose one of {known}, or add it by --model.sensors {name} {table}"
             )

@@ -34,7 +34,9 @@ Seed = Annotated[int, Range(0, 2**32 - 1, "0 to 4294967295")]
 Below1 = Annotated[float, Range(0, math.nextafter(1, 0), "0 or more and below 1")]
 _FLOAT32 = 3.4e38  # larger numbers are infinite in float32
 _LARGEST = 2**32  # of whole numbers: no setting needs more, and larger ones overflow somewhere
-_JSON_BYTES, _JSON_DEPTH, _JSON_DIGITS = 1 << 26, 64, 40
+_JSON_BYTES = 1 << 26
+_JSON_DEPTH = 64
+_JSON_DIGITS = 40
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -61,7 +63,11 @@ def parse_json(text: str | bytes) -> Any:
 
     try:
         text = text.decode("utf-8") if isinstance(text, bytes) else text
-        kinds: Any = {"parse_int": functools.partial(number, kind=int), "parse_float": number, "parse_constant": number}
+        kinds: Any = {
+            "parse_int": functools.partial(number, kind=int),
+            "parse_float": number,
+            "parse_constant": number,
+        }
         value = json.loads(text, object_pairs_hook=distinct, **kinds)
         if _depth(value) > _JSON_DEPTH:
             raise RecursionError
@@ -79,8 +85,12 @@ def parse_json(text: str | bytes) -> Any:
 
 def _depth(value: Any) -> int:
     """Return the levels of lists and objects in a JSON value."""
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
-    return 0 if inner is None else 1 + max(map(_depth, inner), default=0)
+    inner = (
+        value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    )
+    if inner is None:
+        return 0
+    return 1 + max(map(_depth, inner), default=0)
 
 
 def check(settings: Any, prefix: str = "") -> None:
@@ -91,7 +101,8 @@ def check(settings: Any, prefix: str = "") -> None:
     """
     kind: Any = type(settings)
     for name, (hint, has_choices, bounds) in _rules(kind).items():
-        value, where = getattr(settings, name), f"{prefix}{name.replace('_', '-')}" if prefix else name
+        value = getattr(settings, name)
+        where = f"{prefix}{name.replace('_', '-')}" if prefix else name
         if has_choices:
             read_value(hint, value, where)
         for low, high, words in bounds:
@@ -120,23 +131,42 @@ def _rules(kind: type) -> dict[str, tuple[Any, bool, list[Range]]]:
 
     full = typing.get_type_hints(kind, include_extras=True)
     marks = {name: getattr(hint, "__metadata__", ()) for name, hint in full.items()}
-    ranges = {name: [mark for mark in some if isinstance(mark, Range)] for name, some in marks.items()}
-    return {name: (hint, has_choices(hint), ranges[name]) for name, hint in typing.get_type_hints(kind).items()}
+    ranges = {
+        name: [mark for mark in some if isinstance(mark, Range)] for name, some in marks.items()
+    }
+    return {
+        name: (hint, has_choices(hint), ranges[name])
+        for name, hint in typing.get_type_hints(kind).items()
+    }
 
 
 def read_value(kind: Any, value: Any, where: str) -> Any:
     """Return `value` (from JSON) as an instance of the annotation `kind`. `where` is its name in errors."""
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    origin = typing.get_origin(kind)
+    args = typing.get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         if not isinstance(value, dict):
             raise ConfigError(f"{where} must be an object, not {value!r}")
         hints = typing.get_type_hints(kind)
         if unknown := sorted(set(value) - set(hints)):
-            raise ConfigError(f"{where} has no setting called {', '.join(unknown)}. Choose from {', '.join(hints)}.")
-        no_default = (f.default is f.default_factory is dataclasses.MISSING for f in dataclasses.fields(kind))
-        if missing := [name for name, needed in zip(hints, no_default, strict=True) if needed and name not in value]:
+            raise ConfigError(
+                f"{where} has no setting called {', '.join(unknown)}. Choose from {', '.join(hints)}."
+            )
+        no_default = (
+            f.default is f.default_factory is dataclasses.MISSING for f in dataclasses.fields(kind)
+        )
+        if missing := [
+            name
+            for name, needed in zip(hints, no_default, strict=True)
+            if needed and name not in value
+        ]:
             raise ConfigError(f"{where} has no {', '.join(missing)}")
-        return kind(**{name: read_value(hints[name], item, f"{where}.{name}") for name, item in value.items()})
+        return kind(
+            **{
+                name: read_value(hints[name], item, f"{where}.{name}")
+                for name, item in value.items()
+            }
+        )
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in args:
             return None
@@ -152,7 +182,10 @@ def read_value(kind: Any, value: Any, where: str) -> Any:
         kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
         if len(kinds) != len(value):
             raise ConfigError(f"{where} must have {len(kinds)} entries, not {len(value)}")
-        return tuple(read_value(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+        return tuple(
+            read_value(k, v, f"{where}[{i}]")
+            for i, (k, v) in enumerate(zip(kinds, value, strict=True))
+        )
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):

@@ -21,7 +21,11 @@ _PRESETS = {
 
 
 def preset(
-    name: PresetName | str, *, stage: Literal[1, 2] = 1, recipe: Recipe = "paper", towers: Towers = "scratch"
+    name: PresetName | str,
+    *,
+    stage: Literal[1, 2] = 1,
+    recipe: Recipe = "paper",
+    towers: Towers = "scratch",
 ) -> Config:
     """Return the configuration called `name` (tiny, small, base, large) for a stage and a recipe.
 
@@ -32,18 +36,25 @@ def preset(
     """
     if name not in _PRESETS:
         raise ConfigError(f"unknown preset {name!r}. Choose one of {', '.join(_PRESETS)}")
-    read_value(Towers, towers, "towers")  # stage 1 has no towers, but a wrong choice is an error there too
+    # stage 1 has no towers, but a wrong choice is an error there too
+    read_value(Towers, towers, "towers")
     pixels, patch, embed, *sizes, batch = _PRESETS[name]
     touch, decoder, text = (Stack(width, depth, heads, 4 * width) for width, depth, heads in sizes)
     model = ModelConfig(pixels, patch, embed, touch, decoder)
     config = Config(model, stage, recipe, preset=name, data=DataConfig(batch_size=batch))
     if stage == 2:
         if towers == "none":
-            raise ConfigError("stage 2 needs towers. Choose --towers scratch or --towers pretrained.")
-        model = replace(model, image=touch, text=TextTower(text), lora_rank=16 if towers == "pretrained" else 0)
+            raise ConfigError(
+                "stage 2 needs towers. Choose --towers scratch or --towers pretrained."
+            )
+        model = replace(
+            model, image=touch, text=TextTower(text), lora_rank=16 if towers == "pretrained" else 0
+        )
         model = replace(model, match_head="linear" if recipe == "release" else "mlp")
         config = replace(config, model=model, towers=towers)
-        config = config.with_settings({"objective.center_embeddings": towers == "scratch" and recipe == "paper"})
+        config = config.with_settings(
+            {"objective.center_embeddings": towers == "scratch" and recipe == "paper"}
+        )
     if recipe == "release":
         config = config.with_settings({"optim.decay": "cosine", "data.order": "random"})
     return config
@@ -73,11 +84,15 @@ def apply_baseline(name: str, config: Config) -> Config:
     """Return `config` changed to a baseline. Raises UserError if it is unknown, or does not train the stage."""
     baseline = find_baseline(name)
     if not baseline.stages:
-        raise UserError(f"baseline {name} is not trained. Evaluate the image tower of a stage-2 run, or that of CLIP.")
+        raise UserError(
+            f"baseline {name} is not trained. Evaluate the image tower of a stage-2 run, or that of CLIP."
+        )
     if config.stage not in baseline.stages:
         only = f"only stage {baseline.stages[0]} ({baseline.about})"
         raise UserError(f"baseline {name} has no stage {config.stage}, {only}")
-    return config.with_settings(baseline.changes if config.stage == 2 or baseline.changes_stage1 else {})
+    return config.with_settings(
+        baseline.changes if config.stage == 2 or baseline.changes_stage1 else {}
+    )
 
 
 def find_baseline(name: str) -> Baseline:
@@ -93,39 +108,70 @@ _STILLS: dict[str, Any] = {"data.clip_share": 0.0}
 _NO_CLIPS = _STILLS | {"objective.next_frame": False}
 _ALL = (
     Baseline("anytouch", "the paper's model, both stages"),
-    Baseline("no_pretraining", "the image tower as touch encoder, no tactile training (the paper's row CLIP)", ()),
     Baseline(
-        "unitouch", "UniTouch: touch-vision InfoNCE on stills with a photograph, tokens of each sensor alone", (2,),
-        {"model.text": None, "model.match_head": "none", "data.require": ("image",)} | _SENSOR_TOKENS | _STILLS,
+        "no_pretraining",
+        "the image tower as touch encoder, no tactile training (the paper's row CLIP)",
+        (),
     ),
     Baseline(
-        "tlv_link", "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor tokens, no "
-        "matching", (2,), {"model.match_head": "none", "model.sensor_tokens": 0, "data.require": ("image", "text"),
-                           **_SENSOR_TOKENS, **_STILLS},
+        "unitouch",
+        "UniTouch: touch-vision InfoNCE on stills with a photograph, tokens of each sensor alone",
+        (2,),
+        {"model.text": None, "model.match_head": "none", "data.require": ("image",)}
+        | _SENSOR_TOKENS
+        | _STILLS,
     ),
     Baseline(
-        "t3", "T3: one patch encoder a sensor, a shared trunk, masked autoencoding of stills", (1,),
+        "tlv_link",
+        "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor tokens, no "
+        "matching",
+        (2,),
+        {
+            "model.match_head": "none",
+            "model.sensor_tokens": 0,
+            "data.require": ("image", "text"),
+            **_SENSOR_TOKENS,
+            **_STILLS,
+        },
+    ),
+    Baseline(
+        "t3",
+        "T3: one patch encoder a sensor, a shared trunk, masked autoencoding of stills",
+        (1,),
         {"model.patch_encoder": "sensor", "model.sensor_tokens": 0} | _SENSOR_TOKENS | _NO_CLIPS,
     ),
     # The paper has one model for both names: "trained solely on tactile images" in Table 4, "w/o Dynamic Perception" in
     # Table 6.
     Baseline("static_only", "AnyTouch without clips in both stages (Table 4)", changes=_NO_CLIPS),
-    Baseline("no_dynamic", "without dynamic perception: the same model as static_only (Table 6)", changes=_NO_CLIPS),
+    Baseline(
+        "no_dynamic",
+        "without dynamic perception: the same model as static_only (Table 6)",
+        changes=_NO_CLIPS,
+    ),
     # Stage 1 has no towers and no matching head.
     Baseline(
-        "no_text", "without text: no text tower, no touch-text and vision-text pairs", changes={"model.text": None}
+        "no_text",
+        "without text: no text tower, no touch-text and vision-text pairs",
+        changes={"model.text": None},
     ),
     Baseline(
-        "no_vision", "without vision: no image tower, no touch-vision and vision-text pairs",
+        "no_vision",
+        "without vision: no image tower, no touch-vision and vision-text pairs",
         changes={"model.image": None, "model.lora_rank": 0},
     ),
     Baseline(
-        "no_text_aligned", "no text for touches that other sensors or units recorded too",
-        changes={"data.aligned_text": False}, changes_stage1=False,
+        "no_text_aligned",
+        "no text for touches that other sensors or units recorded too",
+        changes={"data.aligned_text": False},
+        changes_stage1=False,
     ),
     Baseline("no_stage1", "stage 2 alone, from the same first weights as stage 1", (2,)),
     Baseline("no_stage2", "stage 1 alone", (1,)),
     Baseline("no_matching", "without cross-sensor matching", changes={"model.match_head": "none"}),
-    Baseline("no_universal", "without universal tokens: each sensor its own, always", changes=_SENSOR_TOKENS),
-)  # fmt: skip
+    Baseline(
+        "no_universal",
+        "without universal tokens: each sensor its own, always",
+        changes=_SENSOR_TOKENS,
+    ),
+)
 BASELINES: dict[str, Baseline] = {baseline.name: baseline for baseline in _ALL}

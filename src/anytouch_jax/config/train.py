@@ -13,17 +13,29 @@ from typing import Annotated, Any, Literal
 
 from anytouch_jax.config import parsing
 from anytouch_jax.config.model import ModelConfig
-from anytouch_jax.config.parsing import Above0, Below1, Count, NotNegative, Range, Seed, Share, check
+from anytouch_jax.config.parsing import (
+    Above0,
+    Below1,
+    Count,
+    NotNegative,
+    Range,
+    Seed,
+    Share,
+    check,
+)
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.shown import shown_short
 
 Recipe = Literal["paper", "release"]
 Towers = Literal["none", "scratch", "pretrained"]
 PresetName = Literal["tiny", "small", "base", "large"]
-RELEASE_WEIGHTS = (("touch_and_go", 2.0), ("octopi", 3.0))  # how often the release draws these in an epoch
+# how often the release draws these in an epoch
+RELEASE_WEIGHTS = (("touch_and_go", 2.0), ("octopi", 3.0))
 # Mean and standard deviation of RGB in 0..1: touch images (ImageNet) and photographs (CLIP), as in the release.
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
 @shown_short
@@ -37,14 +49,20 @@ class LossConfig:
     alpha_tv: NotNegative[float] = 1.0  # Weight of touch and vision (Eq. 4).
     alpha_tl: NotNegative[float] = 1.0  # Weight of touch and text (Eq. 4).
     alpha_vl: NotNegative[float] = 0.2  # Weight of vision and text (Eq. 4).
-    match_weight: NotNegative[float] = 0.1  # Weight of cross-sensor matching relative to alignment (lambda, Eq. 9).
+    # Weight of cross-sensor matching relative to alignment (lambda, Eq. 9).
+    match_weight: NotNegative[float] = 0.1
     match_keep: Annotated[float, Range(math.ulp(0.0), 1, "above 0, and 1 at most")] = 1.0
     """Share of the patches that matching encodes. Not in the paper (after FLIP)."""
-    field_weight: NotNegative[float] = 0.1  # Weight of depth, shear and force (--model.fields). Not in the paper.
-    groups: Count[int] = 1  # Parts of the batch within which negatives stay. 1 uses the whole batch.
-    center_embeddings: bool = False  # Subtract the batch mean from embeddings, against collapse of untrained towers.
-    universal_start: Share = 0.0  # Probability of the universal tokens at the first step (p_u, Sec. 3.5).
-    universal_end: Share = 0.75  # Probability of the universal tokens at the last step, reached linearly.
+    # Weight of depth, shear and force (--model.fields). Not in the paper.
+    field_weight: NotNegative[float] = 0.1
+    # Parts of the batch within which negatives stay. 1 uses the whole batch.
+    groups: Count[int] = 1
+    # Subtract the batch mean from embeddings, against collapse of untrained towers.
+    center_embeddings: bool = False
+    # Probability of the universal tokens at the first step (p_u, Sec. 3.5).
+    universal_start: Share = 0.0
+    # Probability of the universal tokens at the last step, reached linearly.
+    universal_end: Share = 0.75
 
     def __post_init__(self) -> None:
         check(self, "--objective.")
@@ -62,13 +80,16 @@ class OptimConfig:
 
     learning_rate: NotNegative[float] = 2e-4  # Highest learning rate, reached after the warm-up.
     min_rate: NotNegative[float] = 0.0  # Learning rate at the end.
-    warmup: NotNegative[int | None] = None  # Warm-up steps. None: one epoch, or a share of the run if that is shorter.
+    # Warm-up steps. None: one epoch, or a share of the run if that is shorter.
+    warmup: NotNegative[int | None] = None
     decay: Literal["linear", "cosine"] = "linear"  # Form of the decay after the warm-up.
     beta1: Below1 = 0.9  # AdamW's decay of the first moment.
     beta2: Below1 = 0.99  # AdamW's decay of the second moment.
-    eps: Annotated[float, Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")] = 1e-8  # AdamW's epsilon.
+    # AdamW's epsilon.
+    eps: Annotated[float, Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")] = 1e-8
     weight_decay: NotNegative[float] = 0.1  # Weight decay of matrices. Vectors have none.
-    layer_decay: Share = 1.0  # Learning-rate decay from a block of the touch encoder to the one before. 1: off.
+    # Learning-rate decay from a block of the touch encoder to the one before. 1: off.
+    layer_decay: Share = 1.0
     grad_clip: Above0[float | None] = None  # Largest norm of the gradient. None: no limit.
     accumulate: Count[int] = 1  # Batches whose gradients make one update.
 
@@ -85,15 +106,19 @@ class DataConfig:
     split: str = "train"  # Split to train on.
     batch_size: Count[int] = 64  # Samples of a step (--batch).
     clip_share: Share = 0.5  # Share of clips. The rest are stills.
-    order: Literal["alternate", "random"] = "alternate"  # Batches of stills and clips: in turn, or mixed (release).
+    # Batches of stills and clips: in turn, or mixed (release).
+    order: Literal["alternate", "random"] = "alternate"
     weights: NotNegative[tuple[tuple[str, float], ...] | None] = None
     """Dataset and how often an epoch draws it. 0: never."""
-    negatives: Literal["any", "same_sensor"] = "any"  # Sensors of the negatives of matching: any, or the positive's.
+    # Sensors of the negatives of matching: any, or the positive's.
+    negatives: Literal["any", "same_sensor"] = "any"
     parts: NotNegative[int] = 0
     """Cut large data into this many parts of whole shards. A slot of a batch draws from its own part, so that a host
     reads its parts alone. 0: any row with any other. Stage 1 only."""
-    require: tuple[Literal["image", "text"], ...] = ()  # Draw only rows that have these modalities.
-    contact_only: bool = False  # Leave out rows that label.contact marks as free. Unmarked rows stay.
+    # Draw only rows that have these modalities.
+    require: tuple[Literal["image", "text"], ...] = ()
+    # Leave out rows that label.contact marks as free. Unmarked rows stay.
+    contact_only: bool = False
     aligned_text: bool = True  # Use the text of touches that other sensors or units recorded too.
     # Subtract the untouched gel (docs/sensor.md), or for half of the samples, at random. Not in the paper.
     background: Literal["keep", "subtract", "either"] = "keep"
@@ -103,11 +128,13 @@ class DataConfig:
     jitter: NotNegative[tuple[float, float, float, float]] = (0.4, 0.4, 0.5, 0.3)
     """Brightness, contrast, saturation, hue."""
     rotation: NotNegative[float] = 20.0  # Largest rotation of photographs, degrees.
-    tokenizer: str | None = None  # Tokenizer file. None: the run's, else CLIP's, else trained on the captions.
+    # Tokenizer file. None: the run's, else CLIP's, else trained on the captions.
+    tokenizer: str | None = None
     threads: NotNegative[int] = 2  # Threads that read and augment.
     prefetch: NotNegative[int] = 4  # Batches prepared ahead.
     cache: NotNegative[int] = 512  # Memory for frames, MB.
-    on_bad_sample: Literal["error", "skip"] = "error"  # Stop at a file that cannot be read, or replace and count it.
+    # Stop at a file that cannot be read, or replace and count it.
+    on_bad_sample: Literal["error", "skip"] = "error"
 
     def __post_init__(self) -> None:
         check(self, "--data.")
@@ -121,15 +148,24 @@ class SimulatedConfig:
     objects: Count[int] = 480  # Objects of the catalogue, before a part of them is held out.
     variants: Count[int] = 1  # Objects of each kind, with other sizes and phases.
     seed: NotNegative[int] = 41  # Seed of the objects and of the kinds that are held out.
-    sensors: tuple[str, ...] = ("gelsight_mini", "digit", "gelsight", "gelslim", "duragel", "9dtact")
+    sensors: tuple[str, ...] = (
+        "gelsight_mini",
+        "digit",
+        "gelsight",
+        "gelslim",
+        "duragel",
+        "9dtact",
+    )
     """Sensors that are simulated: names, or folders NAME.sensor of `anytouch sensor fit`."""
     coarse: Share = 0.4  # Share of touches at which each sensor touches as by hand.
-    wild: Share = 0.0  # Share of touches by sensors that mix two others, for the universal tokens.
+    # Share of touches by sensors that mix two others, for the universal tokens.
+    wild: Share = 0.0
     depth: NotNegative[tuple[float, float]] = (0.15, 1.0)  # Range of the deepest press, mm.
     vision: Share = 0.4  # Share of touches with a photograph.
     text: Share = 0.7  # Share of touches with a caption.
     places: Count[int] = 4  # Photographed places of each object.
-    reuse: Count[int] = 1  # Steps that draw from the same simulated touches, with new masks and augmentations.
+    # Steps that draw from the same simulated touches, with new masks and augmentations.
+    reuse: Count[int] = 1
 
     def __post_init__(self) -> None:
         check(self, "--simulated.")
@@ -144,7 +180,8 @@ class RunConfig:
     save_every: NotNegative[int] = 200  # Steps between checkpoints. 0 saves the last one only.
     keep: Count[int] = 3  # Latest checkpoints to keep, besides the best one.
     figure_every: NotNegative[int] = 200  # Steps between pictures. 0: none.
-    max_skipped: NotNegative[int] = 20  # Steps in a row that may be skipped for a loss or gradient that is not finite.
+    # Steps in a row that may be skipped for a loss or gradient that is not finite.
+    max_skipped: NotNegative[int] = 20
     tensorboard: bool = False  # Write TensorBoard events too.
     fsdp: Count[int] = 1  # Devices that share parameters and optimiser moments.
 
@@ -176,7 +213,9 @@ class Config:
         config = self
         for place, value in settings.items():
             section, name = place.split(".")
-            config = replace(config, **{section: replace(getattr(config, section), **{name: value})})
+            config = replace(
+                config, **{section: replace(getattr(config, section), **{name: value})}
+            )
         return config
 
     @property
@@ -208,7 +247,10 @@ class Config:
         """Rules (regex over parameter names, frozen?). The first match decides."""
         rules: list[tuple[str, bool]] = [(r"decoder/position$", True)]
         if self.towers == "pretrained":
-            rules += [(r"text/", True), (r"image/blocks/" if self.recipe == "release" else r"image/", True)]
+            rules += [
+                (r"text/", True),
+                (r"image/blocks/" if self.recipe == "release" else r"image/", True),
+            ]
         return (*rules, (r"", False))
 
     @property
@@ -222,11 +264,16 @@ _RENAMED = {("objective", "centre"): "center_embeddings", ("optim", "clip_norm")
 _RECIPE = "what the recipe implies"
 _RETIRED: dict[str, dict[str, Any]] = {
     "model": {"force_head": False},
-    "objective": {"differences": 0.0, "force": 0.0, "touch_text_sum": _RECIPE, "reconstruct": _RECIPE,
-                  "universal_shared": _RECIPE},
+    "objective": {
+        "differences": 0.0,
+        "force": 0.0,
+        "touch_text_sum": _RECIPE,
+        "reconstruct": _RECIPE,
+        "universal_shared": _RECIPE,
+    },
     "optim": {"ema": None},
     "data": {"split_steps": _RECIPE},
-}  # fmt: skip
+}
 
 
 def to_json(config: Any) -> str:
@@ -245,15 +292,22 @@ def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> A
     except ConfigError as error:
         raise ConfigError(f"the configuration {error}") from None
     whole = data if cls is Config else {"model": data}
-    sections = {name: part for name, part in whole.items() if isinstance(part, dict)} if isinstance(whole, dict) else {}
+    sections = (
+        {name: part for name, part in whole.items() if isinstance(part, dict)}
+        if isinstance(whole, dict)
+        else {}
+    )
     for (section, name), new_name in _RENAMED.items():
         if name in sections.get(section, ()):
             sections[section][new_name] = sections[section].pop(name)
     for section, settings in _RETIRED.items():
         for name in settings.keys() & sections.get(section, ()):
-            value, inert = sections[section].pop(name), settings[name]
+            value = sections[section].pop(name)
+            inert = settings[name]
             if inert == _RECIPE:
-                inert = whole.get("recipe") == "release" and (whole.get("stage") == 2 or name == "touch_text_sum")
+                inert = whole.get("recipe") == "release" and (
+                    whole.get("stage") == 2 or name == "touch_text_sum"
+                )
             if not allow_retired and value != inert:
                 raise ConfigError(
                     f"the run sets {section}.{name} to {value!r}, which this version no longer has. "

@@ -17,10 +17,16 @@ import cv2
 from anytouch_jax.data.images import QUIET, open_video
 from anytouch_jax.errors import UserError
 
-SYSTEM, DEVICES = Path("/sys/class/video4linux"), Path("/dev")
+SYSTEM = Path("/sys/class/video4linux")
+DEVICES = Path("/dev")
 ADDRESSES = ("http://", "https://", "rtsp://", "rtmp://", "udp://", "tcp://")
-_FORMATS, _SIZES, _INTERVALS = 0xC0405602, 0xC02C564A, 0xC034564B  # VIDIOC_ENUM_FMT, _FRAMESIZES, _FRAMEINTERVALS
-_CAPTURE, _DISCRETE = 1, 1  # a buffer of pictures; a size or interval that is one of a list
+# VIDIOC_ENUM_FMT, _FRAMESIZES, _FRAMEINTERVALS
+_FORMATS = 0xC0405602
+_SIZES = 0xC02C564A
+_INTERVALS = 0xC034564B
+# a buffer of pictures; a size or interval that is one of a list
+_CAPTURE = 1
+_DISCRETE = 1
 _PATIENCE = 10_000  # milliseconds to wait for an address
 
 
@@ -58,7 +64,11 @@ class Camera(NamedTuple):
         for form in dict.fromkeys(mode.format for mode in self.modes):
             sizes = (
                 f"{mode.width} x {mode.height}"
-                + (f" at {', '.join(f'{rate:g}' for rate in mode.rates)} frames/s" if mode.rates else "")
+                + (
+                    f" at {', '.join(f'{rate:g}' for rate in mode.rates)} frames/s"
+                    if mode.rates
+                    else ""
+                )
                 for mode in self.modes
                 if mode.format == form
             )
@@ -70,9 +80,11 @@ def list_cameras() -> list[Camera]:
     """Return the cameras that are connected. A device that only gives metadata is left out."""
     found = []
     for place in SYSTEM.glob("video*"):
-        modes, digits = tuple(_modes(DEVICES / place.name)), place.name.removeprefix("video")
+        modes = tuple(_modes(DEVICES / place.name))
+        digits = place.name.removeprefix("video")
         if digits.isdecimal() and (modes or _text(place / "index") in ("", "0")):
-            device = (place / "device").resolve()  # of USB an interface, in the folder of its device
+            # of USB an interface, in the folder of its device
+            device = (place / "device").resolve()
             serial = _text(device / "serial") or _text(device.parent / "serial")
             found.append(Camera(int(digits), _text(place / "name") or place.name, serial, modes))
     return sorted(found)
@@ -84,7 +96,8 @@ def camera_of(source: str | Path) -> int | str | None:
     `source` is a file, a number, /dev/videoN or a link to it, an address (ADDRESSES), the serial number of a camera, or
     a part of its name. A file comes first. Raises UserError for a name that several cameras have.
     """
-    text, path = str(source), Path(source)
+    text = str(source)
+    path = Path(source)
     if text.lower().startswith(ADDRESSES):
         return text
     if path.is_char_device():
@@ -94,11 +107,19 @@ def camera_of(source: str | Path) -> int | str | None:
     if number := re.fullmatch(r"(?:/dev/video)?(\d{1,6})", str(path)):
         return int(number[1])
     word = text.strip().lower()
-    cameras = [one for one in list_cameras() if word and (word in one.name.lower() or word == one.serial.lower())]
+    cameras = [
+        one
+        for one in list_cameras()
+        if word and (word in one.name.lower() or word == one.serial.lower())
+    ]
     if len(cameras) > 1:
         listed = ", ".join(map(str, cameras))
-        raise UserError(f"{text} is the name of {len(cameras)} cameras, {listed}: give a number or a serial")
-    return cameras[0].number if cameras else None
+        raise UserError(
+            f"{text} is the name of {len(cameras)} cameras, {listed}: give a number or a serial"
+        )
+    if cameras:
+        return cameras[0].number
+    return None
 
 
 def open_source(
@@ -107,13 +128,20 @@ def open_source(
     """Return a cv2.VideoCapture of a camera or film, and whether it is a camera (`asked` for settings)."""
     camera = camera_of(name)
     if camera is None and Path(name).is_dir():
-        raise UserError(f"{name} is a folder, not a video or a camera. `anytouch embed` takes folders.")
+        raise UserError(
+            f"{name} is a folder, not a video or a camera. `anytouch embed` takes folders."
+        )
     if camera is None and not Path(name).is_file():
         raise UserError(f"there is no video and no camera {name}; {_connected()}")
     source: Any
     with QUIET:
         if isinstance(camera, str):
-            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _PATIENCE, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _PATIENCE]
+            limits = [
+                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+                _PATIENCE,
+                cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+                _PATIENCE,
+            ]
             source = cv2.VideoCapture(camera, cv2.CAP_FFMPEG, limits)
         else:
             source = open_video(name) if camera is None else cv2.VideoCapture(camera)
@@ -121,7 +149,9 @@ def open_source(
         if camera is None:
             raise UserError(f"{name} is not a video that can be read; convert it first")
         if isinstance(camera, str):
-            raise UserError(f"{name} cannot be opened; check the address, and that its server is on")
+            raise UserError(
+                f"{name} cannot be opened; check the address, and that its server is on"
+            )
         device = DEVICES / f"video{camera}"
         advice = _connected()
         if device.exists() and not os.access(device, os.R_OK | os.W_OK):
@@ -130,7 +160,8 @@ def open_source(
     if camera is None or (isinstance(camera, str) and source.get(cv2.CAP_PROP_FRAME_COUNT) > 0):
         return source, False
     if isinstance(camera, int):
-        source.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the driver's own queue would hold old frames
+        # the driver's own queue would hold old frames
+        source.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         _ask(source, asked or CameraSettings())
     if log is not None:
         log(f"camera {name}: {_given(source, camera, asked or CameraSettings())}")
@@ -141,12 +172,19 @@ def format_of(source: Any) -> str:
     """Return the four letters of a source's format, "" if it does not have them."""
     code = source.get(cv2.CAP_PROP_FOURCC)
     letters = int(code).to_bytes(4, "little").decode("latin1").strip() if 0 < code < 2**32 else ""
-    return letters if letters.isascii() and letters.isprintable() else ""
+    if letters.isascii() and letters.isprintable():
+        return letters
+    return ""
 
 
 def _ask(source: Any, asked: CameraSettings) -> None:
     code = None if asked.format is None else cv2.VideoWriter.fourcc(*asked.format.upper())
-    names = (cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+    names = (
+        cv2.CAP_PROP_FOURCC,
+        cv2.CAP_PROP_FRAME_WIDTH,
+        cv2.CAP_PROP_FRAME_HEIGHT,
+        cv2.CAP_PROP_FPS,
+    )
     for name, value in zip(names, (code, *(asked.size or (None, None)), asked.fps), strict=True):
         if value is not None:  # the format first: it decides which sizes and rates there are
             source.set(name, value)
@@ -155,21 +193,40 @@ def _ask(source: Any, asked: CameraSettings) -> None:
 def _given(source: Any, camera: int | str, asked: CameraSettings) -> str:
     """Return what a camera gives, where that is not what it was asked for, and a format that is faster."""
     size = int(source.get(cv2.CAP_PROP_FRAME_WIDTH)), int(source.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    rate, form = source.get(cv2.CAP_PROP_FPS), format_of(source)
-    words = f"{size[0]} x {size[1]} pixels" + (f", {rate:g} frames/s" if rate > 0 else "") + (f", {form}" * bool(form))
-    missed = [f"{asked.size[0]} x {asked.size[1]} pixels"] if asked.size and asked.size != size else []
-    missed += [f"{asked.fps:g} frames/s"] if asked.fps is not None and abs(asked.fps - rate) > 0.5 else []
-    missed += [asked.format.upper()] if asked.format is not None and asked.format.upper() != form else []
+    rate = source.get(cv2.CAP_PROP_FPS)
+    form = format_of(source)
+    words = (
+        f"{size[0]} x {size[1]} pixels"
+        + (f", {rate:g} frames/s" if rate > 0 else "")
+        + (f", {form}" * bool(form))
+    )
+    missed = (
+        [f"{asked.size[0]} x {asked.size[1]} pixels"] if asked.size and asked.size != size else []
+    )
+    missed += (
+        [f"{asked.fps:g} frames/s"] if asked.fps is not None and abs(asked.fps - rate) > 0.5 else []
+    )
+    missed += (
+        [asked.format.upper()] if asked.format is not None and asked.format.upper() != form else []
+    )
     words += f", not {' and '.join(missed)} as asked for" if missed else ""
     modes = _modes(DEVICES / f"video{camera}") if isinstance(camera, int) else ()
-    others = [(max(mode.rates), mode.format) for mode in modes if mode.rates and size == (mode.width, mode.height)]
+    others = [
+        (max(mode.rates), mode.format)
+        for mode in modes
+        if mode.rates and size == (mode.width, mode.height)
+    ]
     fastest, best = max(others, default=(0.0, ""))
-    return words + (f". With format {best} it gives {fastest:g}" if best != form and fastest > rate + 1 else "")
+    return words + (
+        f". With format {best} it gives {fastest:g}" if best != form and fastest > rate + 1 else ""
+    )
 
 
 def _connected() -> str:
     cameras = list_cameras()
-    return f"connected are {', '.join(map(str, cameras))}" if cameras else "no camera is connected"
+    if cameras:
+        return f"connected are {', '.join(map(str, cameras))}"
+    return "no camera is connected"
 
 
 def _text(file: Path) -> str:
@@ -190,9 +247,11 @@ def _modes(device: Path) -> Iterator[Mode]:
         for form in _answers(handle, _FORMATS, _CAPTURE):
             letters = form[11].to_bytes(4, "little").decode("latin1").strip()
             for size in _answers(handle, _SIZES, form[11]):
-                width, height = size[3:5] if size[2] == _DISCRETE else (size[4], size[7])  # the largest of a range
+                # the largest of a range
+                width, height = size[3:5] if size[2] == _DISCRETE else (size[4], size[7])
                 intervals = _answers(handle, _INTERVALS, form[11], width, height)
-                rates = {round(one[6] / one[5], 2) for one in intervals if one[5]}  # of a range the fastest
+                # of a range the fastest
+                rates = {round(one[6] / one[5], 2) for one in intervals if one[5]}
                 yield Mode(letters, width, height, tuple(sorted(rates, reverse=True)))
     finally:
         os.close(handle)
@@ -204,7 +263,9 @@ def _answers(handle: int, code: int, *question: int) -> Iterator[tuple[int, ...]
 
     count = (code >> 16 & 0x3FFF) // 4
     for number in range(256):
-        words = bytearray(struct.pack("=64I", number, *question, *[0] * (63 - len(question)))[: 4 * count])
+        words = bytearray(
+            struct.pack("=64I", number, *question, *[0] * (63 - len(question)))[: 4 * count]
+        )
         try:
             fcntl.ioctl(handle, code, words)
         except OSError:

@@ -40,7 +40,8 @@ FRAMES = 100  # frames of a median: 10 of them to all of them score alike
 FEWEST = 5  # frames of a median, of as many sequences: fewer show the press itself
 SIDE = 320  # pixels of the long side of a median
 SETTLED = 512  # frames, a power of two, after which a running estimate stays
-TINT = 8.0  # grey levels: frames of one unit differ by less in most places, units of one product by more
+# grey levels: frames of one unit differ by less in most places, units of one product by more
+TINT = 8.0
 STORED = 32  # units whose pictures a file stores
 ADVICE = f"Record {FEWEST} frames or more of the sensor, or name a picture of its gel in the column background_path."
 
@@ -49,13 +50,16 @@ class Spread:
     """`make` of at most FRAMES evenly spaced items of a sequence of unknown length."""
 
     def __init__(self, make: Callable[[Any], Array]) -> None:
-        self.items, self.count = list[Array](), 0
-        self._make, self._step = make, 1
+        self.items = list[Array]()
+        self.count = 0
+        self._make = make
+        self._step = 1
 
     def add(self, item: Any) -> None:
         """Count one item more, and keep it if its turn has come."""
         if self.count % self._step == 0 and len(self.items) == FRAMES:
-            self.items, self._step = self.items[::2], 2 * self._step
+            self.items = self.items[::2]
+            self._step = 2 * self._step
         if self.count % self._step == 0:
             self.items.append(self._make(item))
         self.count += 1
@@ -71,7 +75,9 @@ def untouched_gel(frames: Iterable[npt.ArrayLike]) -> Array:
     for frame in frames:
         spread.add(frame)
     if spread.count < FEWEST:
-        raise UserError(f"{spread.count} frames are too few for a picture of the untouched gel. Give {FEWEST} or more.")
+        raise UserError(
+            f"{spread.count} frames are too few for a picture of the untouched gel. Give {FEWEST} or more."
+        )
     if len(shapes := {frame.shape for frame in spread.items}) > 1:
         raise UserError(f"the frames have {len(shapes)} sizes. Give frames of one camera.")
     return median(spread.items)
@@ -94,7 +100,9 @@ def estimate(frames: Sequence[Array]) -> Array:
 
 def reduced(frame: Array) -> Array:
     """Return a copy of a frame, whose long side has at most SIDE pixels."""
-    return frame.copy() if max(frame.shape[:2]) <= SIDE else scale_picture(frame, SIDE)
+    if max(frame.shape[:2]) <= SIDE:
+        return frame.copy()
+    return scale_picture(frame, SIDE)
 
 
 def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
@@ -103,7 +111,9 @@ def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
     for frame in frames:
         spread.add(frame)
     if not spread.items:
-        raise UserError("no frame can be read, so the untouched gel is unknown. Check the pictures.")
+        raise UserError(
+            "no frame can be read, so the untouched gel is unknown. Check the pictures."
+        )
     usual = alike(spread.items)
     return estimate(usual), len(usual)
 
@@ -123,7 +133,8 @@ class RunningGel:
 
     def __init__(self) -> None:
         self.picture: Array | None = None
-        self.settled, self._spread = False, Spread(reduced)
+        self.settled = False
+        self._spread = Spread(reduced)
         self._thread: threading.Thread | None = None
         self._found = list[Array]()
 
@@ -139,10 +150,19 @@ class RunningGel:
             return
         if self._thread is not None:
             self._thread.join()
-        frames, self.settled = alike(self._spread.items), count >= SETTLED
-        self.picture = self._found.pop() if self._found else frames[0] if self.picture is None else self.picture
+        frames = alike(self._spread.items)
+        self.settled = count >= SETTLED
+        self.picture = (
+            self._found.pop()
+            if self._found
+            else frames[0]
+            if self.picture is None
+            else self.picture
+        )
         if not self.settled:
-            self._thread = threading.Thread(target=lambda: self._found.append(estimate(frames)), daemon=True)
+            self._thread = threading.Thread(
+                target=lambda: self._found.append(estimate(frames)), daemon=True
+            )
             self._thread.start()
 
 
@@ -153,7 +173,10 @@ def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
 
 def same_unit(known: Mapping[str, Array], picture: Array) -> tuple[Array | None, str]:
     """Return the known picture that looks most like `picture`, None without any, and how another unit differs ("")."""
-    sizes = {name: gel.shape[1] / gel.shape[0] / (picture.shape[1] / picture.shape[0]) for name, gel in known.items()}
+    sizes = {
+        name: gel.shape[1] / gel.shape[0] / (picture.shape[1] / picture.shape[0])
+        for name, gel in known.items()
+    }
     fitting = {name: known[name] for name, ratio in sizes.items() if abs(ratio - 1) < 0.05}
     if not fitting:
         return None, "in size" if known else ""
@@ -162,9 +185,14 @@ def same_unit(known: Mapping[str, Array], picture: Array) -> tuple[Array | None,
         return cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
 
     own = small(picture)
-    tints = {name: np.median(np.abs(small(gel) - own), axis=(0, 1)).max() for name, gel in fitting.items()}
+    tints = {
+        name: np.median(np.abs(small(gel) - own), axis=(0, 1)).max()
+        for name, gel in fitting.items()
+    }
     name = min(tints, key=lambda one: float(tints[one]))
-    return fitting[name], "" if tints[name] <= TINT else f"in tint, by {tints[name]:.0f} grey levels"
+    return fitting[name], "" if tints[
+        name
+    ] <= TINT else f"in tint, by {tints[name]:.0f} grey levels"
 
 
 def other_unit(why: str) -> str:
@@ -192,15 +220,24 @@ class UnitGels:
     """
 
     def __init__(
-        self, manifest: Manifest, known: Mapping[str, Array] | None = None, log: Callable[[str], None] | None = None
+        self,
+        manifest: Manifest,
+        known: Mapping[str, Array] | None = None,
+        log: Callable[[str], None] | None = None,
     ) -> None:
-        self._manifest, self._known, self._log = manifest, known or {}, log
-        keys = np.stack([manifest.codes(name, own=True) for name in ("sensor", "dataset", "unit")], 1)
+        self._manifest = manifest
+        self._known = known or {}
+        self._log = log
+        keys = np.stack(
+            [manifest.codes(name, own=True) for name in ("sensor", "dataset", "unit")], 1
+        )
         _, self._first, self._unit = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         self._stored = manifest.present("background_path")
         self._split = manifest.text_column("split")
         self._has_image = ~np.isin(manifest.text_column("sensor"), FIELD_SENSORS)
-        self._units, self._sensors, self._lock = dict[int, _Unit](), dict[int, _Unit](), threading.Lock()
+        self._units = dict[int, _Unit]()
+        self._sensors = dict[int, _Unit]()
+        self._lock = threading.Lock()
 
     def __call__(self, row: int) -> Array | None:
         """Return the picture RGB u8 (h, w, 3) of a row's unit; None if that of the row counts, or there is none."""
@@ -214,7 +251,9 @@ class UnitGels:
         try:
             return decode(self._manifest.file(row, "background_path"))
         except UserError as error:
-            raise UserError(f"{self._manifest.where(row)}, column 'background_path': {error}") from None
+            raise UserError(
+                f"{self._manifest.where(row)}, column 'background_path': {error}"
+            ) from None
 
     def shared(self, make: Callable[[Array], T], most: int = 256) -> Callable[[int], T | None]:
         """Return a function from a row to `make` of its untouched gel (or None), made once for all rows of it."""
@@ -239,21 +278,24 @@ class UnitGels:
 
     def report(self, rows: Array) -> str:
         """Return a line on what is used for rows."""
-        count, units = Counter[str](), dict[str, dict[int, int]]()
+        count = Counter[str]()
+        units = dict[str, dict[int, int]]()
         for row in rows.tolist():
             one = self._of(row)
             count[one.source] += 1
             units.setdefault(one.source, {})[id(one)] = one.frames
         parts = []
         for source, some in count.items():
-            frames, of = sum(units[source].values()), len(units[source])
+            frames = sum(units[source].values())
+            of = len(units[source])
             about = f" of {frames:,} frames{f' of {of} units' * (of > 1)}" if frames else ""
             parts.append(f"{source}{about} for {some:,} rows")
         return f"untouched gel: {'; '.join(parts)}"
 
     def pictures(self, rows: Array) -> dict[str, Array]:
         """Return the pictures of the units of rows by name, those of the STORED units with most rows."""
-        rows, found = rows[self.has(rows)], {}
+        rows = rows[self.has(rows)]
+        found = {}
         units, first, counts = np.unique(self._unit[rows], return_index=True, return_counts=True)
         for place in np.argsort(-counts, kind="stable")[:STORED].tolist():
             picture = self.read(int(rows[first[place]]))
@@ -262,13 +304,18 @@ class UnitGels:
         return found
 
     def _name(self, unit: int) -> str:
-        cells = (self._manifest.value(int(self._first[unit]), name) for name in ("dataset", "sensor", "unit"))
+        cells = (
+            self._manifest.value(int(self._first[unit]), name)
+            for name in ("dataset", "sensor", "unit")
+        )
         return " ".join(str(cell) for cell in cells if cell)
 
     def digest(self) -> str:
         """Return what decides the pictures that are not stored ones, as text."""
         digest = 0
-        for row in np.unique(np.where(self._stored, -1, self._first[self._unit]))[1 if self._stored.any() else 0 :]:
+        for row in np.unique(np.where(self._stored, -1, self._first[self._unit]))[
+            1 if self._stored.any() else 0 :
+        ]:
             picture = self._find_once(int(self._unit[row])).picture
             digest = zlib.crc32(b"-" if picture is None else picture.tobytes(), digest)
         return f"{digest:08x}"
@@ -277,7 +324,9 @@ class UnitGels:
         if not self._stored[row]:
             return self._find_once(int(self._unit[row]))
         one = self._find_once(int(self._unit[row])) if self._known else _Unit()
-        return one if one.fitted else _Unit(None, "a stored picture")
+        if one.fitted:
+            return one
+        return _Unit(None, "a stored picture")
 
     def _find_once(self, unit: int) -> _Unit:
         with self._lock:
@@ -300,7 +349,9 @@ class UnitGels:
         if why and self._log is not None:
             self._log(other_unit(why))
             self._log = None  # once
-        return found if gel is None or why else _Unit(gel, "the picture that the head was fitted with", 0, True)
+        if gel is None or why:
+            return found
+        return _Unit(gel, "the picture that the head was fitted with", 0, True)
 
     def _median_of(self, unit: int, rows: Array) -> _Unit:
         """Return the median of rows of a unit, or that of its sensor if they are few and do not show another unit."""
@@ -308,39 +359,58 @@ class UnitGels:
         sensors = self._manifest.codes("sensor")
         sensor = int(sensors[self._first[unit]])
         everything = self._fitted(np.flatnonzero((sensors == sensor) & self._has_image))
-        few = own.picture is None or len(np.unique(self._manifest.codes("sequence", own=True)[rows])) < FEWEST
+        few = (
+            own.picture is None
+            or len(np.unique(self._manifest.codes("sequence", own=True)[rows])) < FEWEST
+        )
         if not few or len(everything) == len(rows):
             return own
         if sensor not in self._sensors:
             self._sensors[sensor] = self._median(everything, FEWEST, "the median of its sensor")
         shared = self._sensors[sensor]
         if own.picture is None or shared.picture is None:
-            return shared if own.picture is None else own
-        return own if same_unit({"": shared.picture}, own.picture)[1] else shared
+            if own.picture is None:
+                return shared
+            return own
+        if same_unit({"": shared.picture}, own.picture)[1]:
+            return own
+        return shared
 
     def _fitted(self, rows: Array) -> Array:
         """Return the rows of split train, or all but those of split background if these are too few."""
         train = rows[self._split[rows] == "train"]
-        return train if len(train) >= FEWEST else rows[self._split[rows] != "background"]
+        if len(train) >= FEWEST:
+            return train
+        return rows[self._split[rows] != "background"]
 
     def _median(self, rows: Array, fewest: int, source: str) -> _Unit:
         frames = []
-        for row in rows[np.unique(np.linspace(0, len(rows) - 1, FRAMES).astype(int))].tolist() if len(rows) else ():
-            with suppress(UserError):  # reading the row itself reports it
+        for row in (
+            rows[np.unique(np.linspace(0, len(rows) - 1, FRAMES).astype(int))].tolist()
+            if len(rows)
+            else ()
+        ):
+            # reading the row itself reports it
+            with suppress(UserError):
                 frames.append(reduced(decode(self._manifest.file(row))))
         usual = alike(frames)
-        return _Unit() if len(usual) < fewest else _Unit(median(usual), source, len(usual))
+        if len(usual) < fewest:
+            return _Unit()
+        return _Unit(median(usual), source, len(usual))
 
 
 def gel_arrays(pictures: Mapping[str, Array]) -> dict[str, Array]:
     """Return pictures by unit as arrays for an .npz file."""
     arrays = {f"gel/{number}": picture for number, picture in enumerate(pictures.values())}
-    return {"gels": np.array(list(pictures), str)} | arrays if pictures else {}
+    if pictures:
+        return {"gels": np.array(list(pictures), str)} | arrays
+    return {}
 
 
 def gels_of_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
     """Return the pictures among the arrays of an .npz file. Raises KeyError or ValueError for others."""
-    names, found = arrays.get("gels", np.zeros(0, str)), {}
+    names = arrays.get("gels", np.zeros(0, str))
+    found = {}
     check_array("gels", names, (len(names.reshape(-1)),), "U")
     for number, name in enumerate(names.tolist()):
         picture = arrays[f"gel/{number}"]

@@ -16,7 +16,14 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from PIL import BmpImagePlugin, ImageFile, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+from PIL import (
+    BmpImagePlugin,
+    ImageFile,
+    JpegImagePlugin,
+    PngImagePlugin,
+    TiffImagePlugin,
+    WebPImagePlugin,
+)
 
 from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.schema import is_manifest
@@ -30,32 +37,47 @@ MAX_PARTS = 1 << 12  # chunks or segments of a header, which Pillow reads one by
 MAX_PADDING = 1 << 16  # bytes between the segments of a JPEG, which Pillow reads one by one
 MAX_ASPECT = 100  # a longer strip would fill the memory when its short side is resized
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
-BACKGROUND, PHOTO = "background", "photo"  # names of images in a recording that are not frames
+# names of images in a recording that are not frames
+BACKGROUND = "background"
+PHOTO = "photo"
 
 # Since OpenCV 4.11. Orientation tags are obeyed by `_upright`, as versions of OpenCV do it for other formats.
 _JPEG_RGB: int = cv2.IMREAD_UNCHANGED
 if hasattr(cv2, "IMREAD_COLOR_RGB"):
     _JPEG_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-_PNG, _JPEG, _TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II*\0", b"MM\0*")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_TIFF = (b"II*\0", b"MM\0*")
 # Pillow's classes for the headers. Image.open adds a search over all formats, 40 of the 390 us that a JPEG takes.
 _HEADERS: dict[bytes, type[ImageFile.ImageFile]] = {
-    _PNG: PngImagePlugin.PngImageFile, _JPEG: JpegImagePlugin.JpegImageFile, b"BM": BmpImagePlugin.BmpImageFile,
+    _PNG: PngImagePlugin.PngImageFile,
+    _JPEG: JpegImagePlugin.JpegImageFile,
+    b"BM": BmpImagePlugin.BmpImageFile,
     b"RIFF": WebPImagePlugin.WebPImageFile,
-}  # fmt: skip
+}
 _ORIENTATION = 274  # a tag of EXIF and of a TIFF
-_WIDTH, _HEIGHT, _BITS, _ALPHA = 256, 257, 258, 338  # tags of a TIFF; _ALPHA is 2 for unassociated alpha
+# tags of a TIFF; _ALPHA is 2 for unassociated alpha
+_WIDTH = 256
+_HEIGHT = 257
+_BITS = 258
+_ALPHA = 338
 
 _MARKER = re.compile(rb"\xff([^\0\xff\xd0-\xd7])")  # of a JPEG, not inside its coded data
-_SCAN, _END = b"\xda", b"\xd9"
+_SCAN = b"\xda"
+_END = b"\xd9"
 _DECODED_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 
 cv2.setNumThreads(1)  # the loader has threads already
-if "OPENCV_LOG_LEVEL" not in os.environ:  # our errors say what is wrong; OpenCV's log would hide them
-    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)  # OpenCV 4, or 5
+if (
+    "OPENCV_LOG_LEVEL" not in os.environ
+):  # our errors say what is wrong; OpenCV's log would hide them
+    # OpenCV 4, or 5
+    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
 warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")
 
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # nothing; OpenCV reads it when a first video is opened
+# nothing; OpenCV reads it when a first video is opened
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 class _Quiet:
@@ -66,7 +88,10 @@ class _Quiet:
     """
 
     def __init__(self) -> None:
-        self._lock, self._inside, self._own, self._stream = threading.Lock(), 0, 0, None
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._own = 0
+        self._stream = None
         if "CS_GNU_LIBC_VERSION" in getattr(os, "confstr_names", ()):
             library = ctypes.CDLL(None)
             library.fopen.restype = ctypes.c_size_t
@@ -77,7 +102,8 @@ class _Quiet:
         if self._stream is not None:
             with self._lock:
                 if not self._inside:
-                    self._own, self._stream.value = self._stream.value, self._null
+                    self._own = self._stream.value
+                    self._stream.value = self._null
                 self._inside += 1
 
     def __exit__(self, *_: object) -> None:
@@ -102,7 +128,8 @@ def decode(path: str | Path) -> np.ndarray:
     JPEG, TIFF, BMP, WebP and .npy, and obeys orientation tags, as for a video. Raises ImageError for a missing, broken
     or too large file, and for pixels that are NaN or outside 0..1.
     """
-    path = path if isinstance(path, Path) else Path(path)  # copying a Path takes as long as reading the file
+    # copying a Path takes as long as reading the file
+    path = path if isinstance(path, Path) else Path(path)
     try:
         data = read_file(path)
     except FileNotFoundError:
@@ -118,7 +145,9 @@ def decode_bytes(data: bytes, name: str | Path, *, as_stored: bool = False) -> n
         pixels = _unpack(data)
     except (ValueError, EOFError, MemoryError) as error:
         raise ImageError(f"{name} cannot be read: {error}") from None
-    return pixels if as_stored else to_rgb(pixels, name)
+    if as_stored:
+        return pixels
+    return to_rgb(pixels, name)
 
 
 def encode(picture: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:
@@ -131,22 +160,29 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or 0 in pixels.shape:
-        raise ImageError(f"{path} has shape {pixels.shape}; an image is (height, width) with 1, 3 or 4 channels")
+        raise ImageError(
+            f"{path} has shape {pixels.shape}; an image is (height, width) with 1, 3 or 4 channels"
+        )
     height, width = pixels.shape[:2]
     if height * width > MAX_PIXELS:
-        raise ImageError(f"{path} has {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
+        raise ImageError(
+            f"{path} has {width} x {height} pixels, more than the limit of {MAX_PIXELS}"
+        )
     if max(height, width) > MAX_ASPECT * min(height, width):
         raise ImageError(f"{path} has {width} x {height} pixels: that is a strip, not a picture")
     pixels = pixels[..., :3].astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.uint16:
         pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     elif np.issubdtype(pixels.dtype, np.floating):
-        low, high = float(pixels.min()), float(pixels.max())
+        low = float(pixels.min())
+        high = float(pixels.max())
         if np.isnan(low):
             raise ImageError(f"{path} has NaN pixels")
         if low < 0 or high > 1:
             advice = "divide them by 255" if low >= 0 and high <= 255 else "scale them first"
-            raise ImageError(f"{path} has float pixels in {low:g}..{high:g}; floats must lie in 0..1: {advice}")
+            raise ImageError(
+                f"{path} has float pixels in {low:g}..{high:g}; floats must lie in 0..1: {advice}"
+            )
         pixels = np.rint(pixels.astype(np.float32) * 255).astype(np.uint8)
     elif pixels.dtype != np.uint8:
         raise ImageError(
@@ -163,18 +199,27 @@ def _unpack(data: bytes) -> np.ndarray:
         return unpack_npy(data)
     chunks = _decoded_chunks(data) if data.startswith(_PNG) else data
     orientation = _check_header(data)
-    jpeg = data.startswith(_JPEG) and _JPEG_RGB != cv2.IMREAD_UNCHANGED  # 8 bits; the decoder itself writes RGB
+    # 8 bits; the decoder itself writes RGB
+    jpeg = data.startswith(_JPEG) and _JPEG_RGB != cv2.IMREAD_UNCHANGED
     try:
         with QUIET:
-            pixels = cv2.imdecode(np.frombuffer(chunks, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED)
+            pixels = cv2.imdecode(
+                np.frombuffer(chunks, np.uint8), _JPEG_RGB if jpeg else cv2.IMREAD_UNCHANGED
+            )
     except cv2.error as error:
         raise ValueError(error.err) from None
     if pixels is None:
         raise ValueError("the picture is corrupt or cut short")
     if not jpeg and pixels.ndim == 3 and pixels.shape[2] in (3, 4):
-        if pixels.dtype not in (np.uint8, np.uint16, np.float32):  # of a TIFF; cvtColor refuses these types
+        if pixels.dtype not in (
+            np.uint8,
+            np.uint16,
+            np.float32,
+        ):  # of a TIFF; cvtColor refuses these types
             return pixels[..., 2::-1]
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
+        pixels = cv2.cvtColor(
+            pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB
+        )
     return _upright(pixels, orientation)
 
 
@@ -184,7 +229,9 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
-    return pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
+    if orientation in (2, 3, 6, 7):
+        return pixels[:, ::-1]
+    return pixels
 
 
 def _check_header(data: bytes) -> int:
@@ -196,23 +243,34 @@ def _check_header(data: bytes) -> int:
         raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
     if data.startswith(_JPEG):
         _check_segments(data)
-    stream, image = io.BytesIO(data), None
+    stream = io.BytesIO(data)
+    image = None
     try:
         image = header(stream) if header is not None else None
         width, height = image.size if image is not None else _tiff_size(stream)
     except ValueError:
         raise
-    except Exception as error:  # Pillow raises many types for a corrupt header, and its own for a bomb
-        reason = "the file is cut short" if "truncated" in str(error).lower() else "its header is corrupt"
+    except (
+        Exception
+    ) as error:  # Pillow raises many types for a corrupt header, and its own for a bomb
+        reason = (
+            "the file is cut short"
+            if "truncated" in str(error).lower()
+            else "its header is corrupt"
+        )
         raise ValueError(f"{reason} ({error})") from None
     if width * height > MAX_PIXELS:
-        raise ValueError(f"it declares {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
+        raise ValueError(
+            f"it declares {width} x {height} pixels, more than the limit of {MAX_PIXELS}"
+        )
     if data.startswith(_JPEG):
         # OpenCV fills the lost part of some cut JPEG files with grey. The stream is now behind the last header.
         if data.find(b"\xff\xd9", stream.tell()) < 0:
             raise ValueError("the file is cut short")
         _check_scans(data, max(width * height, 1 << 16))
-    return _orientation(image) if image is not None and "exif" in image.info else 1
+    if image is not None and "exif" in image.info:
+        return _orientation(image)
+    return 1
 
 
 def _orientation(image: ImageFile.ImageFile) -> int:
@@ -220,14 +278,21 @@ def _orientation(image: ImageFile.ImageFile) -> int:
         value = image.getexif().get(_ORIENTATION, 1)
     except Exception:  # a corrupt tag; the picture itself may be whole
         return 1
-    return value if value in range(1, 9) else 1
+    if value in range(1, 9):
+        return value
+    return 1
 
 
 def _decoded_chunks(data: bytes) -> bytes:
     """Return a PNG without needless chunks, walked first: OpenCV allocates what a chunk declares, up to 4 GB."""
-    at, kind, headers, count, parts = 8, b"", 0, 0, [data[:8]]
+    at = 8
+    kind = b""
+    headers = 0
+    count = 0
+    parts = [data[:8]]
     while kind != b"IEND":
-        length, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
+        length = int.from_bytes(data[at : at + 4])
+        kind = data[at + 4 : at + 8]
         if at + 12 + length > len(data):
             raise ValueError("the picture is corrupt or cut short")
         if kind in _DECODED_CHUNKS:
@@ -238,7 +303,9 @@ def _decoded_chunks(data: bytes) -> bytes:
             raise ValueError(f"it has more than {MAX_PARTS} chunks of a few bytes")
     if headers != 1 or data[12:16] != b"IHDR":
         raise ValueError("the picture is corrupt")
-    return b"".join(parts) if len(parts) <= count else data
+    if len(parts) <= count:
+        return b"".join(parts)
+    return data
 
 
 def _segments(data: bytes) -> Iterator[tuple[bytes, int]]:
@@ -255,7 +322,9 @@ def _check_segments(data: bytes) -> None:
     for count, (kind, skipped) in enumerate(_segments(data)):
         padding += skipped
         if padding > MAX_PADDING or count > MAX_PARTS:
-            raise ValueError(f"its header has more than {MAX_PADDING} bytes of padding or {MAX_PARTS} segments")
+            raise ValueError(
+                f"its header has more than {MAX_PADDING} bytes of padding or {MAX_PARTS} segments"
+            )
         if kind == _SCAN:
             return
 
@@ -268,7 +337,9 @@ def _check_scans(data: bytes, pixels: int) -> None:
         for count, (kind, _) in enumerate(_segments(data)):
             scans += kind == _SCAN
             if scans > most or count > 16 * MAX_PARTS:
-                raise ValueError(f"it has more than {most} scans, which would take minutes; save it as a plain JPEG")
+                raise ValueError(
+                    f"it has more than {most} scans, which would take minutes; save it as a plain JPEG"
+                )
 
 
 def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:
@@ -290,7 +361,9 @@ def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:
     if tags.next:
         raise ValueError("it holds several pictures; write a file for each")
     if tags.get(_ALPHA) in (2, (2,)) and tags.get(_BITS, (0,))[0] == 8:
-        raise ValueError("it has an alpha channel by which its colours would be multiplied; write it without alpha")
+        raise ValueError(
+            "it has an alpha channel by which its colours would be multiplied; write it without alpha"
+        )
     return tags[_WIDTH], tags[_HEIGHT]
 
 
@@ -305,7 +378,8 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
     if not path.is_file():
         raise ImageError(f"there is no video {path}; give another path")
     video = open_video(path)
-    number, last = 0, -1.0
+    number = 0
+    last = -1.0
     try:
         while True:
             try:
@@ -349,14 +423,20 @@ def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
     """Open a video, by PyAV if OpenCV cannot decode it. Raises ImageError for no film, and for an unknown codec."""
     if Path(path).is_file() and (kind := placeholder(path)):
         raise ImageError(f"{path} is {kind}")
-    place = os.path.abspath(path)  # FFmpeg takes the part of a relative name before a colon for a protocol
+    # FFmpeg takes the part of a relative name before a colon for a protocol
+    place = os.path.abspath(path)
     with QUIET:
         video = cv2.VideoCapture(place)
         if not video.isOpened():
             return video
         if video.grab():
             return cv2.VideoCapture(place)  # some formats cannot go back
-    codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace").strip("\0 ")
+    codec = (
+        int(video.get(cv2.CAP_PROP_FOURCC))
+        .to_bytes(4, "little")
+        .decode("ascii", "replace")
+        .strip("\0 ")
+    )
     try:
         film = PyAvFilm(place)
         if film.grab() and film.open(place):
@@ -375,7 +455,8 @@ class PyAvFilm:
     """A film such as AV1, BGR u8 (h, w, 3), with the methods of cv2.VideoCapture. Raises ImportError and OSError."""
 
     def __init__(self, path: str) -> None:
-        self._path, self._frame = path, None
+        self._path = path
+        self._frame = None
         self._container: Any = None
         self._frames: Iterator[Any] = iter(())
         self.open(path)
@@ -388,9 +469,14 @@ class PyAvFilm:
         try:
             self._container = av.open(path)
             self._frames = self._container.decode(video=0)
-        except (av.FFmpegError, ValueError, IndexError) as error:  # IndexError: a file without a film
+        except (
+            av.FFmpegError,
+            ValueError,
+            IndexError,
+        ) as error:  # IndexError: a file without a film
             raise OSError(str(error)) from None
-        self._frame, self._number = None, 0
+        self._frame = None
+        self._number = 0
         return True
 
     def isOpened(self) -> bool:
@@ -400,14 +486,17 @@ class PyAvFilm:
     def grab(self) -> bool:
         """Go to the next frame. A film that is damaged from there on ends."""
         self._frame = None
-        with contextlib.suppress(OSError, ValueError):  # all errors of PyAV are of these types
+        # all errors of PyAV are of these types
+        with contextlib.suppress(OSError, ValueError):
             self._frame = next(self._frames, None)
         self._number += self._frame is not None
         return self._frame is not None
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
         """Return the frame of the last grab."""
-        return self._frame is not None, None if self._frame is None else self._frame.to_ndarray(format="bgr24")
+        return self._frame is not None, None if self._frame is None else self._frame.to_ndarray(
+            format="bgr24"
+        )
 
     def read(self) -> tuple[bool, np.ndarray | None]:
         """Return the next frame."""
@@ -422,9 +511,12 @@ class PyAvFilm:
             return stream.frames or round((self._container.duration or 0) / 1e6 * rate)
         time = None if self._frame is None else self._frame.time
         known = {
-            cv2.CAP_PROP_FPS: rate, cv2.CAP_PROP_POS_MSEC: 1000 * (time or 0), cv2.CAP_PROP_POS_FRAMES: self._number,
-            cv2.CAP_PROP_FRAME_WIDTH: stream.width, cv2.CAP_PROP_FRAME_HEIGHT: stream.height,
-        }  # fmt: skip
+            cv2.CAP_PROP_FPS: rate,
+            cv2.CAP_PROP_POS_MSEC: 1000 * (time or 0),
+            cv2.CAP_PROP_POS_FRAMES: self._number,
+            cv2.CAP_PROP_FRAME_WIDTH: stream.width,
+            cv2.CAP_PROP_FRAME_HEIGHT: stream.height,
+        }
         return float(known.get(name, 0))
 
     def set(self, name: int, value: float) -> bool:
@@ -453,7 +545,11 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     folder = Path(folder)
     if not folder.is_dir():
         raise ImageError(f"there is no folder {folder}; give another path")
-    files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
+    files = [
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
+    ]
     named = {file.stem.lower(): file for file in files if file.stem.lower() in (BACKGROUND, PHOTO)}
     files = [file for file in files if file.stem.lower() not in named]
     files = [file for file in files if file.suffix.lower() != ".npy"] or files
@@ -461,7 +557,9 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
         raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)}){_suggestion(folder)}")
     names, is_clear = frame_order([file.name for file in files])
     if not is_clear:
-        warnings.warn(f"the names in {folder} show no order of its pictures: they come by name", stacklevel=2)
+        warnings.warn(
+            f"the names in {folder} show no order of its pictures: they come by name", stacklevel=2
+        )
     return [folder / name for name in names], named
 
 
@@ -469,7 +567,9 @@ def picture_files(path: Path) -> list[Path] | None:
     """Return the picture at `path`, or the frames of a folder in order; None for a film. Raises ImageError."""
     if path.is_dir():
         return list_images(path)[0]
-    return [path] if path.suffix.lower() in SUFFIXES else None
+    if path.suffix.lower() in SUFFIXES:
+        return [path]
+    return None
 
 
 def _suggestion(folder: Path) -> str:
@@ -478,7 +578,12 @@ def _suggestion(folder: Path) -> str:
     for file in entries:
         if file.suffix.lower() in (".csv", ".parquet") and is_manifest(file):
             return f"; give its manifest {file}"
-    below = (file for one in entries if one.is_dir() and not one.name.startswith(".") for file in one.rglob("*"))
+    below = (
+        file
+        for one in entries
+        if one.is_dir() and not one.name.startswith(".")
+        for file in one.rglob("*")
+    )
     if any(file.suffix.lower() in SUFFIXES for file in below):
         command = f"anytouch data index recordings {folder} --sensor NAME"
         return f"; they lie in its sub-folders: {command} makes a manifest of them"

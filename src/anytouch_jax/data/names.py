@@ -12,12 +12,32 @@ from typing import Any
 
 Number = int | Decimal
 
-_COUNTED = {"frame", "frames", "frm", "f", "img", "image", "i", "picture", "pic", "photo", "shot", "sample", "step"}
-_COUNTED |= {"index", "idx", "no", "nr", "num", "n", "t", "time", "ts"}  # words before the number of a frame
+_COUNTED = {
+    "frame",
+    "frames",
+    "frm",
+    "f",
+    "img",
+    "image",
+    "i",
+    "picture",
+    "pic",
+    "photo",
+    "shot",
+    "sample",
+    "step",
+}
+# words before the number of a frame
+_COUNTED |= {"index", "idx", "no", "nr", "num", "n", "t", "time", "ts"}
 # A number, also with a fraction (but not in 2024.05.01) or as Python writes small floats.
 _DECIMAL = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)(?:e[+-]\d{2,3})?|\de[+-]\d{2,3}|\d+)")
-_DATE = re.compile(r"(?<!\d)(?:19|20)\d\d([-_.:]?)[01]\d\1[0-3]\d[T_ -]{0,3}[0-2]\d([-_.:h]?)[0-5]\d[-_.:m]?[0-5]\d")
-_SIDE = re.compile(r"\d|(?<![^\W_])(?:left|right|l|r|thumb|index|middle|ring|little|pinky)(?![^\W_])", re.IGNORECASE)
+_DATE = re.compile(
+    r"(?<!\d)(?:19|20)\d\d([-_.:]?)[01]\d\1[0-3]\d[T_ -]{0,3}[0-2]\d([-_.:h]?)[0-5]\d[-_.:m]?[0-5]\d"
+)
+_SIDE = re.compile(
+    r"\d|(?<![^\W_])(?:left|right|l|r|thumb|index|middle|ring|little|pinky)(?![^\W_])",
+    re.IGNORECASE,
+)
 
 
 def frame_order(names: Sequence[str]) -> tuple[list[str], bool]:
@@ -26,26 +46,37 @@ def frame_order(names: Sequence[str]) -> tuple[list[str], bool]:
     Numbers are compared by value from left to right. One that counts goes first if what stands before it is in no
     order.
     """
-    ordered, is_clear = list[str](), True
+    ordered = list[str]()
+    is_clear = True
     for series in split_series(sorted(names, key=natural)).values():
         parts = _number_parts(series)
         forms = Counter("0".join(one[::2]) for one in parts)
         values = [tuple(map(_value, one[1::2])) for one in parts]
         widths = set(map(len, values))
         texts = list(zip(*(one[1::2][len(one) // 2 - min(widths) :] for one in parts), strict=True))
-        columns = [tuple(map(_value, column)) for column in texts]  # counters stand behind
+        # counters stand behind
+        columns = [tuple(map(_value, column)) for column in texts]
         keys: list[Any] = list(map(_natural, parts))
-        if is_shown := len(widths) == 1 and len(set(values)) == len(values) and not _is_random(forms):
+        if (
+            is_shown := len(widths) == 1
+            and len(set(values)) == len(values)
+            and not _is_random(forms)
+        ):
             keys = list(values)
         order = sorted(range(len(series)), key=lambda i: (keys[i], series[i]))
-        for at, column in reversed([(at, column) for at, column in enumerate(columns) if _counts_all(column)]):
+        for at, column in reversed(
+            [(at, column) for at, column in enumerate(columns) if _counts_all(column)]
+        ):
             counted = sorted(order, key=lambda i: column[i])
-            is_clock = at > 0 and all(len(one) == 2 and one < "60" for two in texts[at - 1 : at + 1] for one in two)
+            is_clock = at > 0 and all(
+                len(one) == 2 and one < "60" for two in texts[at - 1 : at + 1] for one in two
+            )
             blocks = len(list(itertools.groupby(columns[at - 1][i] for i in counted)))
             if is_clock and 4 * blocks < len(series):
                 break  # its seconds begin again
             if _is_random(forms) or not _is_rising([column[i] for i in order]):
-                is_shown, order = True, counted
+                is_shown = True
+                order = counted
             break
         ordered += [series[i] for i in order]
         is_clear &= is_shown or len(series) == 1
@@ -61,7 +92,11 @@ def _counts_all(column: Sequence[Number]) -> bool:
     """Return whether numbers are whole, distinct, and nearly without gaps: they count frames."""
     ordered = sorted(column)
     steps = [b - a for a, b in itertools.pairwise(ordered)]
-    return len(column) > 2 and all(value == int(value) for value in column) and 5 * steps.count(1) >= 4 * len(steps)
+    return (
+        len(column) > 2
+        and all(value == int(value) for value in column)
+        and 5 * steps.count(1) >= 4 * len(steps)
+    )
 
 
 def _is_rising(column: Sequence[Any]) -> bool:
@@ -81,7 +116,8 @@ def looks_like_film(names: Sequence[str]) -> bool:
     varying = [column for column in columns if len(set(column)) > 1]
     if not varying or not _is_rising(varying[-1]):
         return False
-    unit = 10 ** max(0, 3 * ((len(str(int(varying[-1][0]))) - 8) // 3))  # of a time since 1970: s, ms, us or ns
+    # of a time since 1970: s, ms, us or ns
+    unit = 10 ** max(0, 3 * ((len(str(int(varying[-1][0]))) - 8) // 3))
     if varying[-1][0] > 10**9 and len({value // unit for value in varying[-1]}) == len(names):
         return False
     steps = sorted(b - a for a, b in itertools.pairwise(varying[-1]))
@@ -103,9 +139,15 @@ def _counted(counters: Sequence[tuple[Number, ...]]) -> list[int] | None:
     else:
         numbers = [numbers[-1] for numbers in counters if numbers]
     steps = [b - a for a, b in itertools.pairwise(numbers)]
-    is_count = len(numbers) == len(counters) and min(steps, default=0) == 1 and 3 * steps.count(1) >= len(steps)
+    is_count = (
+        len(numbers) == len(counters)
+        and min(steps, default=0) == 1
+        and 3 * steps.count(1) >= len(steps)
+    )
     is_whole = is_count and all(number == int(number) < 1 << 63 for number in numbers)
-    return [int(number) for number in numbers] if is_whole else None
+    if is_whole:
+        return [int(number) for number in numbers]
+    return None
 
 
 def split_series(names: Sequence[str]) -> dict[str, list[str]]:
@@ -126,7 +168,9 @@ def split_series(names: Sequence[str]) -> dict[str, list[str]]:
     in_time = [key for key, _ in sorted(parts, key=lambda part: part[1])]
     changes = sum(a != b for a, b in itertools.pairwise(in_time))
     alternate = changes > len(series) and all(_SIDE.search(key) for key in series)
-    return series if len(series) > 1 and (shared or alternate) else {"": list(names)}
+    if len(series) > 1 and (shared or alternate):
+        return series
+    return {"": list(names)}
 
 
 def _series_of(names: Sequence[str]) -> list[tuple[str, tuple[Number, ...]]]:
@@ -165,19 +209,27 @@ def _number_parts(names: Sequence[str]) -> list[list[str]]:
     """Return words and numbers of each name in turn. 1,5 is 1.5; in names with 1.1 and 1.10 the point separates two."""
     stems = [re.sub(r"(?<=\d),(?=\d)", ".", Path(name).stem) for name in names]
     fractions = [number.partition(".")[2] for stem in stems for number in _DECIMAL.findall(stem)]
-    is_dotted = len(set(map(len, fractions))) > 1 and any(len(one) > 1 and one[-1] == "0" for one in fractions)
+    is_dotted = len(set(map(len, fractions))) > 1 and any(
+        len(one) > 1 and one[-1] == "0" for one in fractions
+    )
     pattern = re.compile(r"(\d+)") if is_dotted else _DECIMAL
     return [pattern.split(stem) for stem in stems]
 
 
 def _value(number: str) -> Number:
     """Return a number by value. Its digits may be those of any script."""
-    return int(number) if number.isdecimal() else Decimal(number)
+    if number.isdecimal():
+        return int(number)
+    return Decimal(number)
 
 
 def _natural(parts: Sequence[str]) -> list[tuple[Number, str]]:
     """Return a sort key of words and numbers in turn that compares numbers by value."""
-    return [(_value(part), "") if at % 2 else (-1, part) for at, part in enumerate(parts) if at % 2 or part]
+    return [
+        (_value(part), "") if at % 2 else (-1, part)
+        for at, part in enumerate(parts)
+        if at % 2 or part
+    ]
 
 
 def natural(name: str) -> list[tuple[Number, str]]:

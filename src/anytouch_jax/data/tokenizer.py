@@ -12,7 +12,8 @@ from tokenizers import decoders, models, normalizers, pre_tokenizers, processors
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
-START, END = "<|startoftext|>", "<|endoftext|>"
+START = "<|startoftext|>"
+END = "<|endoftext|>"
 
 
 class Tokenizer:
@@ -42,7 +43,9 @@ class Tokenizer:
         true on real tokens including the first end token. Raises UserError for a length below 2.
         """
         if length < 2:
-            raise UserError(f"a text needs room for a start and an end token, not a length of {length}")
+            raise UserError(
+                f"a text needs room for a start and an end token, not a length of {length}"
+            )
         ids = np.full((len(texts), length), self.end_id, np.int32)
         mask = np.zeros((len(texts), length), bool)
         for row, text in enumerate(texts):
@@ -56,7 +59,9 @@ class Tokenizer:
     def longest(self, texts: Sequence[str]) -> int:
         """Return the number of tokens of the longest text, start and end included; 2 without texts."""
         starts = range(0, len(texts), 10_000)
-        parts = (self._inner.encode_batch_fast(list(texts[start : start + 10_000])) for start in starts)
+        parts = (
+            self._inner.encode_batch_fast(list(texts[start : start + 10_000])) for start in starts
+        )
         return max((len(encoding.ids) for part in parts for encoding in part), default=2)
 
     def save(self, path: str | Path) -> None:
@@ -73,7 +78,9 @@ def load_tokenizer(path: str | Path) -> Tokenizer:
         raise UserError(f"there is no tokenizer at {path}; give a tokenizer.json or its folder")
     file = path / "tokenizer.json" if path.is_dir() else path
     if not file.is_file():
-        raise UserError(f"there is no tokenizer {file}; give the tokenizer.json in the folder of CLIP's weights")
+        raise UserError(
+            f"there is no tokenizer {file}; give the tokenizer.json in the folder of CLIP's weights"
+        )
     try:
         inner = tokenizers.Tokenizer.from_file(str(file))
     except Exception as error:  # the library raises plain Exception
@@ -94,11 +101,15 @@ def train_tokenizer(captions: Iterable[str], vocab_size: int) -> Tokenizer:
         raise UserError(f"a tokenizer needs room for at least 258 tokens, not {vocab_size}")
     inner = tokenizers.Tokenizer(models.BPE())
     blanks = normalizers.Replace(tokenizers.Regex(r"\s+"), " ")
-    inner.normalizer = normalizers.Sequence([normalizers.NFC(), blanks, normalizers.Strip(), normalizers.Lowercase()])
+    inner.normalizer = normalizers.Sequence(
+        [normalizers.NFC(), blanks, normalizers.Strip(), normalizers.Lowercase()]
+    )
     inner.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
     inner.decoder = decoders.ByteLevel()
     alphabet = pre_tokenizers.ByteLevel.alphabet()
-    trainer = trainers.BpeTrainer(vocab_size=vocab_size - 2, initial_alphabet=alphabet, show_progress=False)
+    trainer = trainers.BpeTrainer(
+        vocab_size=vocab_size - 2, initial_alphabet=alphabet, show_progress=False
+    )
     inner.train_from_iterator(texts, trainer)
     inner.add_special_tokens([START, END])
     inner.post_processor = processors.TemplateProcessing(

@@ -18,7 +18,9 @@ from anytouch_jax.data.images import ImageError
 
 _GREY = (0.2989, 0.587, 0.114)  # torchvision's weights of red, green, blue
 Flip = Literal["none", "across", "down"]
-TOUCH, VISION = 0, 1  # the two random streams of a row's augmentation
+# the two random streams of a row's augmentation
+TOUCH = 0
+VISION = 1
 FORM = 128  # a background may differ from the proportions of a frame by one part in so many
 UNTOUCHED = 128  # grey level of an untouched gel after background subtraction
 
@@ -29,9 +31,12 @@ def augmentation_rng(seed: int, epoch: int, row: int, stream: int = TOUCH) -> np
 
 
 def touch_transform(
-    frames: Sequence[np.ndarray] | np.ndarray, size: int, rng: np.random.Generator, config: DataConfig,
+    frames: Sequence[np.ndarray] | np.ndarray,
+    size: int,
+    rng: np.random.Generator,
+    config: DataConfig,
     out: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), with one draw for all frames.
 
     The whole image is resized (no crop), and flipped in each direction with probability `config.flip`. It is then
@@ -48,20 +53,27 @@ def touch_transform(
     if any(config.affine):
         warp = _affine(size, rng, config.affine)
         for frame in out:
-            frame[...] = cv2.warpAffine(frame, warp, (size, size), borderMode=cv2.BORDER_REFLECT_101)
-    return colour_jitter(out, rng, config.jitter, out) if any(config.jitter) else out
+            frame[...] = cv2.warpAffine(
+                frame, warp, (size, size), borderMode=cv2.BORDER_REFLECT_101
+            )
+    if any(config.jitter):
+        return colour_jitter(out, rng, config.jitter, out)
+    return out
 
 
 def _affine(size: int, rng: np.random.Generator, spread: tuple[float, float, float]) -> np.ndarray:
     """Return a random affine map of pixels, f64 (2, 3): rotation and scaling about the centre, then a shift."""
     angle, scale, across, down = rng.uniform(-1, 1, 4)
     degrees, share, growth = spread
-    centre, shift = (size - 1) / 2, np.array([across, down]) * share * size
+    centre = (size - 1) / 2
+    shift = np.array([across, down]) * share * size
     warp = cv2.getRotationMatrix2D((centre, centre), angle * degrees, (1 + growth) ** scale)
     return np.column_stack([warp[:, :2], warp[:, 2] + shift])
 
 
-def touch_evaluation(frames: Sequence[np.ndarray] | np.ndarray, size: int, out: np.ndarray | None = None) -> np.ndarray:
+def touch_evaluation(
+    frames: Sequence[np.ndarray] | np.ndarray, size: int, out: np.ndarray | None = None
+) -> np.ndarray:
     """Resize a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), written into `out` or a new array."""
     out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
     for target, frame in zip(out, frames, strict=True):
@@ -75,7 +87,9 @@ def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.
     return {"none": frame, "across": frame[:, ::-1], "down": frame[::-1]}[flip]
 
 
-def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray) -> list[np.ndarray]:
+def subtract_background(
+    frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray
+) -> list[np.ndarray]:
     """Return background-subtracted frames: frame - background + 128, clipped to u8, for each of T frames u8 (h, w, 3).
 
     The background is an image of the untouched gel. It is resized to the frame's size if they differ. Raises ImageError
@@ -95,7 +109,8 @@ def subtract_background(frames: Sequence[np.ndarray] | np.ndarray, background: n
 
 def check_proportions(frame: Sequence[int], background: Sequence[int]) -> None:
     """Raise ImageError if a background (h, w, ...) has other proportions than a frame: it is turned or cropped."""
-    (height, width), (high, wide) = frame[:2], background[:2]
+    (height, width) = frame[:2]
+    (high, wide) = background[:2]
     scale = max(high, wide) / max(height, width)
     if max(abs(height * scale - high), abs(width * scale - wide)) > max(high, wide) / FORM:
         raise ImageError(
@@ -105,16 +120,22 @@ def check_proportions(frame: Sequence[int], background: Sequence[int]) -> None:
 
 
 def _resize(frame: np.ndarray, target: np.ndarray) -> None:
-    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:  # else OpenCV would not write into `target`
-        raise ImageError(f"a frame must be RGB uint8 (height, width, 3), not {frame.dtype} {frame.shape}")
+    if (
+        frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3
+    ):  # else OpenCV would not write into `target`
+        raise ImageError(
+            f"a frame must be RGB uint8 (height, width, 3), not {frame.dtype} {frame.shape}"
+        )
     interpolation = cv2.INTER_AREA if min(frame.shape[:2]) > len(target) else cv2.INTER_LINEAR
     cv2.resize(frame, (target.shape[1], len(target)), dst=target, interpolation=interpolation)
 
 
 def colour_jitter(
-    frames: np.ndarray, rng: np.random.Generator, jitter: tuple[float, float, float, float],
+    frames: np.ndarray,
+    rng: np.random.Generator,
+    jitter: tuple[float, float, float, float],
     out: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Jitter brightness, contrast, saturation and hue in a random order, the same for all frames u8 (T, h, w, 3).
 
     This is torchvision's ColorJitter in float32, each step clipped, with one rounding at the end. Factors are in 1 +-
@@ -122,10 +143,16 @@ def colour_jitter(
     allowed) or a new array.
     """
     spread = np.asarray(jitter)
-    low, high = np.maximum(0.0, 1.0 - spread), 1.0 + spread
-    low[3], high[3] = -jitter[3], jitter[3]
+    low = np.maximum(0.0, 1.0 - spread)
+    high = 1.0 + spread
+    low[3] = -jitter[3]
+    high[3] = jitter[3]
     factors = low + (high - low) * rng.random(4)
-    steps = [(int(operation), float(factors[operation])) for operation in rng.permutation(4) if jitter[operation]]
+    steps = [
+        (int(operation), float(factors[operation]))
+        for operation in rng.permutation(4)
+        if jitter[operation]
+    ]
     out = np.empty(frames.shape, np.uint8) if out is None else out
     buffers = np.empty((2, *frames.shape[1:]), np.float32)
     for target, frame in zip(out, frames, strict=True):
@@ -146,8 +173,11 @@ class _Jitter:
 
     def __init__(self, frame: np.ndarray, image: np.ndarray, spare: np.ndarray) -> None:
         np.copyto(image, frame)
-        self.image, self.spare, self.pending = image, spare, _IDENTITY
-        self.low, self.high = float(frame.min()), float(frame.max())
+        self.image = image
+        self.spare = spare
+        self.pending = _IDENTITY
+        self.low = float(frame.min())
+        self.high = float(frame.max())
 
     def apply(self, steps: Sequence[tuple[int, float]], target: np.ndarray) -> None:
         """Apply the steps (operation, factor) in order and round the result into `target` u8."""
@@ -161,7 +191,9 @@ class _Jitter:
 
     def _blend(self, operation: int, factor: float) -> None:
         """Blend with black (0), with the mean grey of the image (1), or with the grey of each pixel (2)."""
-        step, low, high = _IDENTITY * factor, 0.0, 0.0
+        step = _IDENTITY * factor
+        low = 0.0
+        high = 0.0
         if operation == 1:
             mean = self.pending @ (*cv2.mean(self.image)[:3], 1.0)
             low = high = float(np.dot(mean, _GREY))
@@ -169,7 +201,8 @@ class _Jitter:
         elif operation == 2:
             step[:, :3] += (1 - factor) * np.asarray(_GREY)
             low, high = (self.low, self.high) if factor <= 1 else (self.high, self.low)
-        self.low, self.high = factor * self.low + (1 - factor) * low, factor * self.high + (1 - factor) * high
+        self.low = factor * self.low + (1 - factor) * low
+        self.high = factor * self.high + (1 - factor) * high
         linear = step[:, :3] @ self.pending
         linear[:, 3] += step[:, 3]
         self.pending = linear
@@ -187,19 +220,25 @@ class _Jitter:
             cv2.threshold(self.image, 255, 0, cv2.THRESH_TRUNC, dst=self.image)
         if self.low < 0:
             cv2.threshold(self.image, 0, 0, cv2.THRESH_TOZERO, dst=self.image)
-        self.low, self.high = max(self.low, 0.0), min(self.high, 255.0)
+        self.low = max(self.low, 0.0)
+        self.high = min(self.high, 255.0)
 
     def _rotate_hue(self, factor: float) -> None:
         """Rotate the hue; the largest and the smallest value of a pixel stay, and so do the bounds."""
         self._apply_pending()
         cv2.cvtColor(self.image, cv2.COLOR_RGB2HSV, dst=self.spare)
         hue = self.spare[..., 0]
-        np.add(hue, np.float32(360 * (factor % 1.0)), out=hue)  # HSV2RGB accepts angles above 360 but not below 0
+        # HSV2RGB accepts angles above 360 but not below 0
+        np.add(hue, np.float32(360 * (factor % 1.0)), out=hue)
         cv2.cvtColor(self.spare, cv2.COLOR_HSV2RGB, dst=self.image)
 
 
 def vision_transform(
-    image: np.ndarray, size: int, rng: np.random.Generator, rotation: float = 20.0, flip: float = 0.5
+    image: np.ndarray,
+    size: int,
+    rng: np.random.Generator,
+    rotation: float = 20.0,
+    flip: float = 0.5,
 ) -> np.ndarray:
     """Augment a photograph u8 (h, w, 3) -> u8 (size, size, 3): turn by +-`rotation` degrees, flip, CLIP's resize."""
     angle = rng.uniform(-rotation, rotation)
@@ -223,9 +262,16 @@ def vision_evaluation(image: np.ndarray, size: int) -> np.ndarray:
     image = _shrink(image, size)
     height, width = image.shape[:2]
     short = min(height, width)
-    out = _weigh(np.asarray(image, np.float32).reshape(height, -1), *_bicubic(height, size * height // short, size))
+    out = _weigh(
+        np.asarray(image, np.float32).reshape(height, -1),
+        *_bicubic(height, size * height // short, size),
+    )
     out = out.reshape(size, width, 3).transpose(1, 0, 2).reshape(width, -1)
-    out = _weigh(out, *_bicubic(width, size * width // short, size)).reshape(size, size, 3).transpose(1, 0, 2)
+    out = (
+        _weigh(out, *_bicubic(width, size * width // short, size))
+        .reshape(size, size, 3)
+        .transpose(1, 0, 2)
+    )
     return np.ascontiguousarray(np.rint(np.clip(out, 0, 255)).astype(np.uint8))
 
 
@@ -245,8 +291,11 @@ def _shrink(image: np.ndarray, size: int) -> np.ndarray:
     factor = min(image.shape[:2]) // (3 * size)
     if factor < 2:
         return image
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    return cv2.resize(image[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
+    height = image.shape[0] // factor
+    width = image.shape[1] // factor
+    return cv2.resize(
+        image[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA
+    )
 
 
 @lru_cache(maxsize=256)
@@ -261,7 +310,10 @@ def _bicubic(before: int, after: int, size: int) -> tuple[np.ndarray, np.ndarray
     far = (((x - 5) * x + 8) * x - 4) * a
     weights = np.where(x < 1, near, np.where(x < 2, far, 0.0))
     weights /= weights.sum(axis=1, keepdims=True)
-    first, last = (weights != 0).argmax(axis=1), before - 1 - (weights[:, ::-1] != 0).argmax(axis=1)
+    first = (weights != 0).argmax(axis=1)
+    last = before - 1 - (weights[:, ::-1] != 0).argmax(axis=1)
     taps = int((last - first).max()) + 1  # zeros can lie between them
     first = np.minimum(first, before - taps)
-    return first, np.stack([weights[np.arange(size), first + k] for k in range(taps)]).astype(np.float32)
+    return first, np.stack([weights[np.arange(size), first + k] for k in range(taps)]).astype(
+        np.float32
+    )

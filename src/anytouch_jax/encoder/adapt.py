@@ -59,9 +59,17 @@ class Adapted(NamedTuple):
 
 
 def adapt(
-    run: str | Path, manifest: Manifest, sensor: str, *, frames: int = 100, labels: str | None = None,
-    steps: int = 200, rate: float = 3e-3, seed: int = 0, log: Log = print,
-) -> Adapted:  # fmt: skip
+    run: str | Path,
+    manifest: Manifest,
+    sensor: str,
+    *,
+    frames: int = 100,
+    labels: str | None = None,
+    steps: int = 200,
+    rate: float = 3e-3,
+    seed: int = 0,
+    log: Log = print,
+) -> Adapted:
     """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split train.
 
     `run` is what `load_encoder` takes. The tokens start as the universal ones. The embedding of each frame is drawn to
@@ -70,14 +78,26 @@ def adapt(
     if frames < 0 or steps < 1:
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")
     if frames and labels is None:
-        raise UserError("the tokens are fitted to classes; name a column with --labels, or copy with --frames 0")
+        raise UserError(
+            "the tokens are fitted to classes; name a column with --labels, or copy with --frames 0"
+        )
     loaded, params = read_model(run)
     stored = loaded.metadata if loaded.from_run else {}
     config, params, row = with_row(loaded, params, sensor, str(run), log)
-    source = {"run": str(run), "sensor": sensor, "frames": frames, "labels": labels, "manifest": manifest.content_hash}
-    metadata: dict[str, Any] = {name: stored[name] for name in ("preprocessing", "data") if name in stored}
+    source = {
+        "run": str(run),
+        "sensor": sensor,
+        "frames": frames,
+        "labels": labels,
+        "manifest": manifest.content_hash,
+    }
+    metadata: dict[str, Any] = {
+        name: stored[name] for name in ("preprocessing", "data") if name in stored
+    }
     metadata |= {"sensors": list(config.model.sensors), "source": source}
-    metadata |= {} if loaded.trained_sensors is None else {"seen": [*loaded.trained_sensors, sensor]}
+    metadata |= (
+        {} if loaded.trained_sensors is None else {"seen": [*loaded.trained_sensors, sensor]}
+    )
     if labels is None or not frames:
         return Adapted(config, params, (), float("nan"), float("nan"), "fitted", metadata)
     with precision(config):
@@ -86,11 +106,19 @@ def adapt(
             rows = np.flatnonzero((manifest.text_column("sensor") == sensor) & (classes >= 0))
             classes[np.setdiff1d(rows, rows[UnitGels(manifest).has(rows)])] = -1
         fitted = choose_frames(manifest, sensor, "train", frames, classes, seed)
-        in_val = (manifest.text_column("sensor") == sensor) & (manifest.text_column("split") == "val") & (classes >= 0)
-        rows, measured = fitted[:MEASURED], "fitted"
+        in_val = (
+            (manifest.text_column("sensor") == sensor)
+            & (manifest.text_column("split") == "val")
+            & (classes >= 0)
+        )
+        rows = fitted[:MEASURED]
+        measured = "fitted"
         if count := min(int(in_val.sum()), MEASURED):
-            rows, measured = choose_frames(manifest, sensor, "val", count, classes, seed), "val"
-        net = build(usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0)))
+            rows = choose_frames(manifest, sensor, "val", count, classes, seed)
+            measured = "val"
+        net = build(
+            usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0))
+        )
         touch = {"touch": params["touch"]}
 
         def loss(params: Params, clip: jax.Array, target: jax.Array) -> jax.Array:
@@ -100,9 +128,14 @@ def adapt(
 
         measure = partial(jax.jit(loss), clip=_read(manifest, config, rows), target=classes[rows])
         clip = _read(manifest, config, fitted)
-        tokens, history = _fit(loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed)
-        before, after = float(measure(touch)), float(measure(put_tokens(touch, row, tokens)))
-        return Adapted(config, put_tokens(params, row, tokens), history, before, after, measured, metadata)
+        tokens, history = _fit(
+            loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed
+        )
+        before = float(measure(touch))
+        after = float(measure(put_tokens(touch, row, tokens)))
+        return Adapted(
+            config, put_tokens(params, row, tokens), history, before, after, measured, metadata
+        )
 
 
 def check_empty(out: Path) -> None:
@@ -114,23 +147,34 @@ def check_empty(out: Path) -> None:
 def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
     """Write a run folder for embed, probe and retrieve, whole or not at all. Raises UserError if `out` is not empty."""
     check_empty(Path(out))
-    text, tokenizer = to_json(adapted.config), find_tokenizer(registry.locate(run))
+    text = to_json(adapted.config)
+    tokenizer = find_tokenizer(registry.locate(run))
     touch = dict(adapted.params["touch"])
     trainable = {"touch": {"sensor_tokens": touch.pop("sensor_tokens")}}
     with atomic_folder(Path(out)) as folder:
         atomic_write(folder / "config.json", text + "\n")
         if tokenizer is not None:
             shutil.copyfile(tokenizer, folder / tokenizer.name)
-        lines = (json.dumps({"step": step, "loss": loss}) + "\n" for step, loss in enumerate(adapted.losses))
+        lines = (
+            json.dumps({"step": step, "loss": loss}) + "\n"
+            for step, loss in enumerate(adapted.losses)
+        )
         atomic_write(folder / "metrics.jsonl", "".join(lines))
         state = {"trainable": trainable, "frozen": adapted.params | {"touch": touch}}
-        store = checkpoint.Checkpoints(folder / "checkpoints", keep=1, config_json=text, metadata=adapted.metadata)
+        store = checkpoint.Checkpoints(
+            folder / "checkpoints", keep=1, config_json=text, metadata=adapted.metadata
+        )
         with contextlib.closing(store):
             store.save(len(adapted.losses), state, {"loss": adapted.after})
 
 
 def choose_frames(
-    manifest: Manifest, sensor: str, split: str, count: int, classes: np.ndarray | None = None, seed: int = 0
+    manifest: Manifest,
+    sensor: str,
+    split: str,
+    count: int,
+    classes: np.ndarray | None = None,
+    seed: int = 0,
 ) -> np.ndarray:
     """Return `count` rows i64 of a sensor in a split, from as many sequences as possible, in order.
 
@@ -147,7 +191,8 @@ def choose_frames(
     rows = np.random.default_rng([seed % 2**63, 77]).permutation(rows)
     sequence = manifest.codes("sequence", own=True)[rows]
     order = np.argsort(sequence, kind="stable")
-    turn = np.empty(len(rows), np.int64)  # rows of the same sequence before a row
+    # rows of the same sequence before a row
+    turn = np.empty(len(rows), np.int64)
     turn[order] = np.arange(len(rows)) - np.searchsorted(sequence[order], sequence[order])
     return np.sort(rows[np.argsort(turn, kind="stable")[:count]])
 
@@ -157,12 +202,16 @@ def read_model(run: str | Path) -> tuple[Loaded, Params]:
     path = registry.locate(run)
     family, weights = load_family(path)
     if family is not None:
-        raise UserError(f"{run} is {family.family.title}, which has no tokens to fit; name an encoder of AnyTouch")
+        raise UserError(
+            f"{run} is {family.family.title}, which has no tokens to fit; name an encoder of AnyTouch"
+        )
     loaded = load_model(path, stored_rows=True, weights=weights)
     return loaded, checkpoint.load_params(path)[0] if loaded.from_run else loaded.params
 
 
-def with_row(loaded: Loaded, params: Params, sensor: str, run: str, log: Log) -> tuple[Config, Params, int]:
+def with_row(
+    loaded: Loaded, params: Params, sensor: str, run: str, log: Log
+) -> tuple[Config, Params, int]:
     """Return the model with a row for `sensor` that equals the universal tokens, and the row."""
     config, model, trained = loaded.config, loaded.config.model, loaded.trained_sensors
     check_spelling(sensor, model.sensors)
@@ -172,12 +221,18 @@ def with_row(loaded: Loaded, params: Params, sensor: str, run: str, log: Log) ->
     if "touch" not in params:
         raise UserError(f"{run} has no touch encoder; give a stage-1 or stage-2 run")
     if not model.sensor_tokens or model.patch_encoder == "sensor":
-        raise UserError(f"{run} distinguishes sensors without tokens, so none can be fitted; give another run")
+        raise UserError(
+            f"{run} distinguishes sensors without tokens, so none can be fitted; give another run"
+        )
     if sensor in (trained or ()):
         raise UserError(f"{run} was trained on {sensor}; name a new sensor")
     if sensor in model.sensors and trained is None:
-        log(f"{run} does not store its trained sensors: the tokens of {sensor} start from the universal ones")
-    served = convert.serve_unseen(params["touch"], model, trained or (), universal_drawn=loaded.universal_drawn)
+        log(
+            f"{run} does not store its trained sensors: the tokens of {sensor} start from the universal ones"
+        )
+    served = convert.serve_unseen(
+        params["touch"], model, trained or (), universal_drawn=loaded.universal_drawn
+    )
     start = np.asarray(served["sensor_tokens"])[model.universal_row]
     tokens = np.asarray(params["touch"]["sensor_tokens"])
     if sensor not in model.sensors:
@@ -194,24 +249,35 @@ def put_tokens(params: Params, row: int, tokens: Any) -> Params:
     return params | {"touch": params["touch"] | {"sensor_tokens": table}}
 
 
-def _classes(run: str | Path, manifest: Manifest, sensor: str, labels: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
+def _classes(
+    run: str | Path, manifest: Manifest, sensor: str, labels: str, log: Log
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the class i32 of every row, -1 for none, and unit-norm prototypes f32 (classes, E)."""
-    column = next((name for name in (f"label.{labels}", labels) if name in manifest.table.column_names), None)
+    column = next(
+        (name for name in (f"label.{labels}", labels) if name in manifest.table.column_names), None
+    )
     if column is None:
-        raise UserError(f"the manifest has no column {labels!r} or 'label.{labels}' for --labels; name another")
+        raise UserError(
+            f"the manifest has no column {labels!r} or 'label.{labels}' for --labels; name another"
+        )
     if pa.types.is_floating(manifest.table[column].type):
         raise UserError(f"--labels {labels} is a column of measurements; name a column of classes")
-    value, sensors = manifest.text_column(column), manifest.text_column("sensor")
+    value = manifest.text_column(column)
+    sensors = manifest.text_column("sensor")
     encoder = load_encoder(run)
     known = np.isin(sensors, encoder.config.model.sensors) & (sensors != sensor)
     labelled = known & (value != "") & (manifest.text_column("split") == "train")
     rows = np.random.default_rng(0).permutation(np.flatnonzero(labelled))[:PROTOTYPE_ROWS]
     if not rows.size:
-        raise UserError(f"--labels needs frames of sensors that {run} knows, with a {labels}, in split 'train'")
+        raise UserError(
+            f"--labels needs frames of sensors that {run} knows, with a {labels}, in split 'train'"
+        )
     rows, values = embed_rows(encoder, manifest, np.sort(rows), log=log)
     names, class_ids = np.unique(value[rows], return_inverse=True)
     if len(names) < 2 or len(names) == len(rows):
-        raise UserError(f"--labels {labels} must name classes: two values or more, each of several frames")
+        raise UserError(
+            f"--labels {labels} must name classes: two values or more, each of several frames"
+        )
     unit = unit_rows(values)
     mean = np.stack([unit[class_ids == number].mean(axis=0) for number in range(len(names))])
     place = np.minimum(np.searchsorted(names, value), len(names) - 1)
@@ -221,29 +287,47 @@ def _classes(run: str | Path, manifest: Manifest, sensor: str, labels: str, log:
 
 def _read(manifest: Manifest, config: Config, rows: np.ndarray) -> np.ndarray:
     """Return stills u8 (rows, 1, H, W, 3)."""
-    config = config.with_settings({"data.batch_size": min(64, len(rows)), "data.on_bad_sample": "error"})
-    return np.concatenate([part.clip[: len(ids)] for ids, part in evaluation(manifest, rows, config)])
+    config = config.with_settings(
+        {"data.batch_size": min(64, len(rows)), "data.on_bad_sample": "error"}
+    )
+    return np.concatenate(
+        [part.clip[: len(ids)] for ids, part in evaluation(manifest, rows, config)]
+    )
 
 
 def _fit(
-    loss: Loss, params: Params, row: int, clip: np.ndarray, target: np.ndarray, *, steps: int, rate: float, seed: int
+    loss: Loss,
+    params: Params,
+    row: int,
+    clip: np.ndarray,
+    target: np.ndarray,
+    *,
+    steps: int,
+    rate: float,
+    seed: int,
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """Return the tokens (S, D) of the row after `steps` of Adam with a cosine schedule, and the loss of each step."""
     tx = optax.adam(optax.cosine_decay_schedule(rate, steps))
     arrays = jax.device_put((params, clip, target))
 
     @jax.jit
-    def step(tokens: jax.Array, state: Any, key: jax.Array, arrays: Any) -> tuple[jax.Array, Any, jax.Array]:
+    def step(
+        tokens: jax.Array, state: Any, key: jax.Array, arrays: Any
+    ) -> tuple[jax.Array, Any, jax.Array]:
         params, clip, target = arrays
         key_rows, _ = jax.random.split(key)
         # Drawn with replacement: epochs would need another shape for every number of frames.
         rows = jax.random.randint(key_rows, (BATCH,), 0, clip.shape[0])
-        value, grad = jax.value_and_grad(lambda t: loss(put_tokens(params, row, t), clip[rows], target[rows]))(tokens)
+        value, grad = jax.value_and_grad(
+            lambda t: loss(put_tokens(params, row, t), clip[rows], target[rows])
+        )(tokens)
         updates, state = tx.update(grad, state)
         return optax.apply_updates(tokens, updates), state, value
 
     tokens = jnp.asarray(params["touch"]["sensor_tokens"][row])
-    state, root, history = tx.init(tokens), jax.random.key(seed), []
+    state = tx.init(tokens)
+    root = jax.random.key(seed)
+    history = []
     for number in tracked(range(steps), "steps"):
         tokens, state, value = step(tokens, state, jax.random.fold_in(root, number), arrays)
         history.append(value)

@@ -21,7 +21,9 @@ Join = Literal["mean", "sum", "concat"]
 Log = Callable[[str], None]
 BATCH = 64
 METADATA = "fields"  # of weights: factors on the deviations by name, and the modulus of sensors
-SPREAD_ROWS, SPREAD_LEAST = 2000, 0.99  # rows that are compared, and the mean cosine of nearly constant features
+# rows that are compared, and the mean cosine of nearly constant features
+SPREAD_ROWS = 2000
+SPREAD_LEAST = 0.99
 
 
 def warn(sentence: str) -> None:
@@ -39,18 +41,27 @@ def check_features(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def run_in_batches(function: Callable[[Any], Any], items: Iterable[Any], size: int = BATCH) -> np.ndarray:
+def run_in_batches(
+    function: Callable[[Any], Any], items: Iterable[Any], size: int = BATCH
+) -> np.ndarray:
     """Return the results (n, ...) of `function` over n items, in batches of `size`.
 
     Arrays are stacked, and tuples of arrays one by one. The last batch is filled up with its last item, so that one
     shape is compiled. Without items the result is of shape (0,). Raises UserError for results that are not finite.
     """
-    values, left = list[np.ndarray](), iter(items)
+    values = list[np.ndarray]()
+    left = iter(items)
     while part := list(islice(left, size)):
         full = part + part[-1:] * (size - len(part) if values else 0)
-        batch = tuple(map(np.stack, zip(*full, strict=True))) if isinstance(full[0], tuple) else np.stack(full)
+        batch = (
+            tuple(map(np.stack, zip(*full, strict=True)))
+            if isinstance(full[0], tuple)
+            else np.stack(full)
+        )
         values.append(check_features(np.asarray(function(batch))[: len(part)]))
-    return np.concatenate(values) if values else np.zeros(0, np.float32)
+    if values:
+        return np.concatenate(values)
+    return np.zeros(0, np.float32)
 
 
 def binary_scale(values: np.ndarray, axis: int | None = None) -> np.ndarray:
@@ -63,7 +74,9 @@ def as_array(values: Any, name: str) -> np.ndarray:
     try:
         return np.asarray(values)
     except ValueError:
-        raise UserError(f"{name} must be one array; its parts differ in size, so bring them to one size") from None
+        raise UserError(
+            f"{name} must be one array; its parts differ in size, so bring them to one size"
+        ) from None
 
 
 def check_frames(model: ModelConfig, frames: int) -> None:
@@ -76,7 +89,9 @@ def filled(batch: np.ndarray) -> np.ndarray:
     """Return a batch (n, ...) with zeros up to 1, 2, 4, ... 64, 128, 192, ... rows: each number of rows is compiled."""
     count = len(batch)
     size = 1 << max(count - 1, 0).bit_length() if count <= 64 else -(-count // 64) * 64
-    return batch if count == size else np.concatenate([batch, np.zeros((size - count, *batch.shape[1:]), batch.dtype)])
+    if count == size:
+        return batch
+    return np.concatenate([batch, np.zeros((size - count, *batch.shape[1:]), batch.dtype)])
 
 
 def unit_rows(values: np.ndarray) -> np.ndarray:
@@ -87,7 +102,10 @@ def unit_rows(values: np.ndarray) -> np.ndarray:
 
 def spread_lines(values: np.ndarray) -> list[str]:
     """Return a line with the mean cosine of pairs of features (n, d), and a warning if they are nearly constant."""
-    rows = np.asarray(values[np.linspace(0, len(values) - 1, min(len(values), SPREAD_ROWS)).astype(int)], np.float64)
+    rows = np.asarray(
+        values[np.linspace(0, len(values) - 1, min(len(values), SPREAD_ROWS)).astype(int)],
+        np.float64,
+    )
     if len(rows) < 2 or not np.isfinite(rows).all():
         return []
     unit = unit_rows(rows)
@@ -108,7 +126,9 @@ def rows_of_sensors(sensor: Any, count: int, row: Callable[[str], int], rows: in
     if ids.dtype.kind in "UO":
         ids = np.array([row(name) for name in ids.reshape(-1)], np.int32).reshape(ids.shape)
     if ids.shape != (count,) or ids.dtype.kind not in "iu":
-        raise UserError(f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}")
+        raise UserError(
+            f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}"
+        )
     if ids.min(initial=0) < 0 or ids.max(initial=0) >= rows:
         raise UserError(f"sensor rows must be 0 to {rows - 1}")
     return ids.astype(np.int32)

@@ -21,7 +21,13 @@ from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.gels import RunningGel, other_unit, same_unit, untouched_gel
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
-from anytouch_jax.data.transforms import Flip, orient_frame, subtract_background, touch_evaluation, vision_evaluation
+from anytouch_jax.data.transforms import (
+    Flip,
+    orient_frame,
+    subtract_background,
+    touch_evaluation,
+    vision_evaluation,
+)
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import BATCH, Join, Log, Pooling, warn
 from anytouch_jax.encoder.engines import EngineChoice
@@ -35,7 +41,12 @@ from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import count_of, described, leaves
 
 Params = dict[str, Any]
-_PART_NAMES = {"image": "image tower", "text": "text tower", "matcher": "matching head", "logit_scale": "temperature"}
+_PART_NAMES = {
+    "image": "image tower",
+    "text": "text tower",
+    "matcher": "matching head",
+    "logit_scale": "temperature",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,16 +76,21 @@ class Encoder:
 
     def about(self) -> dict[str, str]:
         """Return what a user wants to know: family, parameters, input, background, features and sensors."""
-        model, count = self.config.model, sum(math.prod(leaf.shape) for leaf in leaves(self.params))
+        model = self.config.model
+        count = sum(math.prod(leaf.shape) for leaf in leaves(self.params))
         towers = [_PART_NAMES[name] for name in ("image", "text") if name in self.others]
         trained = self.trained_sensors
         background = "subtracted if it is given" if self.subtracts else "not used"
         return {
             "family": f"AnyTouch, width {model.touch.width}, depth {model.touch.depth}, {model.touch.heads} heads"
             + (f", with {' and '.join(towers)}" if towers else ""),
-            "parameters": count_of(count) + (" of the touch encoder" if towers else "") if count else "",
+            "parameters": count_of(count) + (" of the touch encoder" if towers else "")
+            if count
+            else "",
             "input": f"uint8 RGB {model.image_size} x {model.image_size}, 1 frame or clips of {model.frames} or more",
-            "background": "needed, the picture of the untouched gel" if self.needs_background else background,
+            "background": "needed, the picture of the untouched gel"
+            if self.needs_background
+            else background,
             "features": str(model.embed),
             "sensors": f"trained on {', '.join(trained)}" if trained else ", ".join(model.sensors),
         }
@@ -89,17 +105,29 @@ class Encoder:
 
     def sensor_row(self, name: str, log: Log = warn) -> int:
         """Return the row of a sensor, or, logged, of the universal tokens (Sec. 3.5). SpellingError for a near name."""
-        model, name = self.config.model, str(name)
-        drawn, known = self.universal_drawn or not self.trained_sensors, name in model.sensors
-        if known and (drawn if name == UNIVERSAL else self.trained_sensors is None or name in self.trained_sensors):
+        model = self.config.model
+        name = str(name)
+        drawn = self.universal_drawn or not self.trained_sensors
+        known = name in model.sensors
+        if known and (
+            drawn
+            if name == UNIVERSAL
+            else self.trained_sensors is None or name in self.trained_sensors
+        ):
             return model.sensors.index(name)
         check_spelling(name, model.sensors)
         why = f"is not in this model's table ({', '.join(model.sensors)})"
         if known:
             why = f"was not in training, which had {', '.join(self.trained_sensors or ())}"
-        used = "the universal tokens" if drawn else "the mean of the trained sensors' tokens (no universal ones)"
+        used = (
+            "the universal tokens"
+            if drawn
+            else "the mean of the trained sensors' tokens (no universal ones)"
+        )
         log(f"sensor {name!r} {why}: using {used}")
-        return model.sensors.index(name) if known else model.universal_row
+        if known:
+            return model.sensors.index(name)
+        return model.universal_row
 
     def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
         """Return the same encoder with float32 or bfloat16 arithmetic; "trained" is that of its training."""
@@ -135,7 +163,8 @@ class Encoder:
 
     def input_form(self, frames: int) -> dict[str, Any]:
         """Return what an exported encoder says about its input, and how a picture becomes a frame of it."""
-        side, subtracts = self.config.model.image_size, self.subtracts
+        side = self.config.model.image_size
+        subtracts = self.subtracts
         difference = ", background-subtracted: clip(frame - gel + 128, 0, 255)" if subtracts else ""
         return {
             "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){difference}; sensor: int32 (B,)",
@@ -157,7 +186,9 @@ class Encoder:
         """Return what prepares frames, without parameters."""
         return Encoder(self.config, {}, self.source)
 
-    def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., jax.Array]:
+    def traceable(
+        self, pooling: Pooling = "class", join: Join = "mean"
+    ) -> Callable[..., jax.Array]:
         """Return the function from params, touches u8 (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
         return partial(touch_features, net=self.net, pooling=pooling, join=join)
 
@@ -166,7 +197,9 @@ class Encoder:
         frames = [frame] if background is None else subtract_background([frame], background)
         return touch_evaluation(frames, self.config.model.image_size)[0]
 
-    def preprocess(self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None) -> np.ndarray:
+    def preprocess(
+        self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None
+    ) -> np.ndarray:
         """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder does so.
 
         Raises UserError if the encoder needs a `background`, and there is none. `untouched_gel(frames)` makes one.
@@ -180,9 +213,13 @@ class Encoder:
         return Preprocess(self, background)(frame)
 
     def encode_touch(
-        self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
+        self,
+        frames: Any,
+        sensor: str | Sequence[str] | np.ndarray = UNIVERSAL,
+        *,
+        pooling: Pooling = "class",
         join: Join = "mean",
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3); not unit-norm.
 
         H and W are the model's size, see `preprocess`. T is 1 (a still), 3 (a clip) or more: then features of segments
@@ -192,7 +229,9 @@ class Encoder:
         frames = as_clips(frames)
         side = self.config.model.image_size
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
-            convert = "convert values 0 to 255 by np.asarray(frames, np.uint8), and " * (frames.dtype != np.uint8)
+            convert = "convert values 0 to 255 by np.asarray(frames, np.uint8), and " * (
+                frames.dtype != np.uint8
+            )
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {frames.dtype} "
                 f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
@@ -200,7 +239,9 @@ class Encoder:
         arrays.check_frames(self.config.model, frames.shape[1])
         check_choices(pooling, join)
         if len(frames) and (run := self.exported(frames.shape[1], pooling)) is not None:
-            rows = arrays.rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
+            rows = arrays.rows_of_sensors(
+                sensor, len(frames), self.sensor_row, len(self.config.model.sensors)
+            )
             return run(frames, rows)
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
 
@@ -214,9 +255,13 @@ class Encoder:
             self._compiled[key] = self.exporter(self, frames, pooling, fields=fields)
         return self._compiled[key]
 
-    def _encode(self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any) -> np.ndarray:
+    def _encode(
+        self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any
+    ) -> np.ndarray:
         """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled for a few B and `key`s."""
-        rows = arrays.rows_of_sensors(sensor, len(clips), self.sensor_row, len(self.config.model.sensors))
+        rows = arrays.rows_of_sensors(
+            sensor, len(clips), self.sensor_row, len(self.config.model.sensors)
+        )
         if key not in self._compiled:
             self._compiled[key] = jax.jit(run)
         with precision(self.config):
@@ -236,7 +281,9 @@ class Encoder:
     @cached_property
     def tokenizer(self) -> Tokenizer | None:
         """The tokenizer of the text tower."""
-        return None if self.tokenizer_file is None else load_tokenizer(self.tokenizer_file)
+        if self.tokenizer_file is None:
+            return None
+        return load_tokenizer(self.tokenizer_file)
 
     def encode_image(self, images: Any, *, batch: int = 64) -> np.ndarray:
         """Return embeddings f32 (B, E) of photographs RGB (h, w, 3), not unit-norm. UserError without a tower."""
@@ -244,9 +291,12 @@ class Encoder:
         def run(net: Net, params: Params, pixels: jax.Array) -> jax.Array:
             return net.encode_image(params, normalise_image(pixels)).astype(jnp.float32)
 
-        tower, size = self._part("encode_image", run, "image", "lora"), self.config.model.image_size
+        tower = self._part("encode_image", run, "image", "lora")
+        size = self.config.model.image_size
         images = [images] if getattr(images, "ndim", 0) == 3 else images
-        pixels = (vision_evaluation(to_rgb(np.asarray(image), "the image"), size) for image in images)
+        pixels = (
+            vision_evaluation(to_rgb(np.asarray(image), "the image"), size) for image in images
+        )
         return self._embeddings(tower, pixels, batch)
 
     def encode_text(self, texts: str | Sequence[str], *, batch: int = 64) -> np.ndarray:
@@ -257,9 +307,12 @@ class Encoder:
 
         tower = self._part("encode_text", run, "text")
         assert self.whole is not None and self.whole.text is not None
-        tokenizer, text = self.tokenizer, self.whole.text
+        tokenizer = self.tokenizer
+        text = self.whole.text
         if tokenizer is None:
-            raise UserError(f"there is no tokenizer.json in the folder of {self.source}; copy the one of its training")
+            raise UserError(
+                f"there is no tokenizer.json in the folder of {self.source}; copy the one of its training"
+            )
         if tokenizer.vocab_size > text.vocab:
             raise UserError(
                 f"{self.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of {self.source} has "
@@ -272,9 +325,14 @@ class Encoder:
         return self._embeddings(tower, zip(ids, mask, strict=True), batch)
 
     def measure(
-        self, frames: Any, background: npt.ArrayLike | None = None, sensor: str = UNIVERSAL, *,
-        width_mm: float | None = None, log: Log = warn,
-    ) -> Fields:  # fmt: skip
+        self,
+        frames: Any,
+        background: npt.ArrayLike | None = None,
+        sensor: str = UNIVERSAL,
+        *,
+        width_mm: float | None = None,
+        log: Log = warn,
+    ) -> Fields:
         """Return depth, shear, contact and force of B frames in mm and N, with their deviations.
 
         `frames` are those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), whose
@@ -286,25 +344,42 @@ class Encoder:
         frames = arrays.as_array(frames, "frames")
         clips = as_clips(frames[..., None] if frames.ndim == 2 else frames)
         if clips.ndim != 5 or not len(clips):
-            raise UserError(f"frames must be (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), not {frames.shape}")
+            raise UserError(
+                f"frames must be (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), not {frames.shape}"
+            )
         arrays.check_frames(self.config.model, clips.shape[1])
         clips = clips[:, -self.config.model.frames :]
-        aspect, row = np.log(clips.shape[2] / clips.shape[3]), self.sensor_row(sensor, log)
+        aspect = np.log(clips.shape[2] / clips.shape[3])
+        row = self.sensor_row(sensor, log)
         parts = []
         for start in range(0, len(clips), BATCH):
             part = clips[start : start + BATCH]
-            ready = np.stack([[self.preprocess(frame, background) for frame in clip] for clip in part])
+            ready = np.stack(
+                [[self.preprocess(frame, background) for frame in clip] for clip in part]
+            )
             numbers = np.full(len(part), row, np.int32), np.full(len(part), aspect, np.float32)
             parts.append(self.encode_and_measure(ready, *numbers)[1])
-        out = FieldOutput._make(arrays.check_features(np.concatenate(values)) for values in zip(*parts, strict=True))
+        out = FieldOutput._make(
+            arrays.check_features(np.concatenate(values)) for values in zip(*parts, strict=True)
+        )
         return measure(out, [to_rgb(clip[-1], "the frame") for clip in clips])
 
     def measure_of(
-        self, sensor: str, background: npt.ArrayLike | None = None, width_mm: float | None = None, log: Log = warn,
-        *, rotate: int = 0, flip: Flip = "none",
-    ) -> Measure:  # fmt: skip
+        self,
+        sensor: str,
+        background: npt.ArrayLike | None = None,
+        width_mm: float | None = None,
+        log: Log = warn,
+        *,
+        rotate: int = 0,
+        flip: Flip = "none",
+    ) -> Measure:
         """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it. Raises UserError."""
-        gel = None if background is None else to_rgb(arrays.as_array(background, "the background"), "the background")
+        gel = (
+            None
+            if background is None
+            else to_rgb(arrays.as_array(background, "the background"), "the background")
+        )
         if not self.measures:
             raise missing(self.source)
         return Measure(scale_of(self.metadata, sensor, width_mm), sensor, gel, log, rotate, flip)
@@ -321,14 +396,21 @@ class Encoder:
 
         `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over width.
         """
-        if self.measures and (run := self.exported(clips.shape[1], pooling, fields=True)) is not None:
+        if (
+            self.measures
+            and (run := self.exported(clips.shape[1], pooling, fields=True)) is not None
+        ):
             return run.measure(np.asarray(clips), np.asarray(rows), np.asarray(aspect))
         if (key := ("fields", pooling)) not in self._compiled:
             net = build(usable(self.whole or self.config.model))
             self._compiled[key] = jax.jit(partial(features_and_fields, net=net, pooling=pooling))
         with precision(self.config):
-            values, out = self._compiled[key](self._placed_fields, *map(arrays.filled, (clips, rows, aspect)))
-        return np.asarray(values)[: len(clips)], FieldOutput._make(np.asarray(x)[: len(clips)] for x in out)
+            values, out = self._compiled[key](
+                self._placed_fields, *map(arrays.filled, (clips, rows, aspect))
+            )
+        return np.asarray(values)[: len(clips)], FieldOutput._make(
+            np.asarray(x)[: len(clips)] for x in out
+        )
 
     @cached_property
     def _placed_fields(self) -> Params:
@@ -337,22 +419,37 @@ class Encoder:
         return self._placed | jax.device_put({"fields": self.part_params("fields")})
 
     def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:
-        values = arrays.run_in_batches(lambda part: tower(jax.tree.map(arrays.filled, part)), items, batch)
-        return values if len(values) else np.zeros((0, self.config.model.embed), np.float32)
+        values = arrays.run_in_batches(
+            lambda part: tower(jax.tree.map(arrays.filled, part)), items, batch
+        )
+        if len(values):
+            return values
+        return np.zeros((0, self.config.model.embed), np.float32)
 
     def similarity(
-        self, touch: npt.ArrayLike, texts: str | Sequence[str] | np.ndarray, *, probabilities: bool = False
+        self,
+        touch: npt.ArrayLike,
+        texts: str | Sequence[str] | np.ndarray,
+        *,
+        probabilities: bool = False,
     ) -> np.ndarray:
         """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text embeddings (L, E).
 
         `probabilities` are their softmax with the learned temperature: a zero-shot classifier. UserError without a
         tower.
         """
-        embeddings = texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts)  # type: ignore[arg-type]
-        z_touch, z_text = np.asarray(touch, np.float32), np.asarray(embeddings, np.float32)
+        embeddings = (
+            texts
+            if isinstance(texts, np.ndarray) and texts.dtype.kind == "f"
+            else self.encode_text(texts)
+        )  # type: ignore[arg-type]
+        z_touch = np.asarray(touch, np.float32)
+        z_text = np.asarray(embeddings, np.float32)
         if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
             width = z_text.shape[-1]
-            raise UserError(f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}")
+            raise UserError(
+                f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}"
+            )
         cosine = _unit(z_touch) @ _unit(z_text).T
         if not probabilities:
             return np.asarray(np.clip(cosine, -1, 1))
@@ -368,12 +465,19 @@ class Encoder:
         def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
             return net.match(params, losses.normalise(first), losses.normalise(second))
 
-        head, one, other = self._part("match", run, "matcher"), *(np.asarray(x, np.float32) for x in (first, second))
+        head, one, other = (
+            self._part("match", run, "matcher"),
+            *(np.asarray(x, np.float32) for x in (first, second)),
+        )
         if one.shape != other.shape or one.ndim != 2:
-            raise UserError(f"match takes two sets of features of one shape (B, E), not {one.shape}, {other.shape}")
+            raise UserError(
+                f"match takes two sets of features of one shape (B, E), not {one.shape}, {other.shape}"
+            )
         return np.asarray(head(arrays.filled(one), arrays.filled(other)))[: len(one)]
 
-    def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
+    def _part(
+        self, method: str, run: Callable[..., jax.Array], name: str, *more: str
+    ) -> Callable[..., jax.Array]:
         """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
         params = {name: self.part_params(name)}
         if method not in self._compiled:
@@ -392,7 +496,9 @@ class Encoder:
     def part_params(self, name: str) -> Params:
         """Return the parameters of a part: image, text, decoder, matcher or logit_scale. Raises UserError."""
         if name not in self.others:
-            raise UserError(f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has one")
+            raise UserError(
+                f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has one"
+            )
         return dict(self.others)[name]
 
 
@@ -408,26 +514,37 @@ class Preprocess:
     """
 
     def __init__(
-        self, encoder: Encoder, background: npt.ArrayLike | None = None, *,
-        frames: Iterable[npt.ArrayLike] | None = None, rotate: int = 0, flip: Flip = "none",
-        known: Mapping[str, np.ndarray] | None = None, log: Log = warn,
-    ) -> None:  # fmt: skip
+        self,
+        encoder: Encoder,
+        background: npt.ArrayLike | None = None,
+        *,
+        frames: Iterable[npt.ArrayLike] | None = None,
+        rotate: int = 0,
+        flip: Flip = "none",
+        known: Mapping[str, np.ndarray] | None = None,
+        log: Log = warn,
+    ) -> None:
         if background is not None and frames is not None:
             raise UserError("Give a background, or the frames that it is taken from, not both.")
         self._prepare = encoder.bare().prepare  # workers get no parameters
         self._subtracts = encoder.subtracts
         self._orient = partial(orient_frame, rotate=rotate, flip=flip)
-        self._known, self._log = dict(known or {}), log
+        self._known = dict(known or {})
+        self._log = log
         self._running = RunningGel() if encoder.needs_background or self._known else None
         self._background = None if frames is None else untouched_gel(frames)
         if background is not None:
-            self._background = to_rgb(arrays.as_array(background, "the background"), "the background")
+            self._background = to_rgb(
+                arrays.as_array(background, "the background"), "the background"
+            )
         self._gel: tuple[np.ndarray | None, np.ndarray] = None, np.zeros((0, 0, 3), np.uint8)
 
     @property
     def background(self) -> np.ndarray | None:
         """The picture of the untouched gel, RGB u8 (h, w, 3), as the camera takes it; None if there is none (yet)."""
-        return self._running.picture if self._background is None and self._running else self._background
+        if self._background is None and self._running:
+            return self._running.picture
+        return self._background
 
     @property
     def estimated(self) -> bool:
@@ -435,8 +552,11 @@ class Preprocess:
         return self._background is None and self._running is not None and not self._running.settled
 
     def __repr__(self) -> str:
-        gel, encoder = self._background, getattr(self._prepare, "__self__", None)
-        known = "the first frame" if gel is None else f"a picture of {gel.shape[1]} x {gel.shape[0]}"
+        gel = self._background
+        encoder = getattr(self._prepare, "__self__", None)
+        known = (
+            "the first frame" if gel is None else f"a picture of {gel.shape[1]} x {gel.shape[0]}"
+        )
         used = f"minus {known}" if self._subtracts else "without a background"
         turned = " ".join(f"{name}={value!r}" for name, value in self._orient.keywords.items())
         return f"Preprocess(frames of {getattr(encoder, 'source', 'an encoder')}, {used}, {turned})"
@@ -445,14 +565,16 @@ class Preprocess:
         """Return a camera's frame (h, w, 3), or grey, RGBA, u16 or floats in 0..1, as the encoder reads it."""
         frame = to_rgb(arrays.as_array(frame, "the frame"), "the frame")
         if self._background is None and self._known:
-            known, self._known = self._known, {}
+            known = self._known
+            self._known = {}
             gel, why = same_unit(known, frame)
             self._background = None if why else gel
             if why:
                 self._log(other_unit(why))
         if self._background is None and self._running is not None:
             self._running.add(frame)
-        frame, gel = np.ascontiguousarray(self._orient(frame)), self.background
+        frame = np.ascontiguousarray(self._orient(frame))
+        gel = self.background
         if gel is None or not self._subtracts:
             return self._prepare(frame)
         if self._gel[0] is not gel:
@@ -463,7 +585,9 @@ class Preprocess:
 def _unit(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
     """Return rows divided by their length, or by 1e-12 if that is larger, as `losses.normalise`."""
     wide = np.asarray(values, np.float64)
-    return np.asarray(wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-12), np.float32)
+    return np.asarray(
+        wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-12), np.float32
+    )
 
 
 def precision(config: Config) -> AbstractContextManager[Any]:
@@ -475,7 +599,11 @@ def precision(config: Config) -> AbstractContextManager[Any]:
 def as_clips(frames: Any) -> np.ndarray:
     """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips. Raises UserError for frames of two sizes."""
     frames = arrays.as_array(frames, "frames")
-    return frames[None, None] if frames.ndim == 3 else frames[:, None] if frames.ndim == 4 else frames
+    if frames.ndim == 3:
+        return frames[None, None]
+    if frames.ndim == 4:
+        return frames[:, None]
+    return frames
 
 
 def check_choices(pooling: Pooling, join: Join) -> None:
@@ -493,12 +621,19 @@ def touch_features(
     clips = normalise_touch(clips)
     if pooling == "class":
         return net.encode_touch(params, clips, sensor, join).astype(jnp.float32)
-    both = net.encode_poolings(params, clips, sensor, join)  # an unused half is not computed
+    # an unused half is not computed
+    both = net.encode_poolings(params, clips, sensor, join)
     return jnp.concatenate(both if pooling == "both" else both[1:], axis=-1).astype(jnp.float32)
 
 
 def features_and_fields(
-    params: Any, clips: jax.Array, sensor: jax.Array, aspect: jax.Array, *, net: Net, pooling: Pooling
+    params: Any,
+    clips: jax.Array,
+    sensor: jax.Array,
+    aspect: jax.Array,
+    *,
+    net: Net,
+    pooling: Pooling,
 ) -> tuple[jax.Array, FieldOutput]:
     """Return features f32 (B, E) and fields of touches u8 (B, T, H, W, 3), sensor rows and aspects (B,)."""
     check_choices(pooling, "mean")
@@ -523,4 +658,6 @@ def bare_model(model: ModelConfig) -> ModelConfig:
 
 def touch_only(config: Config) -> Config:
     """Return the configuration of the touch encoder alone."""
-    return replace(config, model=bare_model(config.model), data=replace(config.data, on_bad_sample="error"))
+    return replace(
+        config, model=bare_model(config.model), data=replace(config.data, on_bad_sample="error")
+    )

@@ -31,16 +31,29 @@ from anytouch_jax.weights import load, registry
 from anytouch_jax.weights.families import Size, load_family
 
 __all__ = [
-    "Encoder", "EngineEncoder", "ExampleTouch", "check_frames", "example_touches", "find_tokenizer", "load_encoder",
-    "load_engine", "random_encoder", "touch_features",
-]  # fmt: skip
-FOLDER = Path(__file__).parent / "examples"  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg of the untouched gel
+    "Encoder",
+    "EngineEncoder",
+    "ExampleTouch",
+    "check_frames",
+    "example_touches",
+    "find_tokenizer",
+    "load_encoder",
+    "load_engine",
+    "random_encoder",
+    "touch_features",
+]
+# PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg of the untouched gel
+FOLDER = Path(__file__).parent / "examples"
 
 
 def load_encoder(
-    path: str | Path, *, step: int | None = None, heads: int | None = None, image_size: int | Size | None = None,
+    path: str | Path,
+    *,
+    step: int | None = None,
+    heads: int | None = None,
+    image_size: int | Size | None = None,
     engine: EngineChoice = "auto",
-) -> Encoder:  # fmt: skip
+) -> Encoder:
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
     Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
@@ -54,12 +67,17 @@ def load_encoder(
     without a touch encoder or with values that are not finite, and in a process that cannot use jax.
     """
     refuse_forked()
-    name, path, names = str(path), registry.locate(path), set[str]()
+    name = str(path)
+    path = registry.locate(path)
+    names = set[str]()
     if path.suffix == ".npz":
-        with suppress(OSError, ValueError):  # the reader of weights reports a damaged file
+        # the reader of weights reports a damaged file
+        with suppress(OSError, ValueError):
             names = set(read_arrays(path, only=lambda _: False))
     if {"features", "rows"} <= names:
-        raise UserError(f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`")
+        raise UserError(
+            f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`"
+        )
     if path.suffix == ".onnx":
         return load_engine(path, None if engine == "auto" else engine)
     if engine not in (known := ("auto", "xla", "onnxruntime", "openvino")):
@@ -67,20 +85,34 @@ def load_encoder(
     model, weights = load_family(path, heads=heads, image_size=image_size)
     if model is not None:
         if engine not in ("auto", "xla"):
-            raise UserError(f"{name} is an encoder of another family, which XLA computes; leave out {engine}")
+            raise UserError(
+                f"{name} is an encoder of another family, which XLA computes; leave out {engine}"
+            )
         return family_encoder(model, name, path)
     if heads is not None or image_size is not None:
         raise UserError(f"{name} stores its heads and image size; leave out heads and image_size")
     loaded = load.load_model(path, step=step, weights=weights)
     if "touch" not in loaded.params:
-        raise UserError(f"{name} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights")
+        raise UserError(
+            f"{name} has no touch encoder; give a stage-1 or stage-2 run, or AnyTouch weights"
+        )
     others = {name: part for name, part in loaded.params.items() if name != "touch"}
     encoder = Encoder(
-        touch_only(loaded.config), {"touch": loaded.params["touch"]}, name, loaded.trained_sensors,
-        loaded.universal_drawn, loaded.config.model, others, find_tokenizer(path), loaded.metadata, engine,
+        touch_only(loaded.config),
+        {"touch": loaded.params["touch"]},
+        name,
+        loaded.trained_sensors,
+        loaded.universal_drawn,
+        loaded.config.model,
+        others,
+        find_tokenizer(path),
+        loaded.metadata,
+        engine,
         export.cached_export,
-    )  # fmt: skip
-    return encoder if engine in ("auto", "xla") else encoder.computed_in("float32")
+    )
+    if engine in ("auto", "xla"):
+        return encoder
+    return encoder.computed_in("float32")
 
 
 @dataclass(frozen=True, repr=False)
@@ -118,35 +150,58 @@ class EngineEncoder(Encoder):
         return self
 
     def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., Any]:
-        raise UserError(f"{self.source} has no parameters for jax; name the encoder that it was exported from")
+        raise UserError(
+            f"{self.source} has no parameters for jax; name the encoder that it was exported from"
+        )
 
     def encode_touch(
-        self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL, *, pooling: Pooling = "class",
+        self,
+        frames: Any,
+        sensor: str | Sequence[str] | np.ndarray = UNIVERSAL,
+        *,
+        pooling: Pooling = "class",
         join: Join = "mean",
-    ) -> np.ndarray:  # fmt: skip
-        frames, about = as_clips(frames), self.run.about
+    ) -> np.ndarray:
+        frames = as_clips(frames)
+        about = self.run.about
         if pooling != about["pooling"]:
-            raise UserError(f"{self.source} has pooling {about['pooling']}, not {pooling}; export it again with that")
+            raise UserError(
+                f"{self.source} has pooling {about['pooling']}, not {pooling}; export it again with that"
+            )
         rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
-        return self.run(frames, rows) if len(frames) else np.zeros((0, about["features"]), np.float32)
+        if len(frames):
+            return self.run(frames, rows)
+        return np.zeros((0, about["features"]), np.float32)
 
 
 def load_engine(path: str | Path, engine: Engine | None = None) -> EngineEncoder:
     """Load an ONNX model of `export` as an encoder, on onnxruntime or another engine. Raises UserError."""
     run = export.load(path, engine)
     if run.about["form"] != "onnx":
-        raise UserError(f"{path} is for jax alone; call it by anytouch_jax.load_exported, or export it with --to onnx")
-    config, trained = from_json(json.dumps(run.about["config"])), run.about.get("trained_sensors")
+        raise UserError(
+            f"{path} is for jax alone; call it by anytouch_jax.load_exported, or export it with --to onnx"
+        )
+    config = from_json(json.dumps(run.about["config"]))
+    trained = run.about.get("trained_sensors")
     sensors = trained and tuple(map(str, trained))
     metadata = {METADATA: run.about.get("fields", {}).get("calibration", {})}
-    return EngineEncoder(config, {}, str(path), sensors, run.about["universal_drawn"], metadata=metadata, run=run)
+    return EngineEncoder(
+        config, {}, str(path), sensors, run.about["universal_drawn"], metadata=metadata, run=run
+    )
 
 
 def find_tokenizer(path: Path) -> Path | None:
     """Return the tokenizer.json of a run, of the run of a checkpoint, or of the folder of a file."""
     is_checkpoint = path.is_dir() and not (path / "config.json").is_file()
-    folders = [path, path.parent, path.parent.parent] if is_checkpoint else [path if path.is_dir() else path.parent]
-    return next((folder / "tokenizer.json" for folder in folders if (folder / "tokenizer.json").is_file()), None)
+    folders = (
+        [path, path.parent, path.parent.parent]
+        if is_checkpoint
+        else [path if path.is_dir() else path.parent]
+    )
+    return next(
+        (folder / "tokenizer.json" for folder in folders if (folder / "tokenizer.json").is_file()),
+        None,
+    )
 
 
 @shown_short
@@ -165,5 +220,9 @@ def example_touches() -> list[ExampleTouch]:
     touches = []
     for file in files:
         press, sensor = file.stem.split("-")
-        touches.append(ExampleTouch(press, sensor, decode(file), decode(file.with_stem(f"{file.stem}-background"))))
+        touches.append(
+            ExampleTouch(
+                press, sensor, decode(file), decode(file.with_stem(f"{file.stem}-background"))
+            )
+        )
     return touches

@@ -39,17 +39,24 @@ if TYPE_CHECKING:
 FORMAT = "anytouch_jax.export.1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 ONNX_TOLERANCE = 1e-5
-TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "float64": 1e-4}  # of the largest feature; the platform's own rounding
+# of the largest feature; the platform's own rounding
+TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "float64": 1e-4}
 # The fields of a description that a caller needs.
 _FIELDS: dict[str, type] = {
     **dict.fromkeys(("bytes", "frames", "image_size", "features"), int),
     **dict.fromkeys(("sha256", "jax", "background", "pooling", "join", "dtype", "form"), str),
     **{"platforms": list, "sensors": dict},
 }
-_ONNX_FIELDS: dict[str, type] = {"source": str, "config": dict, "weights": str, "universal_drawn": bool}
+_ONNX_FIELDS: dict[str, type] = {
+    "source": str,
+    "config": dict,
+    "weights": str,
+    "universal_drawn": bool,
+}
 _ENGINES = {"jax": ("xla",), "onnx": ("onnxruntime", "openvino")}
 _CHECKED = (1, 5)  # batch sizes
-LARGEST = 16_000_000  # parameters; in larger encoders products take the time, which are equally fast in XLA
+# parameters; in larger encoders products take the time, which are equally fast in XLA
+LARGEST = 16_000_000
 _CACHE = ".engines"  # next to the weights
 _EXAMPLE = {
     "jax": """import pathlib
@@ -90,22 +97,34 @@ class Exported:
 
     def __repr__(self) -> str:
         return described(
-            f"Exported {self.about.get('source', 'encoder')}", input=str(self.about.get("input", "")),
+            f"Exported {self.about.get('source', 'encoder')}",
+            input=str(self.about.get("input", "")),
             features=f"{self.about['features']}, pooling {self.about['pooling']}",
-            background=str(self.about["background"]), sensors=", ".join(self.about["sensors"]),
-        )  # fmt: skip
+            background=str(self.about["background"]),
+            sensors=", ".join(self.about["sensors"]),
+        )
 
-    def __call__(self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL) -> np.ndarray:
+    def __call__(
+        self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL
+    ) -> np.ndarray:
         """Return features f32 (B, E) of touches (B, T, H, W, 3), u8 RGB or as another family prepares them.
 
         `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape, type or sensor.
         """
         frames = arrays.as_array(frames, "frames")
-        side, kind = self.about["image_size"], self.about.get("frame_dtype", "uint8")
+        side = self.about["image_size"]
+        kind = self.about.get("frame_dtype", "uint8")
         wanted = (self.about["frames"], *self.about.get("frame_shape", (side, side, 3)))
-        if frames.dtype != kind or frames.ndim != 5 or frames.shape[1:] != wanted or not len(frames):
+        if (
+            frames.dtype != kind
+            or frames.ndim != 5
+            or frames.shape[1:] != wanted
+            or not len(frames)
+        ):
             shape = ", ".join(str(size) for size in wanted)
-            raise UserError(f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}")
+            raise UserError(
+                f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}"
+            )
         rows = arrays.rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
         if "fields" in self.about:  # the aspect does not change features
             return np.asarray(self.measure(frames, rows, np.zeros(len(frames), np.float32))[0])
@@ -118,9 +137,14 @@ class Exported:
     @property
     def gels(self) -> dict[str, np.ndarray]:
         """Pictures RGB u8 (h, w, 3) of the untouched gel, by unit, of the touches that int8 was calibrated on."""
-        return {name: decode_bytes(b64decode(text), name) for name, text in self.about.get("gels", {}).items()}
+        return {
+            name: decode_bytes(b64decode(text), name)
+            for name, text in self.about.get("gels", {}).items()
+        }
 
-    def measure(self, frames: np.ndarray, rows: np.ndarray, aspect: np.ndarray) -> tuple[np.ndarray, FieldOutput]:
+    def measure(
+        self, frames: np.ndarray, rows: np.ndarray, aspect: np.ndarray
+    ) -> tuple[np.ndarray, FieldOutput]:
         """Return features and fields, as `Encoder.encode_and_measure`, of a model that has fields."""
         values, out = self._run(frames, rows, aspect)
         return values, out
@@ -128,7 +152,9 @@ class Exported:
     def _row(self, name: str) -> int:
         sensors: dict[str, int] = self.about["sensors"]
         if name not in sensors:
-            raise UserError(f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other")
+            raise UserError(
+                f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other"
+            )
         return sensors[name]
 
 
@@ -141,9 +167,12 @@ def load(path: str | Path, engine: Engine | None = None) -> Exported:
     """Load what `export` wrote to `path`, to run on an `engine`. Raises UserError for a damaged or unfit file."""
     path = Path(path)
     data, about = read_checked(path)
-    form, runs_on = about["form"], _ENGINES[about["form"]]
+    form = about["form"]
+    runs_on = _ENGINES[about["form"]]
     if engine not in (None, *runs_on):
-        raise UserError(f"{path} runs on {' or '.join(runs_on)}, not on {engine}; name the encoder that it was made of")
+        raise UserError(
+            f"{path} runs on {' or '.join(runs_on)}, not on {engine}; name the encoder that it was made of"
+        )
     if form == "jax" and _here() not in about["platforms"]:
         raise UserError(
             f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs jax on {_here()}; "
@@ -164,11 +193,19 @@ def load(path: str | Path, engine: Engine | None = None) -> Exported:
 
 
 def export(
-    encoder: Encoder, path: str | Path, *, frames: int = 1, platforms: Sequence[str] = ("cpu", "cuda"),
-    pooling: Pooling = "class", join: Join = "mean", form: Literal["jax", "onnx"] = "jax",
-    calibration: tuple[np.ndarray, np.ndarray] | None = None, gels: Mapping[str, np.ndarray] | None = None,
-    fields: bool = False, engine: Engine = "onnxruntime",
-) -> dict[str, Any]:  # fmt: skip
+    encoder: Encoder,
+    path: str | Path,
+    *,
+    frames: int = 1,
+    platforms: Sequence[str] = ("cpu", "cuda"),
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    form: Literal["jax", "onnx"] = "jax",
+    calibration: tuple[np.ndarray, np.ndarray] | None = None,
+    gels: Mapping[str, np.ndarray] | None = None,
+    fields: bool = False,
+    engine: Engine = "onnxruntime",
+) -> dict[str, Any]:
     """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
 
     The artefact is first called with 1 and 5 touches and compared with the live model by XLA. ONNX is float32, for
@@ -179,10 +216,14 @@ def export(
     """
     encoder = replace(encoder, engine="xla")
     if form == "onnx":
-        encoder, platforms = encoder.computed_in("float32"), (_here(),)
+        encoder = encoder.computed_in("float32")
+        platforms = (_here(),)
         if encoder.blank.dtype != np.uint8:
-            raise UserError(f"ONNX is written for AnyTouch's own network; export {encoder.source} with --to jax")
-    path, model = Path(path), encoder.config.model
+            raise UserError(
+                f"ONNX is written for AnyTouch's own network; export {encoder.source} with --to jax"
+            )
+    path = Path(path)
+    model = encoder.config.model
     if fields and (form != "onnx" or calibration is not None):
         raise UserError("fields are exported to ONNX in float32: use --to onnx, without --int8")
     params = encoder.params | ({"fields": encoder.part_params("fields")} if fields else {})
@@ -191,7 +232,9 @@ def export(
     if wrong or not platforms:
         raise UserError(f"platforms must be of {', '.join(PLATFORMS)}, not {wrong or 'none'}")
     if _here() not in platforms:
-        raise UserError(f"this machine runs jax on {_here()}: add it to --platforms, to check the artefact")
+        raise UserError(
+            f"this machine runs jax on {_here()}: add it to --platforms, to check the artefact"
+        )
     if path.suffix == ".json":
         raise UserError(f"{path} is the name of the description; name the artefact .bin or .onnx")
     # The only form of attention that every platform has and that takes any number of touches.
@@ -212,27 +255,51 @@ def export(
         )
     more: dict[str, Any] = {"platforms": list(platforms)}
     if form == "onnx":
-        config, drawn = json.loads(to_json(encoder.config)), encoder.universal_drawn
-        more = {"platforms": ["cpu"], "config": config, "weights": encoder.fingerprint, "universal_drawn": drawn}
+        config = json.loads(to_json(encoder.config))
+        drawn = encoder.universal_drawn
+        more = {
+            "platforms": ["cpu"],
+            "config": config,
+            "weights": encoder.fingerprint,
+            "universal_drawn": drawn,
+        }
     if fields:
-        more["fields"] = {"outputs": list(FieldOutput._fields), "calibration": encoder.metadata.get(METADATA, {})}
-        more["aspect"] = "float32 (B,): the logarithm of the height over the width that the picture shows"
+        more["fields"] = {
+            "outputs": list(FieldOutput._fields),
+            "calibration": encoder.metadata.get(METADATA, {}),
+        }
+        more["aspect"] = (
+            "float32 (B,): the logarithm of the height over the width that the picture shows"
+        )
     if calibration is not None:
         data = engines.quantised(data, *calibration)
         more["int8"] = _int8_error(live, engines.session(data), *calibration, pooling)
     shape = f"{encoder.blank.dtype} (B, {frames}, {', '.join(map(str, encoder.blank.shape))})"
     trained = encoder.trained_sensors
     about = {
-        "format": FORMAT, "form": form, "file": path.name, "bytes": len(data),
-        "sha256": hashlib.sha256(data).hexdigest(), "jax": jax.__version__, **more, "source": encoder.source,
-        "output": f"features: float32 (B, {width}), not normalised", **encoder.input_form(frames), "frames": frames,
-        "image_size": model.image_size, "features": width, "background": encoder.config.data.background,
-        "pooling": pooling, "join": join, "dtype": encoder.config.model.dtype,
+        "format": FORMAT,
+        "form": form,
+        "file": path.name,
+        "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "jax": jax.__version__,
+        **more,
+        "source": encoder.source,
+        "output": f"features: float32 (B, {width}), not normalised",
+        **encoder.input_form(frames),
+        "frames": frames,
+        "image_size": model.image_size,
+        "features": width,
+        "background": encoder.config.data.background,
+        "pooling": pooling,
+        "join": join,
+        "dtype": encoder.config.model.dtype,
         "sensors": {name: row for row, name in enumerate(model.sensors)},
-        "trained_sensors": None if trained is None else list(trained), "worst_difference": differs,
+        "trained_sensors": None if trained is None else list(trained),
+        "worst_difference": differs,
         "gels": {name: b64encode(encode(gel)).decode() for name, gel in (gels or {}).items()},
         "example": _EXAMPLE[form].format(name=path.name, shape=shape),
-    }  # fmt: skip
+    }
     atomic_write(path, data)
     atomic_write(describes(path), json.dumps(about, indent=2) + "\n")
     return about
@@ -243,17 +310,28 @@ def _here() -> str:
     return {"gpu": "cuda"}.get(jax.default_backend(), jax.default_backend())
 
 
-def _artefact(encoder: Encoder, frames: int, platforms: Sequence[str], pooling: Pooling, join: Join) -> bytes:
-    (batch,), blank = jax_export.symbolic_shape("b"), encoder.blank
+def _artefact(
+    encoder: Encoder, frames: int, platforms: Sequence[str], pooling: Pooling, join: Join
+) -> bytes:
+    (batch,) = jax_export.symbolic_shape("b")
+    blank = encoder.blank
     run = partial(encoder.traceable(pooling, join), encoder.params)
     touches = jax.ShapeDtypeStruct((batch, frames, *blank.shape), blank.dtype)
     rows = jax.ShapeDtypeStruct((batch,), np.int32)
-    return bytes(jax_export.export(jax.jit(run), platforms=tuple(platforms))(touches, rows).serialize())
+    return bytes(
+        jax_export.export(jax.jit(run), platforms=tuple(platforms))(touches, rows).serialize()
+    )
 
 
-def _worst(encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join, fields: bool) -> tuple[float, int]:
+def _worst(
+    encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join, fields: bool
+) -> tuple[float, int]:
     """Return the largest difference from the live model, over the largest (or a usual) value, and the feature count."""
-    model, rng, worst, width, blank = encoder.config.model, np.random.default_rng(0), 0.0, 0, encoder.blank
+    model = encoder.config.model
+    rng = np.random.default_rng(0)
+    worst = 0.0
+    width = 0
+    blank = encoder.blank
     for count in _CHECKED:
         clips = rng.integers(0, 256, (count, frames, *blank.shape), np.uint8)
         clips = clips if blank.dtype == np.uint8 else clips.astype(blank.dtype) / 255
@@ -263,22 +341,33 @@ def _worst(encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join
             live, mine = encoder.encode_and_measure(clips, rows, aspect, pooling)
             exported, theirs = run(clips, rows, aspect)
             pairs = [(np.asarray(a), np.asarray(b)) for a, b in zip(mine, theirs, strict=True)]
-            off = [np.inf if a.shape != b.shape else abs(a - b).max() / max(abs(a).max(), LENGTH) for a, b in pairs]
+            off = [
+                np.inf if a.shape != b.shape else abs(a - b).max() / max(abs(a).max(), LENGTH)
+                for a, b in pairs
+            ]
             worst = max(worst, float(np.max(off)))
         else:
             live = encoder.encode_touch(clips, rows, pooling=pooling, join=join)
             exported = np.asarray(run(clips, rows))
-        if exported.shape != live.shape or not (np.isfinite(exported).all() and np.isfinite(live).all()):
-            raise CheckError(f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite")
+        if exported.shape != live.shape or not (
+            np.isfinite(exported).all() and np.isfinite(live).all()
+        ):
+            raise CheckError(
+                f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite"
+            )
         worst = max(worst, float(np.abs(exported - live).max() / np.abs(live).max()))
         width = live.shape[1]
     return worst, width
 
 
-def _int8_error(encoder: Encoder, run: Any, touches: Array, rows: Array, pooling: Pooling) -> dict[str, float]:
+def _int8_error(
+    encoder: Encoder, run: Any, touches: Array, rows: Array, pooling: Pooling
+) -> dict[str, float]:
     """Return the largest difference of int8 on its calibration touches, and the mean cosine with the live features."""
     items = list(zip(touches, rows, strict=True))
-    live = arrays.run_in_batches(lambda part: encoder.encode_touch(*part, pooling=pooling), items, 20)
+    live = arrays.run_in_batches(
+        lambda part: encoder.encode_touch(*part, pooling=pooling), items, 20
+    )
     own = arrays.run_in_batches(lambda part: run(*part), items, 20)
     cosine = float((arrays.unit_rows(own) * arrays.unit_rows(live)).sum(1).mean())
     worst = float(np.abs(own - live).max() / np.abs(live).max())
@@ -288,7 +377,8 @@ def _int8_error(encoder: Encoder, run: Any, touches: Array, rows: Array, pooling
 def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
     """Return the bytes of an artefact and its description, after comparing them. Raises UserError."""
     try:
-        data, text = path.read_bytes(), describes(path).read_bytes()
+        data = path.read_bytes()
+        text = describes(path).read_bytes()
     except OSError as error:
         missing = describes(path) if path.is_file() else path
         raise UserError(
@@ -298,23 +388,39 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
         about = parse_json(text)
         known = about["format"] == FORMAT
     except (ValueError, KeyError, TypeError):
-        raise UserError(f"{describes(path)} is not the description of an exported encoder; export it again") from None
+        raise UserError(
+            f"{describes(path)} is not the description of an exported encoder; export it again"
+        ) from None
     if not known:
-        raise UserError(f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}")
+        raise UserError(
+            f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}"
+        )
     about.setdefault("form", "jax")  # files of version 0.2
     fields = _FIELDS | (_ONNX_FIELDS if about["form"] == "onnx" else {})
-    wrong = [name for name, kind in fields.items() if type(about.get(name)) is not kind or about[name] in ([], {})]
+    wrong = [
+        name
+        for name, kind in fields.items()
+        if type(about.get(name)) is not kind or about[name] in ([], {})
+    ]
     wrong += [] if "form" in wrong or about["form"] in _ENGINES else ["form"]
-    wrong = wrong or [name for name in ("frames", "image_size", "features") if not 0 < about[name] < 1 << 20]
+    wrong = wrong or [
+        name for name in ("frames", "image_size", "features") if not 0 < about[name] < 1 << 20
+    ]
     if wrong or list(about["sensors"].values()) != list(range(len(about["sensors"]))):
         name = (wrong or ["sensors"])[0]
-        raise UserError(f"{describes(path)} is damaged: {name} is missing or wrong; export it again")
+        raise UserError(
+            f"{describes(path)} is damaged: {name} is missing or wrong; export it again"
+        )
     if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:
-        raise UserError(f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again")
+        raise UserError(
+            f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again"
+        )
     return data, about
 
 
-def cached_export(encoder: Encoder, frames: int, pooling: Pooling, *, fields: bool = False) -> Exported | None:
+def cached_export(
+    encoder: Encoder, frames: int, pooling: Pooling, *, fields: bool = False
+) -> Exported | None:
     """Return the export of touches of `frames` frames on the encoder's engine, None where XLA computes.
 
     "auto" is onnxruntime if it is installed and jax runs on a CPU. The encoder must compute in float32, have at most
@@ -329,10 +435,13 @@ def cached_export(encoder: Encoder, frames: int, pooling: Pooling, *, fields: bo
     if is_auto and (jax.default_backend() != "cpu" or model.dtype != "float32" or count > LARGEST):
         return None
     if model.dtype != "float32":
-        raise UserError(f"{engine} computes in float32, not in {model.dtype}; leave out --dtype, or use XLA")
+        raise UserError(
+            f"{engine} computes in float32, not in {model.dtype}; leave out --dtype, or use XLA"
+        )
     on: Engine = "onnxruntime" if engine == "auto" else engine
     try:
-        name, folders = f"{_key(encoder, on, frames, pooling, fields)}.onnx", _folders(encoder.source)
+        name = f"{_key(encoder, on, frames, pooling, fields)}.onnx"
+        folders = _folders(encoder.source)
         for path in (folder / name for folder in folders):
             if is_auto and _is_refused(path):
                 return None
@@ -350,19 +459,34 @@ def cached_export(encoder: Encoder, frames: int, pooling: Pooling, *, fields: bo
 
 
 def _made(
-    encoder: Encoder, engine: Engine, name: str, folders: list[Path], frames: int, pooling: Pooling, fields: bool
+    encoder: Encoder,
+    engine: Engine,
+    name: str,
+    folders: list[Path],
+    frames: int,
+    pooling: Pooling,
+    fields: bool,
 ) -> Exported:
     """Make an export, and store it in the first folder that can be written. Raises CheckError, which is stored too."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / name
         try:
-            export(encoder, path, frames=frames, pooling=pooling, form="onnx", fields=fields, engine=engine)
+            export(
+                encoder,
+                path,
+                frames=frames,
+                pooling=pooling,
+                form="onnx",
+                fields=fields,
+                engine=engine,
+            )
             return load(path, engine)
         except CheckError as error:
             atomic_write(describes(path), json.dumps({"refused": str(error)}))
             raise
         finally:
-            files = {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir())}  # the description last
+            # the description last
+            files = {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir())}
             for stored in folders if files else []:
                 with contextlib.suppress(OSError):
                     for file, data in files.items():
@@ -375,7 +499,15 @@ def _key(encoder: Encoder, engine: Engine, frames: int, pooling: Pooling, fields
     """Return a name for everything that decides the features: weights, preprocessing, code, engine and its version."""
     params = encoder.params | ({"fields": encoder.part_params("fields")} if fields else {})
     made_by = Path(engines.__file__).read_bytes(), engines.imported(engine).__version__
-    asked = FORMAT, engine, frames, pooling, fields, encoder.contract, encoder.config.data.background
+    asked = (
+        FORMAT,
+        engine,
+        frames,
+        pooling,
+        fields,
+        encoder.contract,
+        encoder.config.data.background,
+    )
     digest = hashlib.sha256(repr((asked, made_by)).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         digest.update(f"{path} {leaf.dtype} {leaf.shape}".encode())
@@ -385,7 +517,8 @@ def _key(encoder: Encoder, engine: Engine, frames: int, pooling: Pooling, fields
 
 def _folders(source: str) -> list[Path]:
     """Return where an export is looked for: next to weights of the user, then in the user's cache."""
-    path, own = Path(source), cache_folder() / "engines"
+    path = Path(source)
+    own = cache_folder() / "engines"
     if source in list_encoders() or source.startswith("hf:") or not path.exists():
         return [own]
     return [(path if path.is_dir() else path.parent) / _CACHE, own]

@@ -17,28 +17,69 @@ import numpy as np
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows
 from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS, spread
-from anytouch_jax.data.prepare.untouched_gel import DOT_DEPTH, UntouchedGel, close_dots, has_dots, scale_picture
+from anytouch_jax.data.prepare.untouched_gel import (
+    DOT_DEPTH,
+    UntouchedGel,
+    close_dots,
+    has_dots,
+    scale_picture,
+)
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 
-_LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "looks.npz"  # real untouched gels, in the package
-RECORDINGS, FRAMES = 24, 6  # that are read of a unit, and of a recording
+# real untouched gels, in the package
+_LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "looks.npz"
+# that are read of a unit, and of a recording
+RECORDINGS = 24
+FRAMES = 6
 SIDE = 16  # of the layout of a picture
 LIMITS = {
-    "orientation": 0.10, "exposure": 0.25, "focus": 0.5, "detail": 0.7, "frozen": 0.02, "dropped": 0.01, "tint": 0.20,
-    "dead pixels": 0.0, "scratch": 12.0, "scratch length": 36.0, "background": 20.0, "two units": 16.0,
-}  # fmt: skip
+    "orientation": 0.10,
+    "exposure": 0.25,
+    "focus": 0.5,
+    "detail": 0.7,
+    "frozen": 0.02,
+    "dropped": 0.01,
+    "tint": 0.20,
+    "dead pixels": 0.0,
+    "scratch": 12.0,
+    "scratch length": 36.0,
+    "background": 20.0,
+    "two units": 16.0,
+}
 _SHARE = 0.25  # of recordings that look like another unit
 _ALIKE = 0.6  # distance within another unit, as a share of that between the two
 _DOTS = 21  # pixels of the widest marker dots, at 160 pixels
-_LIKE, _FEWEST = 0.6, 4  # correlation of a unit with its family, and recordings from which a fixed pattern is judged
-_TURNS = ((0, False), (1, False), (2, False), (3, False), (0, True), (1, True), (2, True), (3, True))
-_NAMES = {(1, False): "turned by 90 degrees", (2, False): "upside down", (3, False): "turned by 270 degrees",
-          (0, True): "mirrored left to right", (2, True): "mirrored top to bottom", (1, True): "mirrored and turned",
-          (3, True): "mirrored and turned"}  # fmt: skip
-_OPTIONS = {(1, False): "--rotate 90", (2, False): "--rotate 180", (3, False): "--rotate 270",
-            (0, True): "--flip across", (2, True): "--flip down"}  # fmt: skip
+# correlation of a unit with its family, and recordings from which a fixed pattern is judged
+_LIKE = 0.6
+_FEWEST = 4
+_TURNS = (
+    (0, False),
+    (1, False),
+    (2, False),
+    (3, False),
+    (0, True),
+    (1, True),
+    (2, True),
+    (3, True),
+)
+_NAMES = {
+    (1, False): "turned by 90 degrees",
+    (2, False): "upside down",
+    (3, False): "turned by 270 degrees",
+    (0, True): "mirrored left to right",
+    (2, True): "mirrored top to bottom",
+    (1, True): "mirrored and turned",
+    (3, True): "mirrored and turned",
+}
+_OPTIONS = {
+    (1, False): "--rotate 90",
+    (2, False): "--rotate 180",
+    (3, False): "--rotate 270",
+    (0, True): "--flip across",
+    (2, True): "--flip down",
+}
 
 
 @dataclass(frozen=True)
@@ -73,7 +114,9 @@ class UnitFrames:
     @cached_property
     def small(self) -> list[Array]:
         """The pictures of each recording at 160 pixels, u8 (n, h, w, 3)."""
-        return [np.stack([scale_picture(frame) for frame in recording]) for recording in self.recordings]
+        return [
+            np.stack([scale_picture(frame) for frame in recording]) for recording in self.recordings
+        ]
 
     @cached_property
     def middles(self) -> list[Array]:
@@ -87,7 +130,9 @@ class UnitFrames:
 
     def untouched(self) -> Array:
         """Return the background, or the usual picture without one."""
-        return self.usual if self.background is None else self.background
+        if self.background is None:
+            return self.usual
+        return self.background
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +160,10 @@ def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
     """Yield the frames of each unit of a manifest: at most RECORDINGS recordings, evenly spaced, and FRAMES of each."""
     names = ("dataset", "sensor", "unit")
     codes = np.stack([manifest.codes(name) for name in names], 1)
-    sequence, split = manifest.codes("sequence", own=True), manifest.text_column("split")
-    number, stride = np.asarray(manifest.column("frame_index")), np.asarray(manifest.column("stride").fill_null(1))
+    sequence = manifest.codes("sequence", own=True)
+    split = manifest.text_column("split")
+    number = np.asarray(manifest.column("frame_index"))
+    stride = np.asarray(manifest.column("stride").fill_null(1))
     for group in group_rows(np.arange(len(manifest)), codes):
         rows = group[split[group] != "background"]
         ordered = rows[np.lexsort((number[rows], sequence[rows]))]
@@ -132,7 +179,9 @@ def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
         shapes = [recording[0].shape for recording in recordings]
         recordings = [r for r in recordings if r[0].shape == max(set(shapes), key=shapes.count)]
         if recordings:
-            sensor, unit = (str(manifest.column(name)[int(group[0])].as_py() or "") for name in names[1:])
+            sensor, unit = (
+                str(manifest.column(name)[int(group[0])].as_py() or "") for name in names[1:]
+            )
             yield UnitFrames(sensor, unit, recordings, free, steps, len(rows))
 
 
@@ -146,8 +195,13 @@ def _pictures(manifest: Manifest, rows: Array) -> list[Array]:
 
 def _background(manifest: Manifest, rows: Array, free: Array) -> Array | None:
     """Return the commonest background picture of `rows`, or the first picture of the `free` rows."""
-    paths = [manifest.file(int(row), "background_path") for row in rows[manifest.present("background_path")[rows]]]
-    paths = [max(set(paths), key=paths.count)] if paths else [manifest.file(int(row)) for row in free]
+    paths = [
+        manifest.file(int(row), "background_path")
+        for row in rows[manifest.present("background_path")[rows]]
+    ]
+    paths = (
+        [max(set(paths), key=paths.count)] if paths else [manifest.file(int(row)) for row in free]
+    )
     for path in paths:
         with suppress(UserError):
             return decode(path)
@@ -155,29 +209,43 @@ def _background(manifest: Manifest, rows: Array, free: Array) -> Array | None:
 
 
 def examine(
-    unit: UnitFrames, references: Sequence[Array] = (), others: Sequence[UnitFrames] = (), only: str | None = None
+    unit: UnitFrames,
+    references: Sequence[Array] = (),
+    others: Sequence[UnitFrames] = (),
+    only: str | None = None,
 ) -> UnitHealth:
     """Return the checks of a unit, or the one called `only`.
 
     `references` are untouched gels of the same family. Recordings are compared with the `others` of the data.
     """
     checks: dict[str, Callable[[], Check]] = {
-        "orientation and colours": lambda: check_layout(unit, references), "one unit": lambda: _one_unit(unit, others),
-        "exposure": lambda: _exposure(unit), "focus": lambda: _focus(unit), "frozen frames": lambda: _frozen(unit),
-        "dropped frames": lambda: _dropped(unit), "tint drift": lambda: _tint(unit), "worn gel": lambda: _scratch(unit),
-        "dead pixels": lambda: _dead(unit), "background": lambda: _background_fits(unit),
+        "orientation and colours": lambda: check_layout(unit, references),
+        "one unit": lambda: _one_unit(unit, others),
+        "exposure": lambda: _exposure(unit),
+        "focus": lambda: _focus(unit),
+        "frozen frames": lambda: _frozen(unit),
+        "dropped frames": lambda: _dropped(unit),
+        "tint drift": lambda: _tint(unit),
+        "worn gel": lambda: _scratch(unit),
+        "dead pixels": lambda: _dead(unit),
+        "background": lambda: _background_fits(unit),
         "contact": lambda: _contact(unit),
-    }  # fmt: skip
+    }
     chosen = checks.values() if only is None else (checks[only],)
-    return UnitHealth(unit.sensor, unit.unit, unit.rows, tuple(check() for check in chosen), unit.usual)
+    return UnitHealth(
+        unit.sensor, unit.unit, unit.rows, tuple(check() for check in chosen), unit.usual
+    )
 
 
-def check_units(units: Sequence[UnitFrames], references: Mapping[str, Sequence[Array]]) -> list[UnitHealth]:
+def check_units(
+    units: Sequence[UnitFrames], references: Mapping[str, Sequence[Array]]
+) -> list[UnitHealth]:
     """Return the health of all units; `references` by sensor are joined by the other units of the same sensor."""
     results = []
     for unit in units:
         others = [other for other in units if other.sensor == unit.sensor and other is not unit]
-        others = [others[i] for i in spread(np.arange(len(others)), RECORDINGS)]  # each costs time
+        # each costs time
+        others = [others[i] for i in spread(np.arange(len(others)), RECORDINGS)]
         known = [*references.get(unit.sensor, ()), *(other.untouched() for other in others)]
         results.append(examine(unit, known, others))
     return results
@@ -188,7 +256,10 @@ def known_gels(sensor: str) -> list[Array]:
     """Return small untouched gels RGB u8 (30, 40, 3) of real units of a sensor family, none of an unknown one."""
     name = f"{sensor}.bases"
     gels = read_arrays(_LOOKS, only=name.__eq__).get(name, np.zeros(0))
-    return list(gels) if gels.dtype == np.uint8 else []  # the simulator invents the look of the others
+    # the simulator invents the look of the others
+    if gels.dtype == np.uint8:
+        return list(gels)
+    return []
 
 
 def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
@@ -196,14 +267,18 @@ def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
     name = "orientation and colours"
     if not references:
         return Check(name, None, "no reference of this sensor")
-    picture, known = unit.untouched(), np.stack([_layout(reference) for reference in references])
-    own, scores = _layout(picture), dict[tuple[tuple[int, bool], bool], float]()
+    picture = unit.untouched()
+    known = np.stack([_layout(reference) for reference in references])
+    own = _layout(picture)
+    scores = dict[tuple[tuple[int, bool], bool], float]()
     shapes = np.log([reference.shape[1] / reference.shape[0] for reference in references])
     shape = np.log(picture.shape[1] / picture.shape[0])
     for turn, swap in product(_TURNS, (False, True)):
         if abs((-shape if turn[0] % 2 else shape) - np.median(shapes)) > 0.2:
             continue
-        scores[turn, swap] = float(np.median(np.sort((known * _turned(own, turn, swap)).sum((1, 2, 3)))[-3:]))
+        scores[turn, swap] = float(
+            np.median(np.sort((known * _turned(own, turn, swap)).sum((1, 2, 3)))[-3:])
+        )
     if not scores or max(scores.values()) < _LIKE:
         return Check(name, None, f"unlike its family ({max(scores.values(), default=0):.2f})")
     upright = scores.pop((_TURNS[0], False), -1.0)
@@ -214,7 +289,9 @@ def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
     # The picture was turned by the inverse of what makes it fit.
     (turns, mirrored), swap = best
     done = (turns, True) if mirrored else (-turns % 4, False)
-    what = " and ".join(filter(None, (_NAMES.get(done, ""), "red and blue exchanged" if swap else "")))
+    what = " and ".join(
+        filter(None, (_NAMES.get(done, ""), "red and blue exchanged" if swap else ""))
+    )
     cure = _OPTIONS.get(done, "a turn and a mirror") if done != _TURNS[0] else ""
     advice = " and ".join(filter(None, (cure, "red and blue exchanged" if swap else "")))
     return Check(name, False, f"{what} ({margin:+.2f})", f"Read it with {advice}.")
@@ -229,32 +306,41 @@ def _layout(picture: Array) -> Array:
 
 def _turned(layout: Array, turn: tuple[int, bool], swap: bool) -> Array:
     layout = np.rot90(layout[:, ::-1] if turn[1] else layout, turn[0])
-    return layout[..., ::-1] if swap else layout
+    if swap:
+        return layout[..., ::-1]
+    return layout
 
 
 def _exposure(unit: UnitFrames) -> Check:
     frames = np.concatenate(unit.small)[:, ::2, ::2]
-    lit = frames[frames.max(axis=3) > 8].reshape(-1, 3)  # without the black rim of a round gel
+    # without the black rim of a round gel
+    lit = frames[frames.max(axis=3) > 8].reshape(-1, 3)
     burnt = float((lit >= 252).any(1).mean()) if len(lit) else 0.0
     mean = float(lit.mean()) if len(lit) else 0.0
     ok = burnt <= LIMITS["exposure"] and 25 <= mean <= 225 and len(lit) > 0.4 * frames[..., 0].size
-    return Check("exposure", ok, f"mean {mean:.0f}, {burnt:.0%} saturated", "Change exposure, gain or light.")
+    return Check(
+        "exposure", ok, f"mean {mean:.0f}, {burnt:.0%} saturated", "Change exposure, gain or light."
+    )
 
 
 def _focus(unit: UnitFrames) -> Check:
     """Compare details of one pixel with those of two: blur removes the first."""
     if max(unit.frames[0].shape) < 240:  # made larger, it would look blurred
         return Check("focus", None, "too small a picture")
-    shares, details = [], []
+    shares = []
+    details = []
     for frame in (recording[len(recording) // 2] for recording in unit.recordings):
         grey = scale_picture(frame, 320).mean(2).astype(np.float32)
         one, two = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1, 2))
         details.append(float(np.std(one - two)))
         shares.append(float(np.std(grey - one)) / (details[-1] + 1e-6))
-    share, detail = float(np.median(shares)), float(np.median(details))
+    share = float(np.median(shares))
+    detail = float(np.median(details))
     if detail < LIMITS["detail"]:
         return Check("focus", None, f"too few details ({detail:.2f})")
-    return Check("focus", share >= LIMITS["focus"], f"{share:.2f}", "Focus the camera, or clean its lens.")
+    return Check(
+        "focus", share >= LIMITS["focus"], f"{share:.2f}", "Focus the camera, or clean its lens."
+    )
 
 
 def _frozen(unit: UnitFrames) -> Check:
@@ -262,15 +348,26 @@ def _frozen(unit: UnitFrames) -> Check:
     if not pairs:
         return Check("frozen frames", None, "stills")
     share = float(np.mean(pairs))
-    return Check("frozen frames", share <= LIMITS["frozen"], f"{share:.0%} repeat", "Check cable, driver and buffer.")
+    return Check(
+        "frozen frames",
+        share <= LIMITS["frozen"],
+        f"{share:.0%} repeat",
+        "Check cable, driver and buffer.",
+    )
 
 
 def _dropped(unit: UnitFrames) -> Check:
-    near = unit.steps[(unit.steps > 0) & (unit.steps <= 4)]  # a longer gap separates clips
+    # a longer gap separates clips
+    near = unit.steps[(unit.steps > 0) & (unit.steps <= 4)]
     if not len(near):
         return Check("dropped frames", None, "stills")
     share = float((near > 1).mean())
-    return Check("dropped frames", share <= LIMITS["dropped"], f"{share:.1%} of steps", "Lower the load or the rate.")
+    return Check(
+        "dropped frames",
+        share <= LIMITS["dropped"],
+        f"{share:.1%} of steps",
+        "Lower the load or the rate.",
+    )
 
 
 def _tint(unit: UnitFrames) -> Check:
@@ -281,7 +378,9 @@ def _tint(unit: UnitFrames) -> Check:
     tint = np.log(colours[:, [0, 2]] / colours[:, 1:2])
     part = max(1, len(tint) // 4)
     drift = float(np.abs(np.median(tint[-part:], 0) - np.median(tint[:part], 0)).max())
-    return Check("tint drift", drift <= LIMITS["tint"], f"{drift:.2f}", "Fix white balance and exposure.")
+    return Check(
+        "tint drift", drift <= LIMITS["tint"], f"{drift:.2f}", "Fix white balance and exposure."
+    )
 
 
 def _dead(unit: UnitFrames) -> Check:
@@ -300,13 +399,16 @@ def _difference(unit: UnitFrames) -> tuple[Array, Array] | None:
     if unit.background is None or unit.background.shape != unit.frames[0].shape:
         return None
     gel = scale_picture(unit.background)
-    change, clear = unit.usual.astype(np.float32) - gel, np.ones(gel.shape[:2], np.float32)
+    change = unit.usual.astype(np.float32) - gel
+    clear = np.ones(gel.shape[:2], np.float32)
     change -= np.median(change, axis=(0, 1))
     if has_dots(gel):
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_DOTS, _DOTS))
         dots = cv2.morphologyEx(gel, cv2.MORPH_BLACKHAT, kernel).min(2) > DOT_DEPTH
         clear -= cv2.dilate(dots.astype(np.uint8), np.ones((5, 5)))
-    return None if clear.mean() < 0.3 else (change * clear[..., None], clear)
+    if clear.mean() < 0.3:
+        return None
+    return (change * clear[..., None], clear)
 
 
 def _blurred(change: Array, clear: Array, sigma: float) -> Array:
@@ -317,7 +419,8 @@ def _blurred(change: Array, clear: Array, sigma: float) -> Array:
 
 def _scratch(unit: UnitFrames) -> Check:
     """Look for a long thin pattern that never moves and that the background lacks: a scratch, a tear, a hair."""
-    name, found = "worn gel", _difference(unit)
+    name = "worn gel"
+    found = _difference(unit)
     if found is None or len(unit.recordings) < _FEWEST:
         return Check(name, None, "no background" if found is None else "too few recordings")
     change, clear = found
@@ -326,12 +429,15 @@ def _scratch(unit: UnitFrames) -> Check:
     _, _, boxes, _ = cv2.connectedComponentsWithStats(lines)
     value = float(np.hypot(boxes[1:, 2], boxes[1:, 3]).max(initial=0))
     advice = "Clean or exchange the gel, and record its background again."
-    return Check(name, value <= LIMITS["scratch length"], f"fixed line of {value:.0f} pixels", advice)
+    return Check(
+        name, value <= LIMITS["scratch length"], f"fixed line of {value:.0f} pixels", advice
+    )
 
 
 def _background_fits(unit: UnitFrames) -> Check:
     """Compare the background with the usual picture: a press in one of them is a broad difference."""
-    name, found = "background", _difference(unit)
+    name = "background"
+    found = _difference(unit)
     if found is None or len(unit.recordings) < _FEWEST:
         return Check(name, None, "no background" if found is None else "too few recordings")
     value = float(np.percentile(np.abs(_blurred(*found, 3)).max(2)[4:-4, 4:-4], 98))
@@ -345,8 +451,10 @@ def _contact(unit: UnitFrames) -> Check:
         return Check("contact", None, "no background")
     if len(unit.recordings) < _FEWEST:
         return Check("contact", None, "too few recordings")
-    gel, limit = UntouchedGel(unit.background), THRESHOLDS.get(unit.sensor, DEFAULT_THRESHOLD)
-    frames, moves = np.concatenate(unit.small)[::3], UntouchedGel(unit.usual)
+    gel = UntouchedGel(unit.background)
+    limit = THRESHOLDS.get(unit.sensor, DEFAULT_THRESHOLD)
+    frames = np.concatenate(unit.small)[::3]
+    moves = UntouchedGel(unit.usual)
     touched = np.array([gel.score(frame) > limit for frame in frames])
     still = np.mean([moves.score(frame) < limit / 2 for frame in frames]) if touched.all() else 0.0
     constant = touched.all() and still > 0.9
@@ -368,12 +476,27 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
             share = float(((own > LIMITS["two units"] / 2) & (away < 0.4 * own)).mean())
             if share >= _SHARE:
                 advice = "Sort them by unit. Left and right may be exchanged."
-                return Check(name, False, f"{share:.0%} of recordings look like {other.unit or 'another'}", advice)
-    far, value = own > LIMITS["two units"], float(np.percentile(own, 95))
+                return Check(
+                    name,
+                    False,
+                    f"{share:.0%} of recordings look like {other.unit or 'another'}",
+                    advice,
+                )
+    far = own > LIMITS["two units"]
+    value = float(np.percentile(own, 95))
     # Deep touches of a soft gel look unlike the others, and unlike each other. Those of another unit look alike.
-    apart = np.sqrt(np.mean((looks[far] - np.median(looks[far], axis=0)) ** 2, axis=1)) if far.any() else np.zeros(0)
+    apart = (
+        np.sqrt(np.mean((looks[far] - np.median(looks[far], axis=0)) ** 2, axis=1))
+        if far.any()
+        else np.zeros(0)
+    )
     is_one = far.mean() < _SHARE or np.median(apart) > _ALIKE * np.median(own[far])
-    return Check(name, bool(is_one), f"looks differ by {value:.0f}", "The folder seems to have two units. Sort them.")
+    return Check(
+        name,
+        bool(is_one),
+        f"looks differ by {value:.0f}",
+        "The folder seems to have two units. Sort them.",
+    )
 
 
 def _look(picture: Array) -> Array:
@@ -388,10 +511,14 @@ def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
     The value is the distance of the means over the spread. The limit is that of 95 % of `draws` random assignments.
     """
     if min(contact.sum(), (~contact).sum()) < _FEWEST:
-        return Check("contact visible to the encoder", None, "too few frames with or without contact")
+        return Check(
+            "contact visible to the encoder", None, "too few frames with or without contact"
+        )
 
     def apart(touched: Array) -> float:
-        within = np.concatenate([features[side] - features[side].mean(0) for side in (touched, ~touched)])
+        within = np.concatenate(
+            [features[side] - features[side].mean(0) for side in (touched, ~touched)]
+        )
         gap = features[touched].mean(0) - features[~touched].mean(0)
         return float(np.linalg.norm(gap) / np.sqrt(np.square(within).sum(1).mean() + 1e-12))
 
@@ -399,7 +526,12 @@ def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
     chance = np.quantile([apart(rng.permutation(contact)) for _ in range(draws)], 0.95)
     value = apart(contact)
     advice = "This encoder does not see contact of this unit. Check the checks above, or adapt it."
-    return Check("contact visible to the encoder", bool(value > chance), f"{value:.2f} (chance {chance:.2f})", advice)
+    return Check(
+        "contact visible to the encoder",
+        bool(value > chance),
+        f"{value:.2f} (chance {chance:.2f})",
+        advice,
+    )
 
 
 def health_sheet(results: Sequence[UnitHealth], path: Path) -> None:
@@ -411,10 +543,22 @@ def health_sheet(results: Sequence[UnitHealth], path: Path) -> None:
         band = np.full((132, 720, 3), 255, np.uint8)
         tile = scale_picture(unit.picture, 124)[..., ::-1]
         band[4 : 4 + tile.shape[0], 4 : 4 + tile.shape[1]] = tile
-        lines = [f"{unit.sensor} {unit.unit}: {unit.verdict}", *(f"{c.name}: {c.value}" for c in unit.faults)]
+        lines = [
+            f"{unit.sensor} {unit.unit}: {unit.verdict}",
+            *(f"{c.name}: {c.value}" for c in unit.faults),
+        ]
         for place, line in enumerate(lines[:6]):
             colour = (60, 60, 230) if unit.faults else (80, 150, 60)
             text = line.encode("ascii", "replace").decode()[:80]
-            cv2.putText(band, text, (140, 20 + 20 * place), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+            cv2.putText(
+                band,
+                text,
+                (140, 20 + 20 * place),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.45,
+                colour,
+                1,
+                cv2.LINE_AA,
+            )
         bands.append(band)
     atomic_write(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())

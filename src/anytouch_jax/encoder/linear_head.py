@@ -30,10 +30,15 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.base import Preprocess
 
 FORMATS = ("anytouch_jax.head.2", "anytouch_jax.head.1")  # the second has no calibration
-COVERAGE, FALSE_ALARMS = 0.9, 0.05  # defaults: share of sets that hold the class, share of known touches called novel
+# defaults: share of sets that hold the class, share of known touches called novel
+COVERAGE = 0.9
+FALSE_ALARMS = 0.05
 NEIGHBOURS = 5  # nearest training touches in the novelty score
-REFERENCES = 2048  # training touches that a head stores; more change a score by less than its noise
-_FEWEST, _OTHERS = 8, 0.5  # frames, and share of them that look like another sensor, until that is reported
+# training touches that a head stores; more change a score by less than its noise
+REFERENCES = 2048
+# frames, and share of them that look like another sensor, until that is reported
+_FEWEST = 8
+_OTHERS = 0.5
 _CHUNK = 1024
 
 
@@ -89,9 +94,14 @@ class Calibration:
         known = np.unique(self.sensors)
         if sensor not in known:
             return f"The head was fitted on {', '.join(known)}, not on {sensor}. Do not trust its classes."
-        away = [novelty_scores(x @ self.whitening, self.references[self.sensors == name]) for name in known]
+        away = [
+            novelty_scores(x @ self.whitening, self.references[self.sensors == name])
+            for name in known
+        ]
         looks, counts = np.unique(known[np.argmin(away, axis=0)], return_counts=True)
-        if (counts[looks == sensor].sum() <= (1 - _OTHERS) * len(x)) and looks[counts.argmax()] != sensor:
+        if (counts[looks == sensor].sum() <= (1 - _OTHERS) * len(x)) and looks[
+            counts.argmax()
+        ] != sensor:
             return (
                 f"{counts.max()} of {len(x)} frames look like {looks[counts.argmax()]}, not {sensor}. "
                 "Check --sensor, --rotate and --flip."
@@ -151,8 +161,9 @@ class LinearHead:
             f"LinearHead for {self.label}",
             classes=f"{len(classes)}: {', '.join(classes[:8])}{f' and {more} more' if more > 0 else ''}",
             input=f"features of {len(self.mean)}, pooling {self.pooling}, frames {self.frames}",
-            encoder=self.fingerprint, calibration="; ".join(self.promises()) or "none",
-        )  # fmt: skip
+            encoder=self.fingerprint,
+            calibration="; ".join(self.promises()) or "none",
+        )
 
     def __call__(self, features: npt.ArrayLike) -> tuple[Array, Array]:
         """Return the likeliest class (n,) str and probabilities f32 (n, K) of features (n, d)."""
@@ -172,14 +183,28 @@ class LinearHead:
         label, p = self(features)
         known = self.calibration
         if known is None:
-            raise UserError("This head has no calibration. Save it again with `anytouch probe label --save`.")
+            raise UserError(
+                "This head has no calibration. Save it again with `anytouch probe label --save`."
+            )
         distance = known.novelty(self.scaled(features))
-        return Assessment(label, p, 1 - p <= known.set_limit, distance, distance > known.novelty_limit)
+        return Assessment(
+            label, p, 1 - p <= known.set_limit, distance, distance > known.novelty_limit
+        )
 
     def calibrated(
-        self, logits: Array, y: Array, held_out: Array, features: Array, groups: Array, sensors: Array, fit: Array,
-        val: Array, *, coverage: float = COVERAGE, false_alarms: float = FALSE_ALARMS,
-    ) -> LinearHead:  # fmt: skip
+        self,
+        logits: Array,
+        y: Array,
+        held_out: Array,
+        features: Array,
+        groups: Array,
+        sensors: Array,
+        fit: Array,
+        val: Array,
+        *,
+        coverage: float = COVERAGE,
+        false_alarms: float = FALSE_ALARMS,
+    ) -> LinearHead:
         """Return the head with a calibration from `logits` (n, columns) of rows that no fit saw.
 
         `y` (n,) str and `held_out` (n,) are their classes and groups. `features` (N, d), `groups` (N,) and `sensors`
@@ -187,13 +212,17 @@ class LinearHead:
         """
         known = np.isin(y, self.classes)
         if not known.any():
-            raise UserError("No row is left to calibrate on. Give rows of split val, or classes of several groups.")
-        z, held_out = logits[known].astype(np.float64), held_out[known]
+            raise UserError(
+                "No row is left to calibrate on. Give rows of split val, or classes of several groups."
+            )
+        z = logits[known].astype(np.float64)
+        held_out = held_out[known]
         truth = np.searchsorted(self.classes, y[known])
         temperature = fit_temperature(z, truth, held_out)
         p = probabilities(z, temperature)
         limit = conformal_limit(1 - p[np.arange(len(truth)), truth], held_out, coverage)
-        x, owners = self.scaled(features), groups[val]
+        x = self.scaled(features)
+        owners = groups[val]
         whitening, chosen, references = reference_space(x[fit], groups[fit])
         scores = novelty_scores(x[val] @ whitening, references, owners, groups[fit[chosen]])
         if len(np.unique(owners)) * false_alarms < 5:  # few for a limit: rows of `fit` help
@@ -201,14 +230,20 @@ class LinearHead:
             owners = np.concatenate([owners, groups[fit]])
         novel = conformal_limit(scores, owners, 1 - false_alarms)
         limits = (coverage, limit, false_alarms, novel, len(np.unique(held_out)))
-        return replace(self, calibration=Calibration(temperature, *limits, whitening, references, sensors[fit[chosen]]))
+        return replace(
+            self,
+            calibration=Calibration(
+                temperature, *limits, whitening, references, sensors[fit[chosen]]
+            ),
+        )
 
     def promises(self) -> list[str]:
         """Return sentences on what the limits of the calibration promise, and on those that need more groups."""
         known = self.calibration
         if known is None:
             return []
-        sets, novel = f"the true class in {known.coverage:.0%} of touches", f"{known.false_alarms:.0%} of known touches"
+        sets = f"the true class in {known.coverage:.0%} of touches"
+        novel = f"{known.false_alarms:.0%} of known touches"
         about = f"calibrated on {known.recordings} groups (temperature {known.temperature:.2f})"
         return [f"{about}: sets hold {sets}, {novel} are called novel"] + [
             f"{share:.0%} takes {int(np.ceil(share / (1 - share) - 1e-9))} groups or more. With fewer {what}."
@@ -219,9 +254,15 @@ class LinearHead:
             if np.isinf(limit)
         ]
 
-    def check(self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean") -> None:
+    def check(
+        self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean"
+    ) -> None:
         """Raise UserError unless the head was fitted on features of that encoder, pooling and number of frames."""
-        pairs = (("pooling", self.pooling, pooling), ("frames", self.frames, frames), ("join", "mean", join))
+        pairs = (
+            ("pooling", self.pooling, pooling),
+            ("frames", self.frames, frames),
+            ("join", "mean", join),
+        )
         wrong = [f"--{name} {own}" for name, own, other in pairs if own != other]
         if wrong:
             raise UserError(f"The head was fitted on other features. Give {' '.join(wrong)}.")
@@ -235,10 +276,16 @@ class LinearHead:
 def save_head(path: str | Path, head: LinearHead) -> None:
     """Write a head as `.npz` atomically. Raises OSError."""
     known = head.calibration
-    arrays = {"mark" if name == "fingerprint" else name: value for name, value in vars(head).items()}
+    arrays = {
+        "mark" if name == "fingerprint" else name: value for name, value in vars(head).items()
+    }
     del arrays["calibration"]
     arrays |= gel_arrays(arrays.pop("gels"))
-    arrays |= {} if known is None else {f"calibration/{name}": np.asarray(value) for name, value in vars(known).items()}
+    arrays |= (
+        {}
+        if known is None
+        else {f"calibration/{name}": np.asarray(value) for name, value in vars(known).items()}
+    )
     with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, format=FORMATS[known is None], **arrays)
 
@@ -250,7 +297,11 @@ def load_head(path: str | Path) -> LinearHead:
     try:
         arrays: dict[str, Any] = read_arrays(path)
         for name in ("format", "label", "pooling", "mark"):
-            if arrays[name].shape != () or arrays[name].dtype.kind != "U" or arrays[name].dtype.itemsize > 4096:
+            if (
+                arrays[name].shape != ()
+                or arrays[name].dtype.kind != "U"
+                or arrays[name].dtype.itemsize > 4096
+            ):
                 raise ValueError(f"{name} is not a short text")
             arrays[name] = str(arrays[name])
         if arrays.pop("format") not in FORMATS:
@@ -258,7 +309,11 @@ def load_head(path: str | Path) -> LinearHead:
         check_array("frames", arrays["frames"], (), "iu")
         known = Calibration.from_arrays(arrays, len(arrays["mean"]))
         gels = gels_of_arrays(arrays)
-        arrays = {name: value for name, value in arrays.items() if not name.startswith(("calibration/", "gel"))}
+        arrays = {
+            name: value
+            for name, value in arrays.items()
+            if not name.startswith(("calibration/", "gel"))
+        }
         about = {"frames": int(arrays.pop("frames")), "fingerprint": arrays.pop("mark")}
         head = LinearHead(calibration=known, gels=gels, **about, **arrays)
         _check_head(head)
@@ -271,13 +326,27 @@ def load_head(path: str | Path) -> LinearHead:
 
 def _check_head(head: LinearHead) -> None:
     """Raise ValueError for arrays of a head that do not fit together or are not finite."""
-    count, width = len(head.classes), len(head.mean)
+    count = len(head.classes)
+    width = len(head.mean)
     columns = 1 if count == 2 else count
-    shapes = {"classes": (count,), "weights": (width, columns), "bias": (columns,), "mean": (width,), "scale": (width,)}
+    shapes = {
+        "classes": (count,),
+        "weights": (width, columns),
+        "bias": (columns,),
+        "mean": (width,),
+        "scale": (width,),
+    }
     for name, shape in shapes.items():
         check_array(name, getattr(head, name), shape, "U" if name == "classes" else "f")
-    if count < 2 or not width or not (head.scale > 0).all() or not (head.label and head.fingerprint):
-        raise ValueError("it needs two classes, features, scales above 0, a label and the mark of an encoder")
+    if (
+        count < 2
+        or not width
+        or not (head.scale > 0).all()
+        or not (head.label and head.fingerprint)
+    ):
+        raise ValueError(
+            "it needs two classes, features, scales above 0, a label and the mark of an encoder"
+        )
     if len(set(head.classes)) < count:
         raise ValueError("it has a class twice")
     if head.pooling not in ("class", "mean", "both") or not 0 < head.frames < 1 << 20:
@@ -297,11 +366,16 @@ class ContactGate:
         """Return 1 (contact), 0 (none) or NaN (unknown) of a frame RGB u8 (h, w, 3)."""
         picture = getattr(self._source, "background", self._source)
         if picture is not self._picture:
-            self._picture, self._gel = picture, None if picture is None else UntouchedGel(picture)
+            self._picture = picture
+            self._gel = None if picture is None else UntouchedGel(picture)
         try:
-            return np.nan if self._gel is None else float(self._gel.score(frame) > self.threshold)
+            if self._gel is None:
+                return np.nan
+            return float(self._gel.score(frame) > self.threshold)
         except ValueError as error:
-            raise UserError(f"Contact cannot be decided: {error}. Give a --background of this camera.") from None
+            raise UserError(
+                f"Contact cannot be decided: {error}. Give a --background of this camera."
+            ) from None
 
 
 def probabilities(logits: Array, temperature: float = 1.0) -> Array:
@@ -317,11 +391,15 @@ def fit_temperature(logits: Array, y: Array, groups: Array) -> float:
 
     `logits` (n, K), or (n, 1) of two classes. Each of the `groups` (n,) has the same weight.
     """
-    both = np.concatenate([np.zeros_like(logits), logits], axis=1) if logits.shape[1] == 1 else logits
+    both = (
+        np.concatenate([np.zeros_like(logits), logits], axis=1) if logits.shape[1] == 1 else logits
+    )
     weights = group_weights(groups)
 
     def loss(power: float) -> float:
-        return float(-(weights * log_softmax(both / np.exp(power), axis=1)[np.arange(len(y)), y]).sum())
+        return float(
+            -(weights * log_softmax(both / np.exp(power), axis=1)[np.arange(len(y)), y]).sum()
+        )
 
     bounds = tuple(np.log((0.05, 20.0)))
     return float(np.exp(minimize_scalar(loss, bounds=bounds, method="bounded").x))
@@ -340,37 +418,55 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     others. At most it is the limit for groups of equal rows, with one more group that is infinite. It is infinite below
     share / (1 - share) groups. Raises UserError for a `share` outside 0..1, no scores or NaN.
     """
-    scores, groups = np.asarray(scores, np.float64), np.asarray(groups)
+    scores = np.asarray(scores, np.float64)
+    groups = np.asarray(groups)
     if not isinstance(share, int | float | np.number) or not 0 < share < 1:
         raise UserError(f"A coverage must lie between 0 and 1, not {share!r}.")
     if not scores.size or scores.shape != groups.shape or np.isnan(scores).any():
-        raise UserError(f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape} {groups.shape}.")
+        raise UserError(
+            f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape} {groups.shape}."
+        )
     order = np.argsort(scores, kind="stable")
-    scores, ids = scores[order], np.unique(groups, return_inverse=True)[1][order]
-    count, weights = ids.max() + 1, group_weights(ids)
+    scores = scores[order]
+    ids = np.unique(groups, return_inverse=True)[1][order]
+    count = ids.max() + 1
+    weights = group_weights(ids)
     mass = np.cumsum(weights)
     place = int(np.searchsorted(mass * count / (count + 1), share - 1e-12))
     if place == len(scores):
         return np.inf
-    own, by_group = np.empty(len(ids)), np.argsort(ids, kind="stable")
-    own[by_group] = np.cumsum(weights[by_group]) - ids[by_group] / count  # mass of the row's group up to it
-    below = (mass - own) * count / max(count - 1, 1)  # mass of the others below each row
+    own = np.empty(len(ids))
+    by_group = np.argsort(ids, kind="stable")
+    # mass of the row's group up to it
+    own[by_group] = np.cumsum(weights[by_group]) - ids[by_group] / count
+    # mass of the others below each row
+    below = (mass - own) * count / max(count - 1, 1)
     turn = np.argsort(below, kind="stable")
-    level = below[turn][min(int(np.searchsorted(np.cumsum(weights[turn]), share - 1e-12)) + 1, len(turn) - 1)]
+    level = below[turn][
+        min(int(np.searchsorted(np.cumsum(weights[turn]), share - 1e-12)) + 1, len(turn) - 1)
+    ]
     return float(scores[min(place, int(np.searchsorted(mass, level - 1e-12)))])
 
 
-def novelty_scores(x: Array, references: Array, groups: Array | None = None, reference_groups: Any = None) -> Array:
+def novelty_scores(
+    x: Array, references: Array, groups: Array | None = None, reference_groups: Any = None
+) -> Array:
     """Return the mean distance f64 (n,) of rows (n, d) to their nearest `references` (m, d) of other groups, or inf."""
-    scores, references = np.empty(len(x)), references.astype(np.float64)  # once: live touch waits for it
+    # once: live touch waits for it
+    scores = np.empty(len(x))
+    references = references.astype(np.float64)
     squares = np.einsum("ij,ij->i", references, references)
     for start in range(0, len(x), _CHUNK):
         part = x[start : start + _CHUNK].astype(np.float64)
         square = np.square(part).sum(1)[:, None] + squares - 2 * part @ references.T
         if groups is not None:
-            square[groups[start : start + _CHUNK, None] == np.asarray(reference_groups)[None]] = np.inf
+            square[groups[start : start + _CHUNK, None] == np.asarray(reference_groups)[None]] = (
+                np.inf
+            )
         k = min(NEIGHBOURS, square.shape[1])
-        scores[start : start + _CHUNK] = np.sqrt(np.maximum(np.partition(square, k - 1, axis=1)[:, :k], 0)).mean(1)
+        scores[start : start + _CHUNK] = np.sqrt(
+            np.maximum(np.partition(square, k - 1, axis=1)[:, :k], 0)
+        ).mean(1)
     return scores
 
 
@@ -380,9 +476,12 @@ def reference_space(x: Array, groups: Array) -> tuple[Array, Array, Array]:
     It gives every direction equal spread, but those of almost none only a tenth. At most REFERENCES rows, evenly spread
     over the `groups` (n,), are references.
     """
-    values, vectors = np.linalg.eigh(np.cov(x.astype(np.float64), rowvar=False).reshape(x.shape[1], x.shape[1]))
+    values, vectors = np.linalg.eigh(
+        np.cov(x.astype(np.float64), rowvar=False).reshape(x.shape[1], x.shape[1])
+    )
     spread = np.sqrt(np.maximum(values, 0) + max(0.01 * values.mean(), 1e-12))
-    whitening, order = np.asarray(vectors / spread, np.float32), np.argsort(groups, kind="stable")
+    whitening = np.asarray(vectors / spread, np.float32)
+    order = np.argsort(groups, kind="stable")
     chosen = np.linspace(0, len(order) - 1, min(REFERENCES, len(order))).astype(int)
     chosen = np.sort(order[np.unique(chosen)])
     return whitening, chosen, x[chosen] @ whitening
@@ -391,7 +490,8 @@ def reference_space(x: Array, groups: Array) -> tuple[Array, Array, Array]:
 def left_out_scores(x: Array, groups: Array) -> Array:
     """Return the novelty (n,) of scaled features (n, d) by other groups alone: a fifth is left out in turn."""
     # A whitening that has seen a row stretches its direction less, and the row looks too familiar.
-    part, scores = np.unique(groups, return_inverse=True)[1] % 5, np.full(len(x), np.inf)
+    part = np.unique(groups, return_inverse=True)[1] % 5
+    scores = np.full(len(x), np.inf)
     for out in (part == number for number in range(5)):
         if (~out).sum() > 1 and out.any():
             whitening, _, references = reference_space(x[~out], groups[~out])

@@ -18,7 +18,8 @@ import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.data.cameras import open_source as open_source  # callers find it next to `stream`
+# callers find it next to `stream`
+from anytouch_jax.data.cameras import open_source as open_source
 from anytouch_jax.data.images import QUIET, frame_time, to_rgb
 from anytouch_jax.encoder.arrays import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.base import Preprocess, precision
@@ -31,16 +32,21 @@ PARTS = ("decode", "resize", "copy", "encoder")
 KEPT = 100_000  # last frames whose times are stored if their features are not
 RETRY = 2.0  # seconds in which a missed read of a camera is tried again
 HANG = 20.0  # seconds to wait for a read that does not return; V4L2 itself gives up after 10
-STUCK = 0.3  # seconds of the same bytes, or of black, until they are reported: the noise of a sensor never repeats
+# seconds of the same bytes, or of black, until they are reported: the noise of a sensor never repeats
+STUCK = 0.3
 BLACK = 8.0  # mean pixel below which a picture is black; untouched gels have 30 and more
 CELL = 14  # pixels of a side over which a change is averaged
-CONSTANT = 32_000_000  # bytes of parameters that are laid out for the processor when one touch is compiled
-LEARNED, CHANGES = 30, 1000  # changes from which the noise of a camera is known, at first and later
+# bytes of parameters that are laid out for the processor when one touch is compiled
+CONSTANT = 32_000_000
+# changes from which the noise of a camera is known, at first and later
+LEARNED = 30
+CHANGES = 1000
 _PATIENCE = 2.0  # seconds to wait for the reader after the last frame
 _PAUSE = 0.01  # seconds from a missed read to the next
 
 
-Source = Any  # a cv2.VideoCapture, or another object with its methods grab, retrieve, get (of videos) and release
+# a cv2.VideoCapture, or another object with its methods grab, retrieve, get (of videos) and release
+Source = Any
 
 
 class CameraError(UserError):
@@ -103,8 +109,10 @@ class Mailbox:
     """One slot between the reader and the encoder, in which a newer clip may `replace` one that was not taken."""
 
     def __init__(self, *, replace: bool) -> None:
-        self.is_closed, self.alive = False, time.perf_counter()
-        self._replace, self._changed = replace, threading.Condition()
+        self.is_closed = False
+        self.alive = time.perf_counter()
+        self._replace = replace
+        self._changed = threading.Condition()
         self._clip: Clip | None = None
         self._error: BaseException | None = None
 
@@ -123,10 +131,15 @@ class Mailbox:
         Raises the error of the reader, and CameraError after `hang` seconds in which the reader did not come back.
         """
         with self._changed:
-            while not self._changed.wait_for(lambda: self._clip is not None or self.is_closed, hang):
+            while not self._changed.wait_for(
+                lambda: self._clip is not None or self.is_closed, hang
+            ):
                 if hang is not None and time.perf_counter() - self.alive > hang:
-                    raise CameraError(f"the camera has not answered for {hang:g} s. Check its cable, and start again.")
-            clip, self._clip = self._clip, None
+                    raise CameraError(
+                        f"the camera has not answered for {hang:g} s. Check its cable, and start again."
+                    )
+            clip = self._clip
+            self._clip = None
             self._changed.notify_all()
             if clip is None and self._error is not None:
                 raise self._error
@@ -135,15 +148,27 @@ class Mailbox:
     def close(self, error: BaseException | None = None) -> None:
         """End the stream, from either side. A clip in the slot can still be taken."""
         with self._changed:
-            self.is_closed, self._error = True, self._error or error
+            self.is_closed = True
+            self._error = self._error or error
             self._changed.notify_all()
 
 
 def stream(
-    encoder: Encoder, source: Source, preprocess: Preprocess | None = None, *, live: bool, sensor: int,
-    frames: int = 1, stride: int = 1, pooling: Pooling = "class", join: Join = "mean", log: Log = warn,
-    contact: Callable[[np.ndarray], float] | None = None, reuse: float = 0.0, measure: Measure | None = None,
-) -> Generator[Embedded]:  # fmt: skip
+    encoder: Encoder,
+    source: Source,
+    preprocess: Preprocess | None = None,
+    *,
+    live: bool,
+    sensor: int,
+    frames: int = 1,
+    stride: int = 1,
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    log: Log = warn,
+    contact: Callable[[np.ndarray], float] | None = None,
+    reuse: float = 0.0,
+    measure: Measure | None = None,
+) -> Generator[Embedded]:
     """Yield features of the frames of `source`; the encoder is compiled before the first frame is read.
 
     A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
@@ -158,7 +183,9 @@ def stream(
         raise UserError(f"the stride of a clip must be at least 1, not {stride}")
     is_served = Reuse(reuse)
     if measure is not None and frames not in (1, encoder.config.model.frames):
-        raise UserError(f"fields are measured on 1 frame or clips of {encoder.config.model.frames}, not of {frames}")
+        raise UserError(
+            f"fields are measured on 1 frame or clips of {encoder.config.model.frames}, not of {frames}"
+        )
     embed = compile_for_one(encoder, sensor, frames, pooling, join, measures=measure is not None)
     mailbox = Mailbox(replace=live)
     arrived = _camera_frames(source, mailbox, log) if live else _video_frames(source)
@@ -166,7 +193,9 @@ def stream(
     reader = threading.Thread(target=_read, args=arguments, daemon=True)
 
     def embedded() -> Generator[Embedded]:
-        started, start, measured = time.time(), time.perf_counter(), None
+        started = time.time()
+        start = time.perf_counter()
+        measured = None
         try:
             reader.start()  # Ctrl-C may come already while the thread starts
             while (clip := mailbox.take(HANG if live else None)) is not None:
@@ -210,38 +239,49 @@ class Reuse:
     def __init__(self, factor: float) -> None:
         if not factor >= 0:
             raise UserError(f"the factor of the noise must be 0 or more, not {factor:g}")
-        self._factor, self._changes = factor, deque[float](maxlen=CHANGES)
+        self._factor = factor
+        self._changes = deque[float](maxlen=CHANGES)
         self._last = self._embedded = np.zeros(0)
 
     def __call__(self, clip: np.ndarray) -> bool:
-        last, self._last = self._last, clip
+        last = self._last
+        self._last = clip
         if self._factor and len(last) and (change := largest_change(clip, last)):
             self._changes.append(change)
         served = np.array_equal(clip, self._embedded)
         if not served and len(self._changes) > LEARNED:
             noise = np.quantile(self._changes, 0.1)
-            served = bool(largest_change(clip, self._embedded) <= self._factor * noise)  # changes must not add up
+            # changes must not add up
+            served = bool(largest_change(clip, self._embedded) <= self._factor * noise)
         self._embedded = self._embedded if served else clip
         return served
 
 
 def largest_change(clip: np.ndarray, other: np.ndarray) -> float:
     """Return the largest mean absolute difference, over cells of CELL pixels, of two clips (T, H, W, 3)."""
-    rows, width = clip.shape[0] * clip.shape[1], clip.shape[2]
+    rows = clip.shape[0] * clip.shape[1]
+    width = clip.shape[2]
     change = cv2.absdiff(*(one.reshape(rows, -1) for one in (clip, other))).astype(np.float32)
     cells = max(width // CELL, 1), max(rows // CELL, 1)
-    return float(cv2.resize(change, cells, interpolation=cv2.INTER_AREA).max())  # of bytes it would round to 0
+    # of bytes it would round to 0
+    return float(cv2.resize(change, cells, interpolation=cv2.INTER_AREA).max())
 
 
 def compile_for_one(
-    encoder: Encoder, sensor: int, frames: int, pooling: Pooling = "class", join: Join = "mean", *,
+    encoder: Encoder,
+    sensor: int,
+    frames: int,
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    *,
     measures: bool = False,
-) -> Callable[..., Any]:  # fmt: skip
+) -> Callable[..., Any]:
     """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm, parameters on the device.
 
     If it `measures`, it takes the aspect f32 (1,) too, and returns the features and the fields.
     """
-    touch, row = np.tile(encoder.blank, (1, frames, 1, 1, 1)), np.full(1, sensor, np.int32)
+    touch = np.tile(encoder.blank, (1, frames, 1, 1, 1))
+    row = np.full(1, sensor, np.int32)
     if measures:
         encoder.encode_and_measure(touch, row, np.zeros(1, np.float32), pooling)
         return lambda clip, aspect: encoder.encode_and_measure(clip, row, aspect, pooling)
@@ -262,9 +302,13 @@ def compile_for_one(
 
 
 def _read(
-    arrived: Iterator[Frame], preprocess: Preprocess, frames: int, stride: int, mailbox: Mailbox,
+    arrived: Iterator[Frame],
+    preprocess: Preprocess,
+    frames: int,
+    stride: int,
+    mailbox: Mailbox,
     contact: Callable[[np.ndarray], float] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Put the newest clip of preprocessed frames into the mailbox: the reader's thread. No clip has a missed read."""
     ring: deque[np.ndarray] = deque(maxlen=(frames - 1) * stride + 1)
     missed = 0
@@ -288,19 +332,23 @@ def _read(
 
 def _video_frames(source: Source) -> Iterator[Frame]:
     """Yield the frames of a video with their time stamps. Raises UserError for pixels that cannot be used."""
-    number, last = 0, -1.0
+    number = 0
+    last = -1.0
     while True:
         begin = time.perf_counter()
         try:
             with QUIET:
                 whole, pixels = source.retrieve() if source.grab() else (False, None)
         except cv2.error as error:
-            raise UserError(f"frame {number} of the video cannot be decoded: {' '.join(str(error).split())}") from None
+            raise UserError(
+                f"frame {number} of the video cannot be decoded: {' '.join(str(error).split())}"
+            ) from None
         if not whole or pixels is None:
             return
         last = frame_time(source, number, last)
         pixels = to_rgb(pixels, f"frame {number}")[..., ::-1]
-        yield Frame(number, pixels, begin, time.perf_counter() - begin, last)  # decoding is part of the latency
+        # decoding is part of the latency
+        yield Frame(number, pixels, begin, time.perf_counter() - begin, last)
         number += 1
 
 
@@ -309,15 +357,21 @@ def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame
 
     Raises CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be used.
     """
-    number, missed, failing, fault, shape = 0, 0, None, "", None
+    number = 0
+    missed = 0
+    failing = None
+    fault = ""
+    shape = None
     watch = _Watch(log)
     while True:
-        pixels, reason = None, "the camera delivers nothing"
+        pixels = None
+        reason = "the camera delivers nothing"
         grabbed = time.perf_counter()
         try:
             if source.grab():
                 grabbed = time.perf_counter()  # waiting for a camera is not decoding
-                with QUIET:  # the decoder of a camera that sends JPEG
+                # the decoder of a camera that sends JPEG
+                with QUIET:
                     whole, pixels = source.retrieve()
                 pixels = pixels if whole else None
         except cv2.error as error:
@@ -339,8 +393,12 @@ def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame
             time.sleep(_PAUSE)
             continue
         if failing is not None:
-            watch.report("missed", f"a read of the camera was missed after {number} frames and tried again: {fault}")
-        failing, shape = None, pixels.shape
+            watch.report(
+                "missed",
+                f"a read of the camera was missed after {number} frames and tried again: {fault}",
+            )
+        failing = None
+        shape = pixels.shape
         picture = watch.look(number, pixels, decoded)
         rgb = to_rgb(pixels, f"frame {number}")[..., ::-1]
         yield Frame(number, rgb, grabbed, decoded - grabbed, None, picture, missed)
@@ -351,7 +409,8 @@ class _Watch:
     """Whether the pictures of a camera are frozen or black. Each kind of fault is logged once."""
 
     def __init__(self, log: Log) -> None:
-        self._log, self._last = log, b""
+        self._log = log
+        self._last = b""
         self._logged: set[str] = set()
         self._since: dict[str, float] = {}
 
@@ -363,7 +422,8 @@ class _Watch:
 
     def look(self, number: int, pixels: np.ndarray, now: float) -> str:
         """Return "black" or "frozen" if the picture has been so for STUCK seconds, else "ok"."""
-        last, self._last = self._last, pixels.tobytes()
+        last = self._last
+        self._last = pixels.tobytes()
         for kind, is_so, advice in (
             ("black", pixels[::8, ::8].mean() < BLACK, "Check its light and its cover."),
             ("frozen", self._last == last, "It repeats the same bytes: check its cable."),
@@ -371,7 +431,9 @@ class _Watch:
             if not is_so:
                 self._since.pop(kind, None)
             elif now - self._since.setdefault(kind, now) >= STUCK:
-                self.report(kind, f"the picture of the camera is {kind} at frame {number}. {advice}")
+                self.report(
+                    kind, f"the picture of the camera is {kind} at frame {number}. {advice}"
+                )
                 return kind
         return "ok"
 
@@ -400,28 +462,38 @@ class Result(NamedTuple):
     contact: np.ndarray = np.zeros(0)
     reused: np.ndarray = np.zeros(0, bool)
     estimated: np.ndarray = np.zeros(0, bool)
-    fields: dict[str, np.ndarray] | None = None  # numbers of each frame by name, as in a line of `Fields.summary`
+    # numbers of each frame by name, as in a line of `Fields.summary`
+    fields: dict[str, np.ndarray] | None = None
 
 
-def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None) -> Result:
+def collect(
+    embedded: Generator[Embedded], on_each: Callable[[Embedded], None] | None = None
+) -> Result:
     """Return the frames of a stream up to its end, Ctrl-C, SIGTERM or the failure of the camera.
 
     With `on_each`, features go there, and only the last KEPT times are stored: a stream may run for weeks.
     """
     stored: deque[Embedded] = deque(maxlen=KEPT if on_each else None)
-    total, interrupted, failure = 0, False, None
+    total = 0
+    interrupted = False
+    failure = None
     pictures: Counter[str] = Counter()
-    names, summaries = list[str](), list[list[float]]()
+    names = list[str]()
+    summaries = list[list[float]]()
     try:
-        with contextlib.closing(embedded), handled(signal.default_int_handler, signal.SIGTERM):  # as Ctrl-C
+        # as Ctrl-C
+        with contextlib.closing(embedded), handled(signal.default_int_handler, signal.SIGTERM):
             for frame in embedded:
                 total += 1
                 pictures[frame.picture] += 1
                 if on_each is not None:
                     on_each(frame)
                 elif frame.fields is not None:
-                    summary = frame.fields.summary()  # maps of every frame would fill the memory
-                    summaries.append([np.nan if value is None else value for value in summary.values()])
+                    # maps of every frame would fill the memory
+                    summary = frame.fields.summary()
+                    summaries.append(
+                        [np.nan if value is None else value for value in summary.values()]
+                    )
                     names = list(summary)
                 frame = frame._replace(fields=None)
                 if on_each is not None:
@@ -437,17 +509,32 @@ def collect(embedded: Generator[Embedded], on_each: Callable[[Embedded], None] |
     )
     return Result(
         np.stack([frame.values for frame in stored]) if stored else np.zeros((0, 0), np.float32),
-        numbers.astype(np.int64), at, seconds.reshape(-1, len(PARTS)), age, total, interrupted,
-        stored[-1].started if stored else 0.0, times, stored[-1].missed if stored else 0, pictures["frozen"],
-        pictures["black"], failure, contact, reused.astype(bool), estimated.astype(bool),
+        numbers.astype(np.int64),
+        at,
+        seconds.reshape(-1, len(PARTS)),
+        age,
+        total,
+        interrupted,
+        stored[-1].started if stored else 0.0,
+        times,
+        stored[-1].missed if stored else 0,
+        pictures["frozen"],
+        pictures["black"],
+        failure,
+        contact,
+        reused.astype(bool),
+        estimated.astype(bool),
         dict(zip(names, np.transpose(summaries), strict=True)) if names else None,
-    )  # fmt: skip
+    )
 
 
 def budget(result: Result) -> list[str]:
     """Return lines with p50 and p99 of every part in ms, frames per second, and dropped frames."""
     lines = [f"{'part':20} {'p50 ms':>8} {'p99 ms':>8}"]
-    parts: Sequence[tuple[str, Any]] = [*zip(PARTS, result.seconds.T, strict=True), ("frame to features", result.age)]
+    parts: Sequence[tuple[str, Any]] = [
+        *zip(PARTS, result.seconds.T, strict=True),
+        ("frame to features", result.age),
+    ]
     for name, values in parts:
         middle, late = (1e3 * np.percentile(values, (50, 99))) if len(values) else (np.nan, np.nan)
         lines.append(f"{name:20} {middle:8.2f} {late:8.2f}")
@@ -455,7 +542,14 @@ def budget(result: Result) -> list[str]:
     rate = (count - 1) / np.ptp(result.at + result.age) if count > 1 else np.nan
     dropped = int(np.ptp(result.numbers)) + 1 - count if count else 0
     last = "," if result.total == count else f"; of the last {count}:"
-    faults = {"missed reads": result.missed, "frozen pictures": result.frozen, "black pictures": result.black}
+    faults = {
+        "missed reads": result.missed,
+        "frozen pictures": result.frozen,
+        "black pictures": result.black,
+    }
     faults |= {"reused": int(result.reused.sum())}
     known = "".join(f", {count} {name}" for name, count in faults.items() if count)
-    return [*lines, f"{result.total} frames embedded{last} {dropped} dropped, {rate:.1f} frames/s{known}"]
+    return [
+        *lines,
+        f"{result.total} frames embedded{last} {dropped} dropped, {rate:.1f} frames/s{known}",
+    ]

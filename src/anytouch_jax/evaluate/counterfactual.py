@@ -22,13 +22,20 @@ from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore, enc
 from anytouch_jax.evaluate.probing import probe_tasks
 from anytouch_jax.evaluate.statistics import Array, GroupSums, interval_text
 
-REAL, SHUFFLED, SHIFTED, BACKGROUND, MEAN = (
-    "real touch", "shuffled touch", "time-shifted touch", "background only", "mean touch",
-)  # fmt: skip
+REAL = "real touch"
+SHUFFLED = "shuffled touch"
+SHIFTED = "time-shifted touch"
+BACKGROUND = "background only"
+MEAN = "mean touch"
 
 
 def probe_counterfactual(
-    models: Sequence[str | Path], data: Sequence[str | Path], tasks: Any = "all", *, log: Log = print, **options: Any
+    models: Sequence[str | Path],
+    data: Sequence[str | Path],
+    tasks: Any = "all",
+    *,
+    log: Log = print,
+    **options: Any,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the results of `probe_tasks` for the five kinds of touch, and what real touch adds to each of the others.
 
@@ -37,8 +44,11 @@ def probe_counterfactual(
     `probe_tasks`. Raises UserError.
     """
     if len(models) != 1:
-        raise UserError(f"A counterfactual probe takes one encoder, not {len(models)}. Give one --model.")
-    table, encoder = manifests.read([str(path) for path in data]), load_encoder(models[0])
+        raise UserError(
+            f"A counterfactual probe takes one encoder, not {len(models)}. Give one --model."
+        )
+    table = manifests.read([str(path) for path in data])
+    encoder = load_encoder(models[0])
     encoding = {name: options[name] for name in ("pooling", "join") if name in options}
     cache = options.pop("cache", None)
     sources = touch_sources(table, encoder, cache=cache, log=log, **encoding)
@@ -56,7 +66,12 @@ def probe_counterfactual(
 
 
 def touch_sources(
-    table: Manifest, encoder: Encoder, *, cache: Path | None = None, log: Log = print, **encoding: Any
+    table: Manifest,
+    encoder: Encoder,
+    *,
+    cache: Path | None = None,
+    log: Log = print,
+    **encoding: Any,
 ) -> list[FeatureSource]:
     """Return features of the real touch and of the four controls; "background only" where rows have backgrounds."""
     gels = UnitGels(table)
@@ -72,16 +87,28 @@ def touch_sources(
     def shifted(rows: Array, frames: int) -> Array:
         return shift_in_time(table, rows, frames)
 
-    gel = gels.shared(lambda picture: encoder.prepare(picture, picture if encoder.subtracts else None))
+    gel = gels.shared(
+        lambda picture: encoder.prepare(picture, picture if encoder.subtracts else None)
+    )
 
     def empty(clips: Array, rows: Array) -> Array:
-        return np.broadcast_to(np.stack([np.asarray(gel(row)) for row in rows.tolist()])[:, None], clips.shape)
+        return np.broadcast_to(
+            np.stack([np.asarray(gel(row)) for row in rows.tolist()])[:, None], clips.shape
+        )
 
     def background(rows: Array, frames: int) -> Array:
-        return embed_rows(encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding)[1]
+        return embed_rows(
+            encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding
+        )[1]
 
-    stores = {REAL: real, SHUFFLED: from_real(lambda rows, _: shuffle_rows(table, rows)), SHIFTED: from_real(shifted)}
-    if gels.has(np.flatnonzero(np.isin(table.text_column("split"), ("train", "val", "test")))).all():
+    stores = {
+        REAL: real,
+        SHUFFLED: from_real(lambda rows, _: shuffle_rows(table, rows)),
+        SHIFTED: from_real(shifted),
+    }
+    if gels.has(
+        np.flatnonzero(np.isin(table.text_column("split"), ("train", "val", "test")))
+    ).all():
         stores[BACKGROUND] = FeatureStore(background)
     else:
         log(f"{BACKGROUND}: left out, as some rows have no picture of the untouched gel")
@@ -91,7 +118,9 @@ def touch_sources(
 
 def shuffle_rows(table: Manifest, rows: Array) -> Array:
     """Return for each of `rows` (n,) another row of the same sensor, drawn with a fixed seed."""
-    rng, sensor, partners = np.random.default_rng(0), table.codes("sensor")[rows], rows.copy()
+    rng = np.random.default_rng(0)
+    sensor = table.codes("sensor")[rows]
+    partners = rows.copy()
     for name in np.unique(sensor):
         here = np.flatnonzero(sensor == name)
         turned = rng.permutation(here)
@@ -102,10 +131,15 @@ def shuffle_rows(table: Manifest, rows: Array) -> Array:
 def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
     """Return for each of `rows` (n,) the row half a recording later, around the end; one frame alone stays."""
     ends = np.arange(len(table)) if frames == 1 else np.unique(table.clips(frames)[:, -1])
-    sequence, number = table.codes("sequence", own=True), np.asarray(table.column("frame_index"))
+    sequence = table.codes("sequence", own=True)
+    number = np.asarray(table.column("frame_index"))
     ends = ends[np.lexsort((number[ends], sequence[ends]))]
-    _, first, place, counts = np.unique(sequence[ends], return_index=True, return_inverse=True, return_counts=True)
-    later = (np.arange(len(ends)) - first[place] + counts[place] // 2) % counts[place] + first[place]
+    _, first, place, counts = np.unique(
+        sequence[ends], return_index=True, return_inverse=True, return_counts=True
+    )
+    later = (np.arange(len(ends)) - first[place] + counts[place] // 2) % counts[place] + first[
+        place
+    ]
     partner = np.arange(len(table))
     partner[ends] = ends[later]
     return partner[rows]
@@ -123,8 +157,15 @@ def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
             points = f"{100 * least['difference']:.1f} points ({100 * least['low']:.1f} to {100 * least['high']:.1f})"
             sentence = f"Touch matters for {key[0]}: it adds {points} to {least['control']}"
             late = own.get(SHIFTED, {"low": None})
-            if late["low"] is not None and (late["low"], late["high"]) != (0, 0):  # there is another moment
-                sentence += ", and the moment matters" if late["low"] > 0 else ", and any moment of a recording serves"
+            if late["low"] is not None and (late["low"], late["high"]) != (
+                0,
+                0,
+            ):  # there is another moment
+                sentence += (
+                    ", and the moment matters"
+                    if late["low"] > 0
+                    else ", and any moment of a recording serves"
+                )
         else:
             failed = ", ".join(gain["control"] for gain in without if gain not in above)
             sentence = f"There is no sign that touch matters for {key[0]}: real touch is not above {failed}"
@@ -135,7 +176,13 @@ def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
 def gains_table(gains: Sequence[dict[str, Any]]) -> str:
     """Return the paired differences as a Markdown table, in points of 100."""
     rows = [
-        (gain["task"], gain["head"], f"real above {gain['control']}", f"{100 * gain['difference']:.1f}",
-         interval_text(gain["low"], gain["high"])) for gain in gains
-    ]  # fmt: skip
+        (
+            gain["task"],
+            gain["head"],
+            f"real above {gain['control']}",
+            f"{100 * gain['difference']:.1f}",
+            interval_text(gain["low"], gain["high"]),
+        )
+        for gain in gains
+    ]
     return statistics.markdown_table(("task", "head", "compared", "points", "95 %"), rows)

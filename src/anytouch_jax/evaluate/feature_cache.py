@@ -44,27 +44,35 @@ class FeatureStore:
     """
 
     def __init__(
-        self, compute: Compute, describe: Callable[[], Mapping[str, Any]] = dict, folder: Path | None = None
+        self,
+        compute: Compute,
+        describe: Callable[[], Mapping[str, Any]] = dict,
+        folder: Path | None = None,
     ) -> None:
-        self._compute, self._folder = compute, folder
+        self._compute = compute
+        self._folder = folder
         self._about = {} if folder is None else dict(describe())
-        self._known: dict[int, tuple[Array, Array]] = {}  # rows, in order, and their features by length of clip
+        # rows, in order, and their features by length of clip
+        self._known: dict[int, tuple[Array, Array]] = {}
 
     def add(self, rows: Array, frames: int) -> None:
         """Compute the missing features of these rows (any shape) in one pass."""
         if frames not in self._known:
             self._known[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
             if self._folder is not None:
-                with contextlib.suppress(OSError, ValueError, KeyError):  # a damaged file is written again
+                # a damaged file is written again
+                with contextlib.suppress(OSError, ValueError, KeyError):
                     arrays = read_arrays(self.file(frames))
                     self._known[frames] = arrays["rows"], arrays["features"]
         known, values = self._known[frames]
         missing = np.setdiff1d(rows, known)
         if not len(missing):
             return
-        computed, every = self._compute(missing, frames), np.concatenate([known, missing])
+        computed = self._compute(missing, frames)
+        every = np.concatenate([known, missing])
         order = np.argsort(every)
-        every, values = every[order], np.concatenate([values, computed] if len(known) else [computed])[order]
+        every = every[order]
+        values = np.concatenate([values, computed] if len(known) else [computed])[order]
         self._known[frames] = every, values
         if self._folder is not None:
             save_npz(self.file(frames), Features(values, every, {}), {"about": self._text(frames)})
@@ -77,22 +85,37 @@ class FeatureStore:
 
     def file(self, frames: int) -> Path:
         """Return the file of features of clips of this length."""
-        return Path(self._folder or ".") / f"{hashlib.sha256(self._text(frames).encode()).hexdigest()[:32]}.npz"
+        return (
+            Path(self._folder or ".")
+            / f"{hashlib.sha256(self._text(frames).encode()).hexdigest()[:32]}.npz"
+        )
 
     def _text(self, frames: int) -> str:
         return json.dumps(self._about | {"frames": frames}, sort_keys=True)
 
 
 def encoder_features(
-    encoder: Encoder, table: Manifest, *, pooling: Pooling = "class", join: Join = "mean", order: Order = "right",
-    universal: bool = False, folder: Path | None = None, gels: UnitGels | None = None,
+    encoder: Encoder,
+    table: Manifest,
+    *,
+    pooling: Pooling = "class",
+    join: Join = "mean",
+    order: Order = "right",
+    universal: bool = False,
+    folder: Path | None = None,
+    gels: UnitGels | None = None,
     log: Callable[[str], None] = lambda _: None,
-) -> FeatureStore:  # fmt: skip
+) -> FeatureStore:
     """Return the features of an encoder; `universal`: the universal tokens for every sensor, as for unknown ones."""
     gels = gels or UnitGels(table)
 
     def describe() -> dict[str, Any]:
-        about = {"pooling": pooling, "join": join, "universal": universal, "background": encoder.config.data.background}
+        about = {
+            "pooling": pooling,
+            "join": join,
+            "universal": universal,
+            "background": encoder.config.data.background,
+        }
         content = _content(table, encoder_digest(encoder), order) | about
         return content | ({"gels": gels.digest()} if encoder.subtracts else {})
 
@@ -106,11 +129,17 @@ def encoder_features(
 
 
 def pixel_features(
-    table: Manifest, *, order: Order = "right", folder: Path | None = None, gels: UnitGels | None = None
+    table: Manifest,
+    *,
+    order: Order = "right",
+    folder: Path | None = None,
+    gels: UnitGels | None = None,
 ) -> FeatureStore:
     """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in 0..1."""
     gels = gels or UnitGels(table)
-    read = _pair_reader(table, gels, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA))
+    read = _pair_reader(
+        table, gels, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA)
+    )
 
     def compute(rows: Array, frames: int) -> Array:
         clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
@@ -119,10 +148,14 @@ def pixel_features(
         pixels = np.stack([raw_pixels(*read(int(row))) for row in single])
         last, differences = np.split(pixels, 2, axis=1)
         places = places.reshape(windows.shape)
-        return np.concatenate([last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1)
+        return np.concatenate(
+            [last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1
+        )
 
     name = "raw pixels in colour"
-    return FeatureStore(compute, lambda: _content(table, name, order) | {"gels": gels.digest()}, folder)
+    return FeatureStore(
+        compute, lambda: _content(table, name, order) | {"gels": gels.digest()}, folder
+    )
 
 
 def file_features(path: Path, table: Manifest) -> FeatureStore:
@@ -131,21 +164,36 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
     Raises UserError for another file or manifest, and, when they are read, for other clips and missing rows.
     """
     features, about = read_npz(path)
-    values, rows, length = features.values, features.rows, about.get("frames")
+    values = features.values
+    rows = features.rows
+    length = about.get("frames")
     if len(np.unique(rows)) < len(rows) or rows.min() < 0 or rows.max() >= len(table):
-        raise UserError(f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}.")
+        raise UserError(
+            f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}."
+        )
     paths = features.keys.get("path")
-    if paths is not None and (paths != table.text_column("path")[rows]).any() and len(table.files) == 1:
-        raise UserError(f"{path} holds features of another manifest. Its paths differ from those of these rows.")
+    if (
+        paths is not None
+        and (paths != table.text_column("path")[rows]).any()
+        and len(table.files) == 1
+    ):
+        raise UserError(
+            f"{path} holds features of another manifest. Its paths differ from those of these rows."
+        )
     order = np.argsort(rows)
-    rows, values = rows[order], values[order].astype(np.float32)
+    rows = rows[order]
+    values = values[order].astype(np.float32)
 
     def compute(wanted: Array, frames: int) -> Array:
         if length not in (None, str(frames)):
-            raise UserError(f"{path} holds features of {length} frames a touch, not {frames}. Give --frames {length}.")
+            raise UserError(
+                f"{path} holds features of {length} frames a touch, not {frames}. Give --frames {length}."
+            )
         missing = len(np.setdiff1d(wanted, rows))
         if missing:
-            raise UserError(f"{path} lacks {missing} of the {len(wanted)} rows to probe. Embed them too.")
+            raise UserError(
+                f"{path} lacks {missing} of the {len(wanted)} rows to probe. Embed them too."
+            )
         return values[np.searchsorted(rows, wanted)]
 
     return FeatureStore(compute)
@@ -162,7 +210,8 @@ def reorder_frames(clips: Array, rows: Array, order: Order) -> Array:
         raise UserError(f"Unknown order {order!r}. Choose right, shuffled or repeated.")
     shuffled = np.empty_like(clips)
     for place, row in enumerate(rows):
-        rng, drawn = np.random.default_rng([13, int(row)]), np.arange(frames)
+        rng = np.random.default_rng([13, int(row)])
+        drawn = np.arange(frames)
         while (drawn == np.arange(frames)).all():
             drawn = rng.permutation(frames)
         shuffled[place] = clips[place, drawn]
@@ -170,7 +219,11 @@ def reorder_frames(clips: Array, rows: Array, order: Order) -> Array:
 
 
 def _content(table: Manifest, parameters: str, order: Order) -> dict[str, Any]:
-    about = {"parameters": parameters, "manifest": table.content_hash, "pictures": image_digest(table)}
+    about = {
+        "parameters": parameters,
+        "manifest": table.content_hash,
+        "pictures": image_digest(table),
+    }
     return {"version": VERSION, "order": order, **about}
 
 
@@ -178,7 +231,9 @@ def encoder_digest(encoder: Encoder) -> str:
     """Return SHA-256 over the parameters and the model config."""
     digest = hashlib.sha256(encoder.contract.encode())
     leaves = jax.tree_util.tree_leaves_with_path(encoder.params)
-    for name, leaf in sorted((jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves):
+    for name, leaf in sorted(
+        (jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves
+    ):
         array = np.ascontiguousarray(leaf)
         digest.update(f"{name} {array.dtype} {array.shape}".encode())
         digest.update(array.view(np.uint8).data if array.size else b"")
@@ -193,7 +248,8 @@ def image_digest(table: Manifest, count: int = 32) -> str:
     digest = hashlib.sha256()
     files = distinct_files(table, ("path", "background_path"))
     for row, column in zip(files.row, files.column, strict=True):
-        with contextlib.suppress(OSError, ValueError):  # an unreadable file raises when its features are computed
+        # an unreadable file raises when its features are computed
+        with contextlib.suppress(OSError, ValueError):
             file = table.file(int(row), column)
             if column == "background_path":
                 digest.update(read_file(file))
@@ -210,10 +266,14 @@ def image_digest(table: Manifest, count: int = 32) -> str:
 def raw_pixels(frame: Array, background: Array | None) -> Array:
     """Return pixels in colour, and minus the background (0 if None): u8 RGB (h, w, 3) -> f32 (2 * 24 * 32 * 3,)."""
     pixels = _small(frame)
-    return np.concatenate([pixels, np.zeros_like(pixels) if background is None else pixels - _small(background)])
+    return np.concatenate(
+        [pixels, np.zeros_like(pixels) if background is None else pixels - _small(background)]
+    )
 
 
-def _pair_reader(table: Manifest, gels: UnitGels, prepare: Callable[[Array], Any]) -> Callable[[int], tuple[Any, Any]]:
+def _pair_reader(
+    table: Manifest, gels: UnitGels, prepare: Callable[[Array], Any]
+) -> Callable[[int], tuple[Any, Any]]:
     """Return a function from a row to its prepared frame and untouched gel, None without one."""
     gel = gels.shared(prepare)
     return lambda row: (prepare(read_image(table, row)), gel(row))
@@ -221,20 +281,27 @@ def _pair_reader(table: Manifest, gels: UnitGels, prepare: Callable[[Array], Any
 
 def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = None) -> Array:
     """Return frames minus their untouched gel in RGB: f32 (n, 24 * 32 * 3) in -1..1. Raises UserError without one."""
-    read = _pair_reader(table, gels or UnitGels(table), lambda one: (_small(one), one.shape[1] / one.shape[0]))
+    read = _pair_reader(
+        table, gels or UnitGels(table), lambda one: (_small(one), one.shape[1] / one.shape[0])
+    )
     values = np.zeros((len(rows), SMALL[0] * SMALL[1] * 3), np.float32)
     for place, row in enumerate(map(int, rows)):
         (frame, proportion), background = read(row)
         if background is None:
             raise UserError(f"{table.where(row)} has no picture of the untouched gel. {ADVICE}")
         if abs(proportion / background[1] - 1) > 1 / FORM:
-            raise UserError(f"{table.where(row)}: its background_path has other proportions than the frame.")
+            raise UserError(
+                f"{table.where(row)}: its background_path has other proportions than the frame."
+            )
         values[place] = frame - background[0]
     return values
 
 
 def principal_components(
-    features: Array, train: Array, components: int = COMPONENTS, solver: Literal["full", "randomized"] = "full"
+    features: Array,
+    train: Array,
+    components: int = COMPONENTS,
+    solver: Literal["full", "randomized"] = "full",
 ) -> Array:
     """Return `features` (n, d) on the principal components of their `train` (n,) rows. Raises UserError without any."""
     fitted = features[np.asarray(train, bool)]
@@ -246,7 +313,9 @@ def principal_components(
 
 def _small(image: Array) -> Array:
     """Return area averages, f32 (24 * 32 * 3,) in 0..1, of a picture u8 (h, w, 3)."""
-    return cv2.resize(image.astype(np.float32) / 255, SMALL[::-1], interpolation=cv2.INTER_AREA).ravel()
+    return cv2.resize(
+        image.astype(np.float32) / 255, SMALL[::-1], interpolation=cv2.INTER_AREA
+    ).ravel()
 
 
 def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:
@@ -268,8 +337,12 @@ class FeatureSource(NamedTuple):
         if self.encoder is None:
             return []
         trained = self.encoder.trained_sensors
-        unknown = sorted(set(sensors) - set(self.encoder.config.model.sensors if trained is None else trained))
-        return [f"universal tokens for {', '.join(unknown)}"] if unknown else []
+        unknown = sorted(
+            set(sensors) - set(self.encoder.config.model.sensors if trained is None else trained)
+        )
+        if unknown:
+            return [f"universal tokens for {', '.join(unknown)}"]
+        return []
 
 
 def opened(models: Sequence[str | Path | FeatureSource]) -> list[Encoder | FeatureSource]:
@@ -284,16 +357,28 @@ def with_gel(rows: TaskRows, gels: UnitGels, models: Sequence[Encoder | FeatureS
         return rows
     has = np.all(gels.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
     if not has.any():
-        raise UserError(f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. {ADVICE}")
+        raise UserError(
+            f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. {ADVICE}"
+        )
     note = f"{(~has).sum()} rows are left out: they have no picture of the untouched gel"
-    return rows.take(np.flatnonzero(has))._replace(notes=(*rows.notes, *([] if has.all() else [note])))
+    return rows.take(np.flatnonzero(has))._replace(
+        notes=(*rows.notes, *([] if has.all() else [note]))
+    )
 
 
 def sources(
-    table: Manifest, models: Sequence[Encoder | FeatureSource], features: Sequence[str | Path], controls: bool,
-    cache: Path | None, rows: dict[int, Array], order: Order = "right", least: int = 1, *, gels: UnitGels,
+    table: Manifest,
+    models: Sequence[Encoder | FeatureSource],
+    features: Sequence[str | Path],
+    controls: bool,
+    cache: Path | None,
+    rows: dict[int, Array],
+    order: Order = "right",
+    least: int = 1,
+    *,
+    gels: UnitGels,
     **encoding: Any,
-) -> list[FeatureSource]:  # fmt: skip
+) -> list[FeatureSource]:
     """Return models, the random encoder, features files and raw pixels, in this order.
 
     `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of every clip.
@@ -301,7 +386,10 @@ def sources(
     several = [model for model in models if isinstance(model, FeatureSource)]
     encoders = {model.source: model for model in models if isinstance(model, Encoder)}
     if controls:
-        first = next((one for one in (*encoders.values(), *(source.encoder for source in several)) if one), None)
+        first = next(
+            (one for one in (*encoders.values(), *(source.encoder for source in several)) if one),
+            None,
+        )
         encoders[RANDOM] = first.untrained() if first else random_encoder(preset("tiny"))
     for name, encoder in encoders.items():
         check_frames(encoder.config.model, least)
@@ -312,7 +400,13 @@ def sources(
         for frames, ids in rows.items():
             several[-1].store.add(ids, frames)
     if controls:
-        several.append(FeatureSource(RAW, pixel_features(table, order=order, folder=cache, gels=gels), None, "common"))
+        several.append(
+            FeatureSource(
+                RAW, pixel_features(table, order=order, folder=cache, gels=gels), None, "common"
+            )
+        )
     if not several:
-        raise UserError("There is nothing to probe. Give --model or --features, or keep the controls.")
+        raise UserError(
+            "There is nothing to probe. Give --model or --features, or keep the controls."
+        )
     return several

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 HeadName = Literal["linear", "knn", "gradient"]
 Scaling = Literal["column", "common"]
-Predict = Callable[[Array], list[Array]]  # features (m, d) -> class numbers or numbers (m,) for each option
+# features (m, d) -> class numbers or numbers (m,) for each option
+Predict = Callable[[Array], list[Array]]
 
 PENALTIES = (1.0, 0.1, 0.01, 0.001, 0.0001)  # of logistic regression
 RIDGE = (100.0, 10.0, *PENALTIES)
@@ -63,11 +64,17 @@ class ProbeHead:
 
     def __post_init__(self) -> None:
         if self.name not in get_args(HeadName):
-            raise UserError(f"Unknown head {self.name!r}. Choose among {', '.join(get_args(HeadName))}.")
+            raise UserError(
+                f"Unknown head {self.name!r}. Choose among {', '.join(get_args(HeadName))}."
+            )
         if self.options is not None:
             if not self.options or min(self.options) <= 0:
-                raise UserError(f"Penalties and numbers of neighbours must be above 0, not {list(self.options)}.")
-            object.__setattr__(self, "options", tuple(sorted(set(map(float, self.options)), reverse=True)))
+                raise UserError(
+                    f"Penalties and numbers of neighbours must be above 0, not {list(self.options)}."
+                )
+            object.__setattr__(
+                self, "options", tuple(sorted(set(map(float, self.options)), reverse=True))
+            )
 
 
 @shown_short
@@ -93,7 +100,13 @@ class LinearModel(NamedTuple):
 
 
 def fit_head(
-    head: ProbeHead, x: Array, y: Array, classes: int, *, weights: Array | None = None, start: LinearModel | None = None
+    head: ProbeHead,
+    x: Array,
+    y: Array,
+    classes: int,
+    *,
+    weights: Array | None = None,
+    start: LinearModel | None = None,
 ) -> FittedHead:
     """Fit all options of a head on features f32 (n, d) and class numbers below `classes` (0: y are numbers).
 
@@ -109,12 +122,14 @@ def fit_head(
         return FittedHead(options, lambda rows: [model(rows) for model in models], models)
     if weights is not None:
         times = weights.astype(np.int64)
-        x, y = np.repeat(x, times, 0), np.repeat(y, times)
+        x = np.repeat(x, times, 0)
+        y = np.repeat(y, times)
     if head.name == "gradient":
         return FittedHead(options, _fit_gradient(x, y, classes, options, head.recipe, head.seed))
     if head.name == "linear":
         return FittedHead(options, fit_ridge(x, y, options, head.scaling))
-    z_train, numbers = unit_rows(x), list(map(int, options))
+    z_train = unit_rows(x)
+    numbers = list(map(int, options))
 
     def neighbours(rows: Array) -> list[Array]:
         near, cosines = nearest(z_train, unit_rows(rows), max(numbers))
@@ -127,22 +142,33 @@ def fit_head(
 
 def head_score(predicted: Array, truth: Array, classes: int) -> float:
     """Return the accuracy, or minus the mean squared error of numbers (0 classes)."""
-    return float(np.mean(predicted == truth)) if classes else -float(np.mean((predicted - truth) ** 2))
+    if classes:
+        return float(np.mean(predicted == truth))
+    return -float(np.mean((predicted - truth) ** 2))
 
 
 def linear_path(
-    x: Array, y: Array, penalties: Sequence[float], *, scaling: Scaling = "column", weights: Array | None = None,
+    x: Array,
+    y: Array,
+    penalties: Sequence[float],
+    *,
+    scaling: Scaling = "column",
+    weights: Array | None = None,
     start: LinearModel | None = None,
-) -> list[LinearModel]:  # fmt: skip
+) -> list[LinearModel]:
     """Return logistic regression of `y` (n,) for each penalty, each from the fit before; `weights` (n,) of the rows."""
     mean, scale = _mean_and_scale(x, weights, scaling)
     classes, numbers = np.unique(y, return_inverse=True)
     first = start.fit if start is not None and np.array_equal(start.classes, classes) else None
     fits = logistic_path((x - mean) / scale, numbers, len(classes), penalties, first, weights)
-    return [LinearModel(mean, scale, classes, fit) for fit in tracked(fits, "penalties", len(penalties))]
+    return [
+        LinearModel(mean, scale, classes, fit) for fit in tracked(fits, "penalties", len(penalties))
+    ]
 
 
-def _mean_and_scale(x: Array, weights: Array | None = None, scaling: Scaling = "column") -> tuple[Array, Array]:
+def _mean_and_scale(
+    x: Array, weights: Array | None = None, scaling: Scaling = "column"
+) -> tuple[Array, Array]:
     """Return the mean and deviation (d,) of each column, "common": one for all; a constant column gets deviation 1."""
     shares = None if weights is None else weights / weights.sum(dtype=np.float64)
     mean = (x.mean(0, dtype=np.float64) if shares is None else shares @ x).astype(np.float32)
@@ -157,14 +183,19 @@ def _mean_and_scale(x: Array, weights: Array | None = None, scaling: Scaling = "
     return mean, np.where(scale > 1e-6 * np.abs(mean), scale, 1.0).astype(np.float32)
 
 
-def fit_ridge(x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "column") -> Predict:
+def fit_ridge(
+    x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "column"
+) -> Predict:
     """Return a function from features (m, d) to ridge predictions (m,), one array a penalty of the mean square."""
-    from sklearn.linear_model import Ridge  # here, so that other heads are fitted without it
+    # here, so that other heads are fitted without it
+    from sklearn.linear_model import Ridge
 
     mean, scale = _mean_and_scale(x, scaling=scaling)
     model = Ridge(len(x) * np.asarray(penalties), solver="cholesky")
     model.fit((x - mean).astype(np.float64) / scale, np.repeat(y[:, None], len(penalties), 1))
-    return lambda rows: list(model.predict((rows - mean).astype(np.float64) / scale).reshape(len(rows), -1).T)
+    return lambda rows: list(
+        model.predict((rows - mean).astype(np.float64) / scale).reshape(len(rows), -1).T
+    )
 
 
 def vote(labels: Array, cosines: Array, classes: int) -> Array:
@@ -189,25 +220,36 @@ def _fit_gradient(
         np.asarray(rng.uniform(-1, 1, columns) / np.sqrt(d), np.float32),
     )
     init, step = _gradient_step(recipe, classes)
-    state, batch, epochs = init(params), min(recipe.batch, n), list[tuple[Array, Array]]()
+    state = init(params)
+    batch = min(recipe.batch, n)
+    epochs = list[tuple[Array, Array]]()
     steps = n // batch  # the last, smaller batch of an epoch is left out
     for epoch in tracked(range(recipe.epochs), "epochs"):
-        for number, rows in enumerate(rng.permutation(n)[: steps * batch].reshape(steps, batch), epoch * steps):
+        for number, rows in enumerate(
+            rng.permutation(n)[: steps * batch].reshape(steps, batch), epoch * steps
+        ):
             rate = recipe.rate * 0.5 * (1 + np.cos(np.pi * number / (steps * recipe.epochs)))
             params, state = step(params, state, x[rows], target[rows], np.float32(rate))
         epochs.append((np.asarray(params[0]), np.asarray(params[1])))
 
     def predict(rows: Array) -> list[Array]:
-        logits = [rows @ weights + bias for weights, bias in (epochs[int(epoch) - 1] for epoch in options)]
+        logits = [
+            rows @ weights + bias for weights, bias in (epochs[int(epoch) - 1] for epoch in options)
+        ]
         if classes > 2:
             return [each.argmax(1) for each in logits]
-        return [(each[:, 0] > 0).astype(np.int64) if classes else each[:, 0] * spread + middle for each in logits]
+        return [
+            (each[:, 0] > 0).astype(np.int64) if classes else each[:, 0] * spread + middle
+            for each in logits
+        ]
 
     return predict
 
 
 @functools.cache
-def _gradient_step(recipe: GradientRecipe, classes: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _gradient_step(
+    recipe: GradientRecipe, classes: int
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return optax's `init` and a compiled step of AdamW; two classes share one logit, as in the released code."""
     import jax  # here, so that a saved head is read without it
     import optax
@@ -224,22 +266,35 @@ def _gradient_step(recipe: GradientRecipe, classes: int) -> tuple[Callable[..., 
 
     def step(params: Any, state: Any, x: Any, target: Any, rate: Any) -> tuple[Any, Any]:
         updates, state = tx.update(jax.grad(loss)(params, x, target), state, params)
-        return optax.apply_updates(params, jax.tree.map(lambda update: rate * update, updates)), state
+        return optax.apply_updates(
+            params, jax.tree.map(lambda update: rate * update, updates)
+        ), state
 
-    return tuple(jax.enable_x64(False)(function) for function in (tx.init, jax.jit(step)))  # whatever JAX_ENABLE_X64
+    # whatever JAX_ENABLE_X64
+    return tuple(jax.enable_x64(False)(function) for function in (tx.init, jax.jit(step)))
 
 
 def calibrate(
-    head: LinearHead, features: Array, y: Array, groups: Array, sensors: Array, fit: Array, val: Array,
-    folds: Iterable[tuple[Array, Array]], penalty: float, **shares: float,
-) -> LinearHead:  # fmt: skip
+    head: LinearHead,
+    features: Array,
+    y: Array,
+    groups: Array,
+    sensors: Array,
+    fit: Array,
+    val: Array,
+    folds: Iterable[tuple[Array, Array]],
+    penalty: float,
+    **shares: float,
+) -> LinearHead:
     """Return the head with a calibration from rows that it was not fitted on.
 
     `features` (N, d), class names `y` (N,), `groups` (N,) and `sensors` (N,) are of all rows. `fit` and `val` are row
     numbers. `folds` yields rows of `fit` to fit on and left out: heads fitted again with `penalty` predict these.
     `shares` are those of `LinearHead.calibrated`. Raises UserError if no row is left.
     """
-    count, logits, used = len(head.classes), [head.scaled(features[val]) @ head.weights + head.bias], [val]
+    count = len(head.classes)
+    logits = [head.scaled(features[val]) @ head.weights + head.bias]
+    used = [val]
     numbers = np.searchsorted(head.classes, y)
     for inside, outside in folds:
         classes = np.unique(numbers[inside])
@@ -250,12 +305,15 @@ def calibrate(
         several = (features[kept] - model.mean) / model.scale @ model.fit.weights + model.fit.bias
         if len(classes) < count:
             partial = several
-            several = np.full((len(kept), count), -1e3, np.float32)  # e**-1000 is 0: classes that the fit lacks
+            # e**-1000 is 0: classes that the fit lacks
+            several = np.full((len(kept), count), -1e3, np.float32)
             several[:, classes] = partial
         logits.append(several)
         used.append(kept)
     rows = np.concatenate(used)
-    return head.calibrated(np.concatenate(logits), y[rows], groups[rows], features, groups, sensors, fit, val, **shares)
+    return head.calibrated(
+        np.concatenate(logits), y[rows], groups[rows], features, groups, sensors, fit, val, **shares
+    )
 
 
 def linear_head(
@@ -284,13 +342,19 @@ class Logistic(NamedTuple):
     def __call__(self, x: Array) -> Array:
         """Return class numbers i64 (n,) of features (n, d)."""
         logits = x @ self.weights + self.bias
-        return (logits[:, 0] > 0).astype(np.int64) if logits.shape[1] == 1 else logits.argmax(1)
+        if logits.shape[1] == 1:
+            return (logits[:, 0] > 0).astype(np.int64)
+        return logits.argmax(1)
 
 
 def logistic_path(
-    x: Array, y: Array, classes: int, penalties: Sequence[float], start: Logistic | None = None,
+    x: Array,
+    y: Array,
+    classes: int,
+    penalties: Sequence[float],
+    start: Logistic | None = None,
     weights: Array | None = None,
-) -> Iterator[Logistic]:  # fmt: skip
+) -> Iterator[Logistic]:
     """Yield multinomial logistic regressions of class numbers `y` (n,) below `classes` on features `x` f32 (n, d).
 
     A penalty is the factor of half the squared weights, added to the mean log loss; the bias is free. Give standardised
@@ -308,9 +372,16 @@ def logistic_path(
 
 
 def _fit(
-    x: Array, y: Array, shares: Array, columns: int, penalty: float, covariance: Array, start: Logistic | None
+    x: Array,
+    y: Array,
+    shares: Array,
+    columns: int,
+    penalty: float,
+    covariance: Array,
+    start: Logistic | None,
 ) -> Logistic:
-    d, share = x.shape[1], 0.25 if columns == 1 else 1 / columns
+    d = x.shape[1]
+    share = 0.25 if columns == 1 else 1 / columns
     # A small diagonal keeps the factor when there are fewer rows than features.
     diagonal = penalty + 1e-6 * share * np.trace(covariance) / d
     factor = cholesky(share * covariance + diagonal * np.eye(d), lower=True, check_finite=False)
@@ -335,7 +406,9 @@ def _fit(
     options = {"maxiter": STEPS, "maxfun": 2 * STEPS, "maxcor": 20, "ftol": 1e-7, "gtol": 1e-6}
     optimum = minimize(value, first.ravel(), jac=True, method="L-BFGS-B", options=options)
     weights, bias = unpacked(optimum.x)
-    return Logistic(weights.astype(np.float32), bias.astype(np.float32), float(optimum.fun), optimum.nit < STEPS)
+    return Logistic(
+        weights.astype(np.float32), bias.astype(np.float32), float(optimum.fun), optimum.nit < STEPS
+    )
 
 
 def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
@@ -356,7 +429,8 @@ def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
     return loss, logits
 
 
-_libraries = functools.cache(ThreadpoolController)  # finding the libraries takes longer than a small fit
+# finding the libraries takes longer than a small fit
+_libraries = functools.cache(ThreadpoolController)
 
 
 def threads(size: int) -> contextlib.AbstractContextManager[Any]:

@@ -53,12 +53,19 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     try:
         lines = [parse_json(line) for line in file.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError) as error:
-        raise UserError(f"{file} is not the metrics.jsonl of a run ({error}). Give a run folder.") from None
+        raise UserError(
+            f"{file} is not the metrics.jsonl of a run ({error}). Give a run folder."
+        ) from None
     for number, line in enumerate(lines, 1):
         row = line if isinstance(line, dict) else {}
-        values = [row.get("step"), *(row[name] for name in (*TERMS, "loss") if row.get(name) is not None)]
+        values = [
+            row.get("step"),
+            *(row[name] for name in (*TERMS, "loss") if row.get(name) is not None),
+        ]
         if not all(isinstance(value, int | float) for value in values):
-            raise UserError(f"Line {number} of {file} has no step, or a loss that is not a number. Remove the line.")
+            raise UserError(
+                f"Line {number} of {file} has no step, or a loss that is not a number. Remove the line."
+            )
     if not lines:
         raise UserError(f"{file} has no step yet. Train first.")
     return lines
@@ -74,7 +81,13 @@ def loss_curves(path: Path, runs: Mapping[str, Path]) -> None:
             points = [(line["step"], line[name]) for line in lines if line.get(name) is not None]
             steps, values = np.array(points, np.float64).T if points else np.zeros((2, 0))
             axis.plot(steps, values, color=f"C{colour}", alpha=0.25, linewidth=0.8)
-            axis.plot(steps, smoothed(values), color=f"C{colour}", linewidth=1.6, label=name.replace("_", " "))
+            axis.plot(
+                steps,
+                smoothed(values),
+                color=f"C{colour}",
+                linewidth=1.6,
+                label=name.replace("_", " "),
+            )
         axis.set(title=title, xlabel="step", ylabel="loss term")
         axis.locator_params(axis="x", integer=True)
         axis.set_ylim(bottom=0)
@@ -103,24 +116,38 @@ def tsne_panels(path: Path, spaces: Mapping[str, Array], sensors: Any, objects: 
             axis.set(title=f"{title}, by {what}", xticks=[], yticks=[])
         if len(names) <= _LEGEND:
             marks = [row[-1].scatter([], [], s=20, color=colours[i]) for i in range(len(names))]
-            row[-1].legend(marks, names, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+            row[-1].legend(
+                marks, names, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False
+            )
         else:
             row[-1].set_xlabel(f"{len(names)} {what}s", loc="right")
     write_figure(path, figure)
 
 
 def sample_grid(
-    path: Path, images: Sequence[Sequence[Array | None]], rows: Sequence[str], columns: Sequence[str]
+    path: Path,
+    images: Sequence[Sequence[Array | None]],
+    rows: Sequence[str],
+    columns: Sequence[str],
 ) -> None:
     """Draw a grid of pictures RGB u8 (h, w, 3), or fields (h, w) as colour maps; None is an empty cell."""
     figure, axes = panels(len(rows), len(columns), 1.75, 1.6)
     for i, (line, title) in enumerate(zip(images, rows, strict=True)):
         for j, (image, column) in enumerate(zip(line, columns, strict=True)):
             axis = axes[i][j]
-            axis.set(xticks=[], yticks=[], anchor="N")  # the titles of all columns at one height
+            # the titles of all columns at one height
+            axis.set(xticks=[], yticks=[], anchor="N")
             if image is None:
                 axis.set_facecolor("#f2f2f2")
-                axis.text(0.5, 0.5, "none", ha="center", va="center", color="#999999", transform=axis.transAxes)
+                axis.text(
+                    0.5,
+                    0.5,
+                    "none",
+                    ha="center",
+                    va="center",
+                    color="#999999",
+                    transform=axis.transAxes,
+                )
             else:
                 axis.imshow(image, cmap="viridis", aspect="equal")
             for side in axis.spines.values():
@@ -142,18 +169,29 @@ def bars(path: Path, series: Mapping[str, Mapping[str, ShareBar]], *, label: str
             place = names.index(name)
             axis.barh(place, 100 * bar.value, color=f"C{place % 10}", alpha=0.85, height=0.7)
             if bar.low is not None and bar.high is not None:
-                axis.plot([100 * bar.low, 100 * bar.high], [place, place], color="#222222", linewidth=1.4)
+                axis.plot(
+                    [100 * bar.low, 100 * bar.high], [place, place], color="#222222", linewidth=1.4
+                )
             if bar.chance is not None:
-                axis.plot([100 * bar.chance] * 2, [place - 0.45, place + 0.45], "--", color="#222222", linewidth=1)
+                axis.plot(
+                    [100 * bar.chance] * 2,
+                    [place - 0.45, place + 0.45],
+                    "--",
+                    color="#222222",
+                    linewidth=1,
+                )
         axis.set(title=title, xlabel=f"{label}, % (95 % interval)", axisbelow=True)
         axis.set_yticks(range(len(names)), names)
         axis.grid(axis="x", alpha=0.25)
-    axes[0][0].set_xlim(left=0)  # after all panels, which share it: a limit ends its growth
+    # after all panels, which share it: a limit ends its growth
+    axes[0][0].set_xlim(left=0)
     axes[0][0].invert_yaxis()
     write_figure(path, figure)
 
 
-def panels(rows: int, columns: int, width: float, height: float, **options: Any) -> tuple[Figure, list[list[Axes]]]:
+def panels(
+    rows: int, columns: int, width: float, height: float, **options: Any
+) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure and its grid of axes, each `width` x `height` inches. Raises UserError without any."""
     from matplotlib.figure import Figure
 
@@ -186,7 +224,8 @@ class Space:
 
 def alignment(first: Array, second: Array) -> float:
     """Return the mean squared distance of unit-norm positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
-    first, second = _unit(first), _unit(second)
+    first = _unit(first)
+    second = _unit(second)
     if first.shape != second.shape or not len(first):
         raise UserError(f"Alignment needs pairs of rows, not {first.shape} and {second.shape}.")
     return float(np.mean(np.linalg.norm(first - second, axis=1) ** 2))
@@ -209,7 +248,9 @@ def silhouette(features: Array, labels: Any) -> float | None:
     count = len(np.unique(labels))
     if not 2 <= count < len(labels):
         return None
-    return float(silhouette_score(_unit(subsample(np.asarray(features), MOST)), labels, metric="cosine"))
+    return float(
+        silhouette_score(_unit(subsample(np.asarray(features), MOST)), labels, metric="cosine")
+    )
 
 
 def tsne(features: Array, *, seed: int = 0) -> Array:
@@ -217,26 +258,39 @@ def tsne(features: Array, *, seed: int = 0) -> Array:
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits
 
-    if (features := np.asarray(features)).ndim != 2 or features.shape[0] < 4 or features.shape[1] < 2:
+    if (
+        (features := np.asarray(features)).ndim != 2
+        or features.shape[0] < 4
+        or features.shape[1] < 2
+    ):
         raise UserError(f"A t-SNE needs 4 rows of 2 columns or more, not {features.shape}.")
     x = _unit(features)
     # Squared Euclidean distances of unit-norm rows are twice the cosine distances.
-    model = TSNE(perplexity=min(30.0, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed)
-    with threadpool_limits(1):  # its threads wait for each other at every step, very long on a busy machine
+    model = TSNE(
+        perplexity=min(30.0, (len(x) - 1) / 3), init="pca", max_iter=600, random_state=seed
+    )
+    # its threads wait for each other at every step, very long on a busy machine
+    with threadpool_limits(1):
         return np.asarray(model.fit_transform(x.astype(np.float32)), np.float32)
 
 
-def describe(features: Array, sensors: Any, objects: Any, touches: Any, *, name: str = "features") -> Space:
+def describe(
+    features: Array, sensors: Any, objects: Any, touches: Any, *, name: str = "features"
+) -> Space:
     """Return all numbers of features (n, d); positive pairs are the rows of one touch by different sensors."""
-    x, sensors, objects = np.asarray(features), np.asarray(sensors).astype(str), np.asarray(objects).astype(str)
-    known, members = objects != "", dict[str, list[int]]()
+    x = np.asarray(features)
+    sensors = np.asarray(sensors).astype(str)
+    objects = np.asarray(objects).astype(str)
+    known = objects != ""
+    members = dict[str, list[int]]()
     for row, touch in enumerate(np.asarray(touches).astype(str)):
         members.setdefault(touch, []).append(row)
     several = [combinations(rows, 2) for _, rows in sorted(members.items())]
     pairs = [(a, b) for a, b in chain.from_iterable(several) if sensors[a] != sensors[b]]
     first, second = np.array(pairs, np.int64).reshape(-1, 2).T
     aligned = alignment(x[first], x[second]) if pairs else None
-    by_sensor, by_object = silhouette(x, sensors), silhouette(x[known], objects[known])
+    by_sensor = silhouette(x, sensors)
+    by_object = silhouette(x[known], objects[known])
     return Space(name, aligned, uniformity(x), by_sensor, by_object, len(x))
 
 

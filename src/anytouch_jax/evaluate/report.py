@@ -40,7 +40,8 @@ from anytouch_jax.files import atomic_write
 
 Change = tuple[float, float | None, float | None]  # a difference with its interval
 
-PIXELS, VECTOR = "pixels minus background", "area, centroid, force"
+PIXELS = "pixels minus background"
+VECTOR = "area, centroid, force"
 LABELS = ("hardness", "roughness", "material", "indenter", "force")
 FEWEST = 4  # rows of a t-SNE
 _T_SNE_ROWS = 800
@@ -60,7 +61,11 @@ class Section:
 
 
 def write_report(
-    folder: Path, sections: Sequence[Section], *, title: str = "Report", numbers: Mapping[str, Any] | None = None
+    folder: Path,
+    sections: Sequence[Section],
+    *,
+    title: str = "Report",
+    numbers: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write `folder`/report.html, report.md, report.json (`numbers`) and the figures, and return the path of report.md.
 
@@ -71,12 +76,17 @@ def write_report(
         parts += [f"## {section.title}", section.text]
         if section.figure is not None:
             if not section.figure.is_file():
-                raise UserError(f"There is no figure {section.figure} for the report. Draw it first, or leave it out.")
+                raise UserError(
+                    f"There is no figure {section.figure} for the report. Draw it first, or leave it out."
+                )
             atomic_write(folder / "figures" / section.figure.name, section.figure.read_bytes())
             parts.append(f"![{section.title}](figures/{section.figure.name})")
         parts += [section.table, section.notes]
     if numbers is not None:
-        atomic_write(folder / "report.json", json.dumps(statistics.plain(numbers), indent=2, allow_nan=False) + "\n")
+        atomic_write(
+            folder / "report.json",
+            json.dumps(statistics.plain(numbers), indent=2, allow_nan=False) + "\n",
+        )
     text = "\n\n".join(part.strip() for part in parts if part) + "\n"
     atomic_write(folder / "report.html", html_page(text, folder, title))
     atomic_write(folder / "report.md", text)
@@ -107,15 +117,23 @@ def html_page(text: str, folder: Path, title: str) -> str:
 
 
 def demo_report(
-    manifest: str | Path, stage1: str | Path, stage2: str | Path, out: str | Path, log: Log = print, *,
-    touches: int = 200, gallery_size: int = retrieval.GALLERY, seed: int = 0,
-) -> Path:  # fmt: skip
+    manifest: str | Path,
+    stage1: str | Path,
+    stage2: str | Path,
+    out: str | Path,
+    log: Log = print,
+    *,
+    touches: int = 200,
+    gallery_size: int = retrieval.GALLERY,
+    seed: int = 0,
+) -> Path:
     """Write a report of two runs on the split test of a manifest, and return the path of report.md.
 
     `touches` is the most of test, and half of it of train and of val, each with its deepest frame. A report that fails
     leaves an earlier one in `out` unchanged. Raises UserError, also for a run of the other stage and for weights files.
     """
-    clock, table = time.perf_counter(), manifests.read(manifest)
+    clock = time.perf_counter()
+    table = manifests.read(manifest)
     if (count := len(_chosen(table, "test", touches, seed))) < FEWEST:
         raise UserError(
             f"The report needs {FEWEST} frames of deepest contact. The split test gives {count} with --touches "
@@ -130,12 +148,17 @@ def demo_report(
         drawn = Path(folder)
         sections = [_facts(table, first, second, _lineage(runs["stage 1"], second))]
         sections += [*samples_section(table, drawn, seed=seed), _losses(runs, drawn)]
-        parts: dict[str, tuple[Section, Any]] = {"pixels": reconstructions_section(table, first, drawn)}
+        parts: dict[str, tuple[Section, Any]] = {
+            "pixels": reconstructions_section(table, first, drawn)
+        }
         log("report: samples, losses and reconstructions are drawn")
         encoders = {RANDOM: random_encoder(first.config, seed), "stage 1": first, "stage 2": second}
         study = _study(table, encoders, touches, seed, log)
         log(f"report: {len(study.rows)} frames embedded by {len(encoders)} encoders")
-        parts |= {"space": _space(study, drawn, seed), "retrieval": _retrieval(study, drawn, gallery_size)}
+        parts |= {
+            "space": _space(study, drawn, seed),
+            "retrieval": _retrieval(study, drawn, gallery_size),
+        }
         log("report: t-SNE is drawn, retrieval is scored")
         parts |= {"matching": _matching(study, second), "probes": _probes(study, drawn)}
         sections += [section for section, _ in parts.values()]
@@ -149,11 +172,19 @@ def demo_report(
 def _encoder_of_stage(run: Path, stage: int) -> Encoder:
     """Return the encoder of a run. Raises UserError for a weights file, which has no losses, and for another stage."""
     if run.is_file():
-        raise UserError(f"--stage{stage} {run} is a weights file. Give the folder of a run of stage {stage}.")
+        raise UserError(
+            f"--stage{stage} {run} is a weights file. Give the folder of a run of stage {stage}."
+        )
     encoder = load_encoder(run)
     if encoder.config.stage != stage:
-        meant = "the stage 1 from which stage 2 started" if stage == 1 else "a stage 2 that started from stage 1"
-        raise UserError(f"--stage{stage} {run} is a run of stage {encoder.config.stage}. Give {meant}.")
+        meant = (
+            "the stage 1 from which stage 2 started"
+            if stage == 1
+            else "a stage 2 that started from stage 1"
+        )
+        raise UserError(
+            f"--stage{stage} {run} is a run of stage {encoder.config.stage}. Give {meant}."
+        )
     return encoder
 
 
@@ -163,19 +194,29 @@ def _lineage(stage1: Path, second: Encoder) -> str:
     if init is None:
         return "Stage 2 started from no run, so this stage 1 is no part of it."
     began = Path(init)
-    same = began.resolve() == stage1.resolve() or (not began.exists() and began.name == stage1.resolve().name)
+    same = began.resolve() == stage1.resolve() or (
+        not began.exists() and began.name == stage1.resolve().name
+    )
     name = statistics.as_text(began.name)
-    return "" if same else f"Stage 2 started from another run ({name}), so this stage 1 is no part of it."
+    if same:
+        return ""
+    return f"Stage 2 started from another run ({name}), so this stage 1 is no part of it."
 
 
 def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Section:
-    split, objects = table.text_column("split"), table.text_column("object")
-    touch, sensors = table.codes("touch", own=True), table.text_column("sensor")
+    split = table.text_column("split")
+    objects = table.text_column("object")
+    touch = table.codes("touch", own=True)
+    sensors = table.text_column("sensor")
     rows = []
     for name in manifests.SPLITS:
         part = split == name
         if part.any():
-            counts = (part.sum(), len(np.unique(touch[part & (touch >= 0)])), len(set(objects[part]) - {""}))
+            counts = (
+                part.sum(),
+                len(np.unique(touch[part & (touch >= 0)])),
+                len(set(objects[part]) - {""}),
+            )
             rows.append((name, *counts, ", ".join(sorted(set(sensors[part])))))
     text = (
         f"Data {table.content_hash[:12]}. Stage 1: preset {first.config.preset}, {first.config.run.steps} steps of "
@@ -186,22 +227,31 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
     if backgrounds[0] != backgrounds[1]:
         lineage += f" Stage 1 was trained with background {backgrounds[0]}, stage 2 with background {backgrounds[1]}."
     counted = statistics.markdown_table(("split", "frames", "touches", "objects", "sensors"), rows)
-    return Section("Data and runs", text, counted, notes=f"**{lineage.strip()}**" if lineage else "")
+    return Section(
+        "Data and runs", text, counted, notes=f"**{lineage.strip()}**" if lineage else ""
+    )
 
 
 def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[Section]:
     """Return a section for each grade of alignment: pictures with a touch a row and a sensor a column, and captions."""
-    rows, sections = deepest_rows(manifest), []
+    rows = deepest_rows(manifest)
+    sections = []
     grades = _grades(manifest, rows, "")
     for grade in np.unique(grades):
         part = rows[grades == grade]
-        sensor, touch = manifest.text_column("sensor")[part], manifest.codes("touch", own=True)[part]
-        objects, names = manifest.text_column("object")[part], np.unique(sensor).tolist()
-        images, titles, captions = [], [], []
+        sensor = manifest.text_column("sensor")[part]
+        touch = manifest.codes("touch", own=True)[part]
+        objects = manifest.text_column("object")[part]
+        names = np.unique(sensor).tolist()
+        images = []
+        titles = []
+        captions = []
         for code in _varied_touches(touch, sensor, objects, seed):
             row_of = {str(sensor[i]): int(part[i]) for i in np.flatnonzero(touch == code)[::-1]}
             texts = [manifest.value(row, "text") for row in row_of.values()]
-            pictured = [row for row in row_of.values() if manifest.value(row, "image_path") is not None]
+            pictured = [
+                row for row in row_of.values() if manifest.value(row, "image_path") is not None
+            ]
             photo = decode(manifest.file(pictured[0], "image_path")) if pictured else None
             images.append([_picture(manifest, row_of.get(name)) for name in names] + [photo])
             titles.append(str(objects[touch == code][0]) or f"touch {code}")
@@ -210,8 +260,12 @@ def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[
         path = folder / "figures" / f"samples{suffix}.png"
         plots.sample_grid(path, images, titles, [*names, "photograph"])
         lines = zip(*(map(statistics.as_text, texts) for texts in (titles, captions)), strict=True)
-        notes = "\n".join(f"{i}. *{title}*: {caption}" for i, (title, caption) in enumerate(lines, 1))
-        text = "Rows are touches, columns are sensors, each at the deepest frame. Captions are below."
+        notes = "\n".join(
+            f"{i}. *{title}*: {caption}" for i, (title, caption) in enumerate(lines, 1)
+        )
+        text = (
+            "Rows are touches, columns are sensors, each at the deepest frame. Captions are below."
+        )
         title = f"Samples{', ' if grade else ''}{statistics.as_text(grade)}"
         sections.append(Section(title, text, figure=path, notes=notes))
     return sections
@@ -219,7 +273,9 @@ def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[
 
 def _grades(table: Manifest, rows: Array, default: str) -> Array:
     known = "grade" in table.table.column_names
-    return table.text_column("grade")[rows] if known else np.full(len(rows), default)
+    if known:
+        return table.text_column("grade")[rows]
+    return np.full(len(rows), default)
 
 
 def _varied_touches(touch: Array, sensor: Array, objects: Array, seed: int) -> list[int]:
@@ -228,7 +284,8 @@ def _varied_touches(touch: Array, sensor: Array, objects: Array, seed: int) -> l
     sensors = np.array([len(set(sensor[touch == code])) for code in codes])
     order = np.lexsort((np.random.default_rng(seed).random(len(codes)), -sensors))
     names = objects[first[order]]
-    turn = [np.sum(names[:place] == name) for place, name in enumerate(names)]  # how often the object came before
+    # how often the object came before
+    turn = [np.sum(names[:place] == name) for place, name in enumerate(names)]
     return codes[order[np.argsort(turn, kind="stable")]][:_SHOWN].tolist()
 
 
@@ -242,13 +299,18 @@ def _picture(manifest: Manifest, row: int | None) -> Array | None:
     try:
         field = unpack_npy(read_file(manifest.file(row, column)))
     except ValueError as error:
-        raise UserError(f"{manifest.where(row)}, column {column!r}, is no field of forces: {error}.") from None
-    return np.linalg.norm(field[..., :3], axis=-1) if field.ndim == 3 else field
+        raise UserError(
+            f"{manifest.where(row)}, column {column!r}, is no field of forces: {error}."
+        ) from None
+    if field.ndim == 3:
+        return np.linalg.norm(field[..., :3], axis=-1)
+    return field
 
 
 def _losses(runs: Mapping[str, Path], folder: Path) -> Section:
     """Return the loss curves of runs {title: run folder}, and the first and last smoothed value of each term."""
-    path, rows = folder / "figures" / "losses.png", []
+    path = folder / "figures" / "losses.png"
+    rows = []
     plots.loss_curves(path, runs)
     for title, run in runs.items():
         lines = plots.read_metrics(run)
@@ -256,17 +318,33 @@ def _losses(runs: Mapping[str, Path], folder: Path) -> Section:
             values = np.array([line[name] for line in lines if line.get(name) is not None])
             if len(values):
                 smooth = plots.smoothed(values)
-                rows.append((title, name.replace("_", " "), len(lines), f"{smooth[0]:.3f}", f"{smooth[-1]:.3f}"))
+                rows.append(
+                    (
+                        title,
+                        name.replace("_", " "),
+                        len(lines),
+                        f"{smooth[0]:.3f}",
+                        f"{smooth[-1]:.3f}",
+                    )
+                )
     table = statistics.markdown_table(("run", "term", "steps", "at the start", "at the end"), rows)
-    return Section("Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path)
+    return Section(
+        "Losses", "Pale: each step. Strong: running mean over a twentieth of the run.", table, path
+    )
 
 
-def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) -> tuple[Section, dict[str, Any]]:
+def reconstructions_section(
+    manifest: Manifest, encoder: Encoder, folder: Path
+) -> tuple[Section, dict[str, Any]]:
     """Return masked patches and next frames of stage 1 on a test clip of each sensor, and its errors."""
-    config, params = encoder.config, encoder.params | {"decoder": encoder.part_params("decoder")}
-    rows, frames = _with_images(manifest, manifest.rows_of("test")), config.model.frames + 1
+    config = encoder.config
+    params = encoder.params | {"decoder": encoder.part_params("decoder")}
+    rows = _with_images(manifest, manifest.rows_of("test"))
+    frames = config.model.frames + 1
     rows = rows_with_gel(encoder, UnitGels(manifest), rows, lambda _: None)
-    if config.objective.next_frame and config.data.clip_share > 0:  # else the head for clips is untrained
+    if (
+        config.objective.next_frame and config.data.clip_share > 0
+    ):  # else the head for clips is untrained
         ends = np.intersect1d(manifest.clips(frames, "test")[:, -1], rows)
     else:
         ends = rows[:0]
@@ -275,35 +353,54 @@ def reconstructions_section(manifest: Manifest, encoder: Encoder, folder: Path) 
     rows, frames = (ends, frames) if len(ends) else (rows, 1)
     sensor = manifest.codes("sensor")[rows]
     force = np.array([manifest.value(int(row), "label.force") or 0.0 for row in rows], np.float64)
-    rows = np.sort(best_rows(rows, sensor, force, rows))  # the last without forces
+    # the last without forces
+    rows = np.sort(best_rows(rows, sensor, force, rows))
     config = replace(config, data=replace(config.data, batch_size=len(rows)))
-    _, batch = next(iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal")))
+    _, batch = next(
+        iter(evaluation(manifest, rows, config, kind, frames=frames, unknown="universal"))
+    )
     image = reconstruction_panels(params, batch.clip, batch.sensor, net=encoder.net, config=config)
     path = folder / "figures" / "reconstructions.png"
     atomic_write(path, encode(image))
     names = ", ".join(map(statistics.as_text, manifest.text_column("sensor")[rows]))
     share = f"{config.objective.keep_ratio:.0%}".replace("%", " %")
     text = f"Stage 1 reads {share} of the patches of a held-out object. From above: {names}."
-    title, table = "Reconstructions", ""
+    title = "Reconstructions"
+    table = ""
     if frames > 1:
-        title, text = f"{title} and next frames", f"{text} The last pair is the next frame and its prediction."
+        title = f"{title} and next frames"
+        text = f"{text} The last pair is the next frame and its prediction."
     if scores:
-        kinds = {"untouched ": "untouched gel", "plain ": "mean of the visible patches; copy of the last frame"}
-        kinds = {"": "stage 1"} | {kind: name for kind, name in kinds.items() if f"{kind}reconstruction" in scores}
+        kinds = {
+            "untouched ": "untouched gel",
+            "plain ": "mean of the visible patches; copy of the last frame",
+        }
+        kinds = {"": "stage 1"} | {
+            kind: name for kind, name in kinds.items() if f"{kind}reconstruction" in scores
+        }
         terms = {"reconstruction": "hidden patches", "next_frame": "next frame"}
-        lines = [(name, *(f"{scores[kind + term]:.4f}" for kind in kinds)) for term, name in terms.items()]
-        table = statistics.markdown_table((f"error on {scores['clips']} clips in contact", *kinds.values()), lines)
+        lines = [
+            (name, *(f"{scores[kind + term]:.4f}" for kind in kinds))
+            for term, name in terms.items()
+        ]
+        table = statistics.markdown_table(
+            (f"error on {scores['clips']} clips in contact", *kinds.values()), lines
+        )
     return Section(title, text, table, path), scores
 
 
 def _pixel_errors(params: Any, manifest: Manifest, ends: Array, encoder: Encoder) -> dict[str, Any]:
     """Return errors of stage 1 and of its baselines on clips in contact, {} if there are none."""
-    ends, config = ends[known_contact(manifest)[ends] != 0], encoder.config  # in contact or unknown
+    # in contact or unknown
+    ends = ends[known_contact(manifest)[ends] != 0]
+    config = encoder.config
     if config.objective.norm_pix_loss or not len(ends):
         return {}
     ends = ends[np.linspace(0, len(ends) - 1, min(_CLIPS, len(ends))).astype(int)]
     config = replace(config, data=replace(config.data, batch_size=min(48, len(ends))))
-    return {"clips": len(ends)} | pixel_scores(params, manifest, ends, net=encoder.net, config=config)
+    return {"clips": len(ends)} | pixel_scores(
+        params, manifest, ends, net=encoder.net, config=config
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,17 +419,23 @@ class _Study:
         return values[self.split == "test"]
 
 
-def _study(table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, log: Log) -> _Study:
+def _study(
+    table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, log: Log
+) -> _Study:
     most = {"train": touches // 2, "val": touches // 2, "test": touches}
     rows = np.concatenate([_chosen(table, name, count, seed) for name, count in most.items()])
-    classes, patches, gels = {}, {}, UnitGels(table)
+    classes = {}
+    patches = {}
+    gels = UnitGels(table)
     for encoder in encoders.values():
         rows = rows_with_gel(encoder, gels, rows, log)
     for name, encoder in encoders.items():
         values = embed_rows(encoder, table, rows, pooling="both", gels=gels, log=log)[1]
         classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)
     pixels, notes = _baseline(PIXELS, lambda: background_difference(table, rows, gels))
-    return _Study(table, rows, table.text_column("split")[rows], classes, patches, pixels, tuple(notes))
+    return _Study(
+        table, rows, table.text_column("split")[rows], classes, patches, pixels, tuple(notes)
+    )
 
 
 def _baseline(name: str, make: Callable[[], Array]) -> tuple[Array | None, list[str]]:
@@ -354,57 +457,97 @@ def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
     codes = table.codes("touch", own=True)[rows]
     names = np.unique(codes)
     if len(names) > touches:
-        rows = rows[np.isin(codes, np.random.default_rng(seed).choice(names, touches, replace=False))]
+        rows = rows[
+            np.isin(codes, np.random.default_rng(seed).choice(names, touches, replace=False))
+        ]
     return rows
 
 
 def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[plots.Space]]:
     """Return the section and the numbers of the feature spaces: alignment, uniformity, silhouettes, t-SNE."""
     rows = study.test(study.rows)
-    sensors, objects = study.manifest.text_column("sensor")[rows], study.manifest.text_column("object")[rows]
+    sensors = study.manifest.text_column("sensor")[rows]
+    objects = study.manifest.text_column("object")[rows]
     touch = study.manifest.codes("touch", own=True)[rows]
     drawn = np.sort(np.random.default_rng(seed).permutation(len(rows))[:_T_SNE_ROWS])
     features = {name: study.test(values) for name, values in study.classes.items()}
-    spaces = [plots.describe(values, sensors, objects, touch, name=name) for name, values in features.items()]
-    points = {name: plots.tsne(values[drawn], seed=seed) for name, values in tracked(features.items(), "t-SNE")}
+    spaces = [
+        plots.describe(values, sensors, objects, touch, name=name)
+        for name, values in features.items()
+    ]
+    points = {
+        name: plots.tsne(values[drawn], seed=seed)
+        for name, values in tracked(features.items(), "t-SNE")
+    }
     path = out / "figures" / "tsne.png"
     plots.tsne_panels(path, points, sensors[drawn], objects[drawn])
     lines = []
     for space in spaces:
-        figures = (space.alignment, space.uniformity, space.silhouette_sensor, space.silhouette_object)
-        lines.append((space.name, *("-" if value is None else f"{value:.3f}" for value in figures), space.rows))
-    head = ("features", "alignment", "uniformity", "silhouette by sensor", "silhouette by object", "frames")
+        figures = (
+            space.alignment,
+            space.uniformity,
+            space.silhouette_sensor,
+            space.silhouette_object,
+        )
+        lines.append(
+            (
+                space.name,
+                *("-" if value is None else f"{value:.3f}" for value in figures),
+                space.rows,
+            )
+        )
+    head = (
+        "features",
+        "alignment",
+        "uniformity",
+        "silhouette by sensor",
+        "silhouette by object",
+        "frames",
+    )
     text = (
         "The same touches by several sensors. Alignment: mean squared distance of one touch by two sensors (0 is "
         "best). Uniformity: lower is more even. Silhouette (-1 to 1): good alignment makes it low by sensor and high "
         "by object."
     )
-    return Section("The space of touches", text, statistics.markdown_table(head, lines), path), spaces
+    return Section(
+        "The space of touches", text, statistics.markdown_table(head, lines), path
+    ), spaces
 
 
 def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, Any]]:
     """Return retrieval of the test rows for each grade of alignment, with matched and with random galleries."""
-    table, rows, notes = study.manifest, study.test(study.rows), list(study.notes)
+    table = study.manifest
+    rows = study.test(study.rows)
+    notes = list(study.notes)
     features = {name: study.test(values) for name, values in study.classes.items()}
     features |= {f"{name} (patches)": study.test(values) for name, values in study.patches.items()}
     features |= {} if study.pixels is None else {PIXELS: study.test(study.pixels)}
     vector, missing = _baseline(VECTOR, lambda: contact_vector(table, rows))
     features |= {} if vector is None else {VECTOR: vector}
     notes += missing
-    grades, sensors = _grades(table, rows, "test"), table.text_column("sensor")[rows]
+    grades = _grades(table, rows, "test")
+    sensors = table.text_column("sensor")[rows]
     touch = table.codes("touch", own=True)[rows]
     results: dict[str, dict[str, list[retrieval.Retrieval]]] = {}
     for grade in map(str, np.unique(grades)):
         part = np.flatnonzero(grades == grade)
-        least = min(len(np.unique(touch[part][sensors[part] == name])) for name in np.unique(sensors[part]))
+        least = min(
+            len(np.unique(touch[part][sensors[part] == name])) for name in np.unique(sensors[part])
+        )
         if least < size:
-            notes.append(f"{grade}: a sensor has {least} touches only, so galleries have {least}, not {size}")
+            notes.append(
+                f"{grade}: a sensor has {least} touches only, so galleries have {least}, not {size}"
+            )
         for kind, match in (("matched", retrieval.COVARIATES), ("by chance", None)):
             try:
                 results.setdefault(grade, {})[kind] = retrieval.cross_sensor_retrieval(
-                    table, {name: values[part] for name, values in features.items()}, rows[part],
-                    gallery_size=min(size, least), match=match, metrics={VECTOR: "euclidean"},
-                )  # fmt: skip
+                    table,
+                    {name: values[part] for name, values in features.items()},
+                    rows[part],
+                    gallery_size=min(size, least),
+                    match=match,
+                    metrics={VECTOR: "euclidean"},
+                )
             except UserError as error:
                 notes.append(f"{grade}, gallery {kind}: not scored: {error}")
     section, changes = retrieval_section(results, "stage 2", notes, out)
@@ -412,31 +555,57 @@ def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, 
 
 
 def retrieval_section(
-    results: Mapping[str, Mapping[str, Sequence[retrieval.Retrieval]]], best: str, notes: Sequence[str], folder: Path
+    results: Mapping[str, Mapping[str, Sequence[retrieval.Retrieval]]],
+    best: str,
+    notes: Sequence[str],
+    folder: Path,
 ) -> tuple[Section, dict[str, dict[str, Change]]]:
     """Return tables of retrieval {grade: {"matched" or "by chance": results}}, and paired differences to `best`."""
-    rows, ahead, changes, panels = [], [], {}, {}
+    rows = []
+    ahead = []
+    changes = {}
+    panels = {}
     for grade, kinds in results.items():
         pooled = {
             (result.name, kind, result.centred): result
-            for kind, several in kinds.items() for result in several if result.query_sensor == retrieval.ALL
-        }  # fmt: skip
+            for kind, several in kinds.items()
+            for result in several
+            if result.query_sensor == retrieval.ALL
+        }
         kind = "matched" if "matched" in kinds else "by chance"
-        plain = {name: result for (name, other, centred), result in pooled.items() if other == kind and not centred}
+        plain = {
+            name: result
+            for (name, other, centred), result in pooled.items()
+            if other == kind and not centred
+        }
         panels[f"{grade}, gallery {kind}"] = {
-            name: ShareBar(result.top1, result.low, result.high, result.chance1) for name, result in plain.items()
+            name: ShareBar(result.top1, result.low, result.high, result.chance1)
+            for name, result in plain.items()
         }
         others = [name for name in plain if name != best] if best in plain else []
         changes[grade] = {name: retrieval.difference(plain[best], plain[name]) for name in others}
-        ahead += [(grade, name, _shares(*change, sign="+")) for name, change in changes[grade].items()]
+        ahead += [
+            (grade, name, _shares(*change, sign="+")) for name, change in changes[grade].items()
+        ]
         for name, result in plain.items():
-            columns = [(way, centred) for way in ("matched", "by chance") for centred in (False, True)]
+            columns = [
+                (way, centred) for way in ("matched", "by chance") for centred in (False, True)
+            ]
             cells = [pooled.get((name, *column)) for column in columns]
-            shares = ["-" if cell is None else _shares(cell.top1, cell.low, cell.high) for cell in cells]
+            shares = [
+                "-" if cell is None else _shares(cell.top1, cell.low, cell.high) for cell in cells
+            ]
             fifth = "-" if cells[0] is None else _shares(cells[0].top5)
-            rows.append((grade, name, shares[0], fifth, *shares[1:], result.gallery, result.queries))
-    ways = ("recall@1 matched", "recall@5 matched", "recall@1 matched, centred", "recall@1 by chance",
-            "recall@1 by chance, centred")  # fmt: skip
+            rows.append(
+                (grade, name, shares[0], fifth, *shares[1:], result.gallery, result.queries)
+            )
+    ways = (
+        "recall@1 matched",
+        "recall@5 matched",
+        "recall@1 matched, centred",
+        "recall@1 by chance",
+        "recall@1 by chance, centred",
+    )
     head = ("data", "features", *ways, "gallery", "queries")
     table = statistics.markdown_table(head, rows)
     table += f"\n\n{best}, recall@1 ahead of the others (points, paired by query):\n\n"
@@ -446,19 +615,31 @@ def retrieval_section(
         plots.bars(path, panels, label="recall@1")
     matched = [result for kinds in results.values() for result in kinds.get("matched", ())]
     near = [result.nearness for result in matched if result.nearness is not None]
-    covariates = ", ".join(name.removeprefix("label.") for name in matched[0].matched) if matched else "nothing"
+    covariates = (
+        ", ".join(name.removeprefix("label.") for name in matched[0].matched)
+        if matched
+        else "nothing"
+    )
     text = (
         "A touch by one sensor is retrieved among touches by another. In matched galleries the distractors are the "
         f"nearest in {covariates}; by chance they are random. Centred: minus the mean of each sensor. In brackets: "
         "95 % under a bootstrap over objects."
-        + (f" Distractors lie at {np.mean(near):.2f} of the mean distance of all touches." if near else "")
+        + (
+            f" Distractors lie at {np.mean(near):.2f} of the mean distance of all touches."
+            if near
+            else ""
+        )
     )
-    return Section("Cross-sensor retrieval", text, table, path if panels else None, _listed(notes)), changes
+    return Section(
+        "Cross-sensor retrieval", text, table, path if panels else None, _listed(notes)
+    ), changes
 
 
 def _matching(study: _Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]:
     """Return the scores of the matching head of stage 2 on the test rows, for both kinds of negatives."""
-    scores, notes, features = list[retrieval.MatchScore](), list[str](), study.test(study.classes["stage 2"])
+    scores = list[retrieval.MatchScore]()
+    notes = list[str]()
+    features = study.test(study.classes["stage 2"])
     try:
         scores = retrieval.score_matching(encoder, study.manifest, study.test(study.rows), features)
     except UserError as error:
@@ -472,20 +653,35 @@ def _matching(study: _Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]
     names = {"any": "of any sensor", "same_sensor": "of the positive's sensor"}
     head = ("negatives", "accuracy (chance 50 %)", "AUC", "by the sensors alone", "triples")
     rows = [
-        (names[score.negatives], _shares(score.accuracy, score.low, score.high), f"{score.auc:.3f}",
-         _shares(score.sensors_alone), score.triples) for score in scores
-    ]  # fmt: skip
+        (
+            names[score.negatives],
+            _shares(score.accuracy, score.low, score.high),
+            f"{score.auc:.3f}",
+            _shares(score.sensors_alone),
+            score.triples,
+        )
+        for score in scores
+    ]
     table = statistics.markdown_table(head, rows) if rows else ""
-    return Section("Cross-sensor matching", text, table, notes=_listed(notes)), {"found": scores, "notes": notes}
+    return Section("Cross-sensor matching", text, table, notes=_listed(notes)), {
+        "found": scores,
+        "notes": notes,
+    }
 
 
 def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
     """Return probes of labels on held-out objects; a note names each label that cannot be probed."""
-    table, rows, notes = study.manifest, study.rows, list(study.notes)
-    features = {name: np.concatenate([study.classes[name], study.patches[name]], 1) for name in study.classes}
+    table = study.manifest
+    rows = study.rows
+    notes = list(study.notes)
+    features = {
+        name: np.concatenate([study.classes[name], study.patches[name]], 1)
+        for name in study.classes
+    }
     if study.pixels is not None:
         features[PIXELS] = principal_components(study.pixels, study.split == "train")
-    objects, sequences = table.text_column("object")[rows], table.text_column("sequence")[rows]
+    objects = table.text_column("object")[rows]
+    sequences = table.text_column("sequence")[rows]
     groups = np.where(objects == "", sequences, objects)
     results: dict[str, list[ProbeResult]] = {}
     for label in LABELS:
@@ -500,27 +696,41 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
                 # Principal components share one scale: unit spread for each would amplify the smallest.
                 head = ProbeHead("linear", "common" if name == PIXELS else "column")
                 options: dict[str, Any] = {"measured": measured, "name": name, "seeds": 0}
-                scored.append(probing.probe_features(x, values, groups, study.split, head, **options))
+                scored.append(
+                    probing.probe_features(x, values, groups, study.split, head, **options)
+                )
         except UserError as error:
             notes.append(f"{label}: not probed: {error}")
         results |= {label: scored} if scored else {}
     bars = {
-        label: {one.probe: ShareBar(one.accuracy, one.low, one.high, one.baseline) for one in scored}
-        for label, scored in results.items() if not scored[0].measured
-    }  # fmt: skip
+        label: {
+            one.probe: ShareBar(one.accuracy, one.low, one.high, one.baseline) for one in scored
+        }
+        for label, scored in results.items()
+        if not scored[0].measured
+    }
     path = out / "figures" / "probes.png"
     if bars:
         plots.bars(path, bars, label="accuracy")
     text = "A linear probe on frozen features (class token and mean of patches), fitted on train, tested on test."
-    parts = "\n\n".join(f"### {label}\n\n{probing.probe_table(scored).strip()}" for label, scored in results.items())
-    return Section("Probes", text, parts, path if bars else None, _listed(notes)), {"found": results, "notes": notes}
+    parts = "\n\n".join(
+        f"### {label}\n\n{probing.probe_table(scored).strip()}" for label, scored in results.items()
+    )
+    return Section("Probes", text, parts, path if bars else None, _listed(notes)), {
+        "found": results,
+        "notes": notes,
+    }
 
 
 def _listed(notes: Sequence[str]) -> str:
     return "\n".join(f"- {statistics.as_text(note)}" for note in notes)
 
 
-def _shares(value: float, low: float | None = None, high: float | None = None, sign: str = "") -> str:
+def _shares(
+    value: float, low: float | None = None, high: float | None = None, sign: str = ""
+) -> str:
     """Return a share in percent (with `sign` "+": a difference in points) and its interval."""
-    interval = "" if low is None or high is None else f" ({100 * low:{sign}.1f} to {100 * high:{sign}.1f})"
+    interval = (
+        "" if low is None or high is None else f" ({100 * low:{sign}.1f} to {100 * high:{sign}.1f})"
+    )
     return f"{100 * value:{sign}.1f}{'' if sign else ' %'}{interval}"

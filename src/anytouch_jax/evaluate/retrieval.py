@@ -79,10 +79,16 @@ class Retrieval:
 
 
 def cross_sensor_retrieval(
-    manifest: Manifest, features: Mapping[str, Array], rows: Array, *, gallery_size: int = GALLERY,
-    match: Sequence[str] | None = COVARIATES, centre: Sequence[bool] = (False, True),
-    metrics: Mapping[str, Metric] | None = None, seeds: int = 5,
-) -> list[Retrieval]:  # fmt: skip
+    manifest: Manifest,
+    features: Mapping[str, Array],
+    rows: Array,
+    *,
+    gallery_size: int = GALLERY,
+    match: Sequence[str] | None = COVARIATES,
+    centre: Sequence[bool] = (False, True),
+    metrics: Mapping[str, Metric] | None = None,
+    seeds: int = 5,
+) -> list[Retrieval]:
     """Return retrieval for each set of features, ordered pair of sensors and kind of centring; pooled results last.
 
     `features` {name: (len(rows), d)} are those of manifest `rows`; the deepest frame of each touch, sensor and unit is
@@ -93,69 +99,128 @@ def cross_sensor_retrieval(
     rows = np.asarray(rows)
     for name, values in features.items():
         if len(values) != len(rows):
-            raise UserError(f"Features {name!r} have {len(values)} rows. They must have one for each of {len(rows)}.")
+            raise UserError(
+                f"Features {name!r} have {len(values)} rows. They must have one for each of {len(rows)}."
+            )
     used, place, covariates, notes = _usable(manifest, rows, match)
     names = ("sensor", "unit", "object", "touch")
     sensors, units, objects, touch = (manifest.text_column(name)[used] for name in names)
     if len(manifest.files) > 1:
-        touch = _joined(touch, manifest.source[used])  # equal names of joined manifests are not one touch
-    unit, groups = _joined(sensors, units), np.where(objects == "", touch, objects)
-    keys, drawn = _joined(touch, unit), {}
+        # equal names of joined manifests are not one touch
+        touch = _joined(touch, manifest.source[used])
+    unit = _joined(sensors, units)
+    groups = np.where(objects == "", touch, objects)
+    keys = _joined(touch, unit)
+    drawn = {}
     rows_of = {str(name): np.flatnonzero(sensors == name) for name in np.unique(sensors)}
     if len(rows_of) < 2:
-        raise UserError(f"Cross-sensor retrieval needs touches by two sensors. These are by {', '.join(rows_of)}.")
+        raise UserError(
+            f"Cross-sensor retrieval needs touches by two sensors. These are by {', '.join(rows_of)}."
+        )
     for first, second in permutations(rows_of, 2):
-        query, gallery = rows_of[first], rows_of[second]
+        query = rows_of[first]
+        gallery = rows_of[second]
         if not np.isin(touch[query], touch[gallery]).any():
             notes += (f"{first} to {second} left out: they share no touch",)
             continue
         near = None if match is None else numbers(manifest, covariates, used[gallery])
         drawn[first, second] = draw_galleries(
-            touch[query], touch[gallery], gallery_size=gallery_size, match=near, query_unit=unit[query],
-            gallery_unit=unit[gallery], seeds=seeds,
-        )  # fmt: skip
+            touch[query],
+            touch[gallery],
+            gallery_size=gallery_size,
+            match=near,
+            query_unit=unit[query],
+            gallery_unit=unit[gallery],
+            seeds=seeds,
+        )
     if not drawn:
-        raise UserError("The two sensors share no touch. `touch` must be equal for the same place of the same object.")
+        raise UserError(
+            "The two sensors share no touch. `touch` must be equal for the same place of the same object."
+        )
     results = []
     for name, centred in product(features, centre):
-        metric, values = (metrics or {}).get(name, "cosine"), np.asarray(features[name])[place]
-        common = {"name": name, "metric": metric, "matched": covariates, "centred": centred, "notes": notes}
+        metric = (metrics or {}).get(name, "cosine")
+        values = np.asarray(features[name])[place]
+        common = {
+            "name": name,
+            "metric": metric,
+            "matched": covariates,
+            "centred": centred,
+            "notes": notes,
+        }
         tables = []
         for (first, second), galleries in drawn.items():
-            query, gallery = rows_of[first], rows_of[second]
-            tops = score_galleries(values[query], values[gallery], galleries, metric=metric, centre=centred)
+            query = rows_of[first]
+            gallery = rows_of[second]
+            tops = score_galleries(
+                values[query], values[gallery], galleries, metric=metric, centre=centred
+            )
             ids = query[galleries.queries]
-            tables.append(QueryScores(_joined(keys[ids], [f"{first} to {second}"] * len(ids)), *tops, groups[ids]))
+            tables.append(
+                QueryScores(
+                    _joined(keys[ids], [f"{first} to {second}"] * len(ids)), *tops, groups[ids]
+                )
+            )
             sides = {"query_sensor": first, "gallery_sensor": second}
             results.append(_summary(tables[-1], gallery_size, (galleries,), common | sides))
-        pooled = QueryScores(*map(np.concatenate, zip(*(vars(table).values() for table in tables), strict=True)))
+        pooled = QueryScores(
+            *map(np.concatenate, zip(*(vars(table).values() for table in tables), strict=True))
+        )
         results.append(_summary(pooled, gallery_size, tuple(drawn.values()), common))
     return results
 
 
 def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None, float | None]:
     """Return recall@1 of `first` minus `second`, and its 95 % interval, paired. Raises UserError for other queries."""
-    a, b = first.per_query, second.per_query
-    if a is None or b is None or not np.array_equal(a.keys, b.keys) or not np.array_equal(a.groups, b.groups):
-        raise UserError(f"{first.name!r} and {second.name!r} have different queries. Give both the same rows.")
+    a = first.per_query
+    b = second.per_query
+    if (
+        a is None
+        or b is None
+        or not np.array_equal(a.keys, b.keys)
+        or not np.array_equal(a.groups, b.groups)
+    ):
+        raise UserError(
+            f"{first.name!r} and {second.name!r} have different queries. Give both the same rows."
+        )
     change = a.top1 - b.top1
     return float(change.mean()), *mean_interval(change, a.groups)
 
 
-def _summary(scores: QueryScores, size: int, drawn: Sequence[Galleries], common: Mapping[str, Any]) -> Retrieval:
-    missing, notes = sum(galleries.missing for galleries in drawn), tuple(common["notes"])
+def _summary(
+    scores: QueryScores, size: int, drawn: Sequence[Galleries], common: Mapping[str, Any]
+) -> Retrieval:
+    missing = sum(galleries.missing for galleries in drawn)
+    notes = tuple(common["notes"])
     if missing:
         notes += (f"{missing} queries left out: no other unit in the gallery has their touch",)
     near = [(part.nearness, len(part.queries)) for part in drawn if part.nearness is not None]
-    nearness = sum(value * count for value, count in near) / sum(count for _, count in near) if near else None
-    (low, high), (low5, high5) = (mean_interval(top, scores.groups) for top in (scores.top1, scores.top5))
+    nearness = (
+        sum(value * count for value, count in near) / sum(count for _, count in near)
+        if near
+        else None
+    )
+    (low, high), (low5, high5) = (
+        mean_interval(top, scores.groups) for top in (scores.top1, scores.top5)
+    )
     fields: dict[str, Any] = {
-        "query_sensor": ALL, "gallery_sensor": ALL, **common, "notes": notes,
-        "top1": float(scores.top1.mean()), "low": low, "high": high,
-        "top5": float(scores.top5.mean()), "top5_low": low5, "top5_high": high5,
-        "chance1": 1 / size, "chance5": min(5 / size, 1.0), "gallery": size, "queries": len(scores.keys),
-        "groups": len(np.unique(scores.groups)), "nearness": nearness,
-    }  # fmt: skip
+        "query_sensor": ALL,
+        "gallery_sensor": ALL,
+        **common,
+        "notes": notes,
+        "top1": float(scores.top1.mean()),
+        "low": low,
+        "high": high,
+        "top5": float(scores.top5.mean()),
+        "top5_low": low5,
+        "top5_high": high5,
+        "chance1": 1 / size,
+        "chance5": min(5 / size, 1.0),
+        "gallery": size,
+        "queries": len(scores.keys),
+        "groups": len(np.unique(scores.groups)),
+        "nearness": nearness,
+    }
     return Retrieval(**fields, per_query=scores)
 
 
@@ -163,18 +228,29 @@ def _usable(
     manifest: Manifest, rows: Array, match: Sequence[str] | None
 ) -> tuple[Array, Array, tuple[str, ...], tuple[str, ...]]:
     """Return the rows to use, their places in `rows`, the covariates of the manifest, and notes."""
-    used, notes = deepest_rows(manifest, rows), []
+    used = deepest_rows(manifest, rows)
+    notes = []
     is_field = np.isin(manifest.text_column("sensor")[used], FIELD_SENSORS)
     used = used[~is_field]
     if is_field.any():
-        notes.append(f"{int(is_field.sum())} touches by force-field sensors, which have no images, left out")
-    covariates = () if match is None else tuple(name for name in match if name in manifest.table.column_names)
+        notes.append(
+            f"{int(is_field.sum())} touches by force-field sensors, which have no images, left out"
+        )
+    covariates = (
+        ()
+        if match is None
+        else tuple(name for name in match if name in manifest.table.column_names)
+    )
     if match is not None:
         if not covariates:
-            raise UserError(f"The manifest has none of {', '.join(match)} to match the gallery in. Use --by-chance.")
+            raise UserError(
+                f"The manifest has none of {', '.join(match)} to match the gallery in. Use --by-chance."
+            )
         whole = np.isfinite(numbers(manifest, covariates, used)).all(axis=1)
         if not whole.all():
-            notes.append(f"{int(np.sum(~whole))} touches without {' or '.join(covariates)} left out")
+            notes.append(
+                f"{int(np.sum(~whole))} touches without {' or '.join(covariates)} left out"
+            )
         used = used[whole]
     order = np.argsort(rows)
     return used, order[np.searchsorted(rows, used, sorter=order)], covariates, tuple(notes)
@@ -199,9 +275,15 @@ class Galleries:
 
 
 def draw_galleries(
-    query_touch: Any, gallery_touch: Any, *, gallery_size: int = GALLERY, match: Array | None = None,
-    query_unit: Any = None, gallery_unit: Any = None, seeds: int = 5,
-) -> Galleries:  # fmt: skip
+    query_touch: Any,
+    gallery_touch: Any,
+    *,
+    gallery_size: int = GALLERY,
+    match: Array | None = None,
+    query_unit: Any = None,
+    gallery_unit: Any = None,
+    seeds: int = 5,
+) -> Galleries:
     """Return galleries that depend on names, covariates and seeds, not on the order of rows.
 
     Equal names are one touch. `match` (m, k) are covariates of the gallery, scaled to unit spread: the nearest are the
@@ -211,23 +293,35 @@ def draw_galleries(
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
     if gallery_size < 2:
-        raise UserError(f"gallery_size {gallery_size} is too small. A gallery has the touch and another.")
+        raise UserError(
+            f"gallery_size {gallery_size} is too small. A gallery has the touch and another."
+        )
     (query_order, query_touch, query_unit), (order, touch, unit) = (
         _by_name(touches, [side] * len(touches) if units is None else units)
-        for side, touches, units in (("query", query_touch, query_unit), ("gallery", gallery_touch, gallery_unit))
+        for side, touches, units in (
+            ("query", query_touch, query_unit),
+            ("gallery", gallery_touch, gallery_unit),
+        )
     )
     for one, two in pairwise(zip(touch, unit, strict=True)):
         if one == two:
-            raise UserError(f"The gallery has touch {str(one[0])!r} twice by one unit. Keep one frame of each touch.")
-    draws = seeds if match is None else 1  # matched galleries have no randomness
+            raise UserError(
+                f"The gallery has touch {str(one[0])!r} twice by one unit. Keep one frame of each touch."
+            )
+    # matched galleries have no randomness
+    draws = seeds if match is None else 1
     covariates = np.zeros((len(order), 0))
     if match is not None:
         spread = match.std(axis=0)
         covariates = ((match - match.mean(axis=0)) / np.where(spread > 0, spread, 1.0))[order]
-    ranks, items, sums = [], [], np.zeros(2)
+    ranks = []
+    items = []
+    sums = np.zeros(2)
     for rank in range(len(query_order)):
-        allowed, same = unit != query_unit[rank], touch == query_touch[rank]
-        own, rest = np.flatnonzero(allowed & same), np.flatnonzero(allowed & ~same)
+        allowed = unit != query_unit[rank]
+        same = touch == query_touch[rank]
+        own = np.flatnonzero(allowed & same)
+        rest = np.flatnonzero(allowed & ~same)
         if not len(own):
             continue
         if len(rest) < gallery_size - 1:
@@ -236,7 +330,10 @@ def draw_galleries(
                 f"{str(query_touch[rank])!r}. There are {len(rest)}. Give more touches, or a smaller --gallery."
             )
         ranks.append(rank)
-        several = [_draw(own, rest, covariates, gallery_size, np.random.default_rng([s, rank])) for s in range(draws)]
+        several = [
+            _draw(own, rest, covariates, gallery_size, np.random.default_rng([s, rank]))
+            for s in range(draws)
+        ]
         items.append([order[chosen] for chosen, _ in several])
         sums += np.sum([distances for _, distances in several], axis=0)
     if not ranks:
@@ -244,12 +341,18 @@ def draw_galleries(
     rows = query_order[ranks]
     back = np.argsort(rows)
     nearness = float(sums[0] / sums[1]) if sums[1] > 0 else None
-    return Galleries(rows[back], np.asarray(items).transpose(1, 0, 2)[:, back], nearness, len(query_order) - len(rows))
+    return Galleries(
+        rows[back],
+        np.asarray(items).transpose(1, 0, 2)[:, back],
+        nearness,
+        len(query_order) - len(rows),
+    )
 
 
 def _by_name(touches: Any, units: Any) -> tuple[Array, Array, Array]:
     """Return an order of rows that depends on their names alone, and touch and unit names in it."""
-    touch, unit = np.asarray(touches).astype(str), np.asarray(units).astype(str)
+    touch = np.asarray(touches).astype(str)
+    unit = np.asarray(units).astype(str)
     order = np.lexsort((unit, touch))
     return order, touch[order], unit[order]
 
@@ -258,40 +361,61 @@ def _draw(
     own: Array, rest: Array, covariates: Array, size: int, rng: np.random.Generator
 ) -> tuple[Array, tuple[float, float]]:
     """Return one gallery, the true touch first, and the mean distances of its distractors and of all candidates."""
-    wanted, lot = own[rng.integers(len(own))], rng.random(len(rest))
+    wanted = own[rng.integers(len(own))]
+    lot = rng.random(len(rest))
     distance = np.linalg.norm(covariates[rest] - covariates[[wanted]], axis=1)
     nearest = np.lexsort((lot, distance))[: size - 1]
-    return np.concatenate([[wanted], rest[nearest]]), (float(distance[nearest].mean()), float(distance.mean()))
+    return np.concatenate([[wanted], rest[nearest]]), (
+        float(distance[nearest].mean()),
+        float(distance.mean()),
+    )
 
 
 def score_galleries(
-    query: Array, gallery: Array, drawn: Galleries, *, metric: Metric = "cosine", centre: bool = False
+    query: Array,
+    gallery: Array,
+    drawn: Galleries,
+    *,
+    metric: Metric = "cosine",
+    centre: bool = False,
 ) -> tuple[Array, Array]:
     """Return recall@1 and recall@5 (n,) of each query as means over galleries; ties share their ranks evenly.
 
     `query` (q, d), `gallery` (m, d). `centre` subtracts the mean of each side. UserError for values that do not fit.
     """
-    q, g = _finite(query, "query"), _finite(gallery, "gallery")
+    q = _finite(query, "query")
+    g = _finite(gallery, "gallery")
     if q.shape[1] != g.shape[1]:
-        raise UserError(f"query and gallery features have {q.shape[1]} and {g.shape[1]} values. They must be alike.")
-    q, g = _prepared(q, metric, centre)[drawn.queries], _prepared(g, metric, centre)
+        raise UserError(
+            f"query and gallery features have {q.shape[1]} and {g.shape[1]} values. They must be alike."
+        )
+    q = _prepared(q, metric, centre)[drawn.queries]
+    g = _prepared(g, metric, centre)
     if metric == "euclidean":
         # Both sides are moved and scaled by the same amount, so that rounding does not reorder distances.
-        least, middle = _TIE * max(np.abs(side).max(initial=0.0) for side in (q, g)), g.mean(axis=0, keepdims=True)
+        least = _TIE * max(np.abs(side).max(initial=0.0) for side in (q, g))
+        middle = g.mean(axis=0, keepdims=True)
         q, g = (np.where(np.abs(side - middle) > least, side - middle, 0.0) for side in (q, g))
         size = max(np.abs(side).max(initial=0.0) for side in (q, g)) or 1.0
-        q, g = q / size, g / size
-    top1, top5 = np.zeros(len(q)), np.zeros(len(q))
+        q = q / size
+        g = g / size
+    top1 = np.zeros(len(q))
+    top5 = np.zeros(len(q))
     for start in range(0, len(q), _CHUNK):
         part = slice(start, start + _CHUNK)
         likeness = q[part] @ g.T
         if metric == "euclidean":
-            likeness = 2 * likeness - np.sum(g * g, axis=1)[None] - np.sum(q[part] ** 2, axis=1, keepdims=True)
+            likeness = (
+                2 * likeness
+                - np.sum(g * g, axis=1)[None]
+                - np.sum(q[part] ** 2, axis=1, keepdims=True)
+            )
         for items in drawn.items[:, part]:
             values = np.take_along_axis(likeness, items, axis=1)
             margin = _TIE * np.maximum(1.0, np.abs(values).max(axis=1, keepdims=True))
             ahead = values[:, 1:] - values[:, :1]
-            better, equal = np.sum(ahead > margin, axis=1), np.sum(np.abs(ahead) <= margin, axis=1)
+            better = np.sum(ahead > margin, axis=1)
+            equal = np.sum(np.abs(ahead) <= margin, axis=1)
             for k, total in ((1, top1), (5, top5)):
                 total[part] += np.clip((k - better) / (equal + 1), 0, 1) / len(drawn.items)
     return top1, top5
@@ -314,7 +438,9 @@ def _finite(values: Any, kind: str) -> Array:
         raise UserError(f"The {kind} values must be (n, d), not {values.shape}.")
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise UserError(f"The {kind} row {bad[0]} is not finite, nor are {len(bad) - 1} others. Repair or drop them.")
+        raise UserError(
+            f"The {kind} row {bad[0]} is not finite, nor are {len(bad) - 1} others. Repair or drop them."
+        )
     return values
 
 
@@ -337,13 +463,16 @@ class MatchScore:
     anchors: int
 
 
-def score_matching(encoder: Encoder, manifest: Manifest, rows: Array, features: Array) -> list[MatchScore]:
+def score_matching(
+    encoder: Encoder, manifest: Manifest, rows: Array, features: Array
+) -> list[MatchScore]:
     """Return the scores of the encoder's matching head (Eq. 5) with negatives of any sensor, and of the positive's.
 
     With negatives of any sensor, the sensors alone reveal part of the answer. `features` (n, E) are those of manifest
     `rows` (n,), pooling class. Raises UserError without a matching head, and if two sensors share no touch.
     """
-    objects, scores = manifest.text_column("object")[rows], []
+    objects = manifest.text_column("object")[rows]
+    scores = []
     encoder.match(features[:1], features[:1])  # raises without a head
     for negatives in NEGATIVES:
         anchor, positive, negative = draw_triples(manifest, rows, negatives)
@@ -351,12 +480,17 @@ def score_matching(encoder: Encoder, manifest: Manifest, rows: Array, features: 
         wrong = encoder.match(features[anchor], features[negative])
         correct = np.mean([right > 0, wrong <= 0], axis=0)
         sensor = manifest.codes("sensor")[rows]
-        codes = [sensor[anchor] * (1 + sensor.max()) + sensor[other] for other in (positive, negative)]
+        codes = [
+            sensor[anchor] * (1 + sensor.max()) + sensor[other] for other in (positive, negative)
+        ]
         low, high = mean_interval(correct, objects[anchor])
         labels = np.repeat([1, 0], [len(right), len(wrong)])
         auc = float(roc_auc_score(labels, np.concatenate([right, wrong])))
-        alone, count = best_rule(codes[0], codes[1], anchor), len(np.unique(anchor))
-        scores.append(MatchScore(negatives, float(correct.mean()), low, high, auc, alone, len(anchor), count))
+        alone = best_rule(codes[0], codes[1], anchor)
+        count = len(np.unique(anchor))
+        scores.append(
+            MatchScore(negatives, float(correct.mean()), low, high, auc, alone, len(anchor), count)
+        )
     return scores
 
 
@@ -369,7 +503,9 @@ def draw_triples(
     matches = Matches(rows, keys, same_sensor=negatives == "same_sensor", other_object=True)
     if not matches.anchors.size:
         which = "" if negatives == "any" else " next to a touch of another place"
-        raise UserError(f"two sensors share no touch{which} in these rows; there is nothing to match")
+        raise UserError(
+            f"two sensors share no touch{which} in these rows; there is nothing to match"
+        )
     triples = [
         (int(anchor), *matches.draw(int(anchor), np.random.default_rng([seed, int(anchor), turn])))
         for anchor in matches.anchors
@@ -387,7 +523,8 @@ def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
     names, place = np.unique(anchor, return_inverse=True)
     half = (np.random.default_rng(0).permutation(len(names)) % 2)[place]
     codes, code = np.unique(np.stack([right, wrong]), return_inverse=True)
-    code, yes = code.reshape(2, -1), np.empty((2, len(place)))
+    code = code.reshape(2, -1)
+    yes = np.empty((2, len(place)))
     for side in (0, 1):
         counts = [np.bincount(part[half != side], minlength=len(codes)) for part in code]
         yes[:, half == side] = (0.5 + 0.5 * np.sign(counts[0] - counts[1]))[code[:, half == side]]
@@ -399,7 +536,9 @@ def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
     return np.stack([manifest.number_column(name)[rows] for name in names], 1)
 
 
-def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1) -> Array:
+def deepest_rows(
+    manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1
+) -> Array:
     """Return one row for each touch, sensor and unit, in order: that of the largest `label.force`, the first of equals.
 
     Only `rows` are used, the whole `split` by default; with `frames` > 1 only ends of clips of so many. Without forces
@@ -412,8 +551,17 @@ def deepest_rows(manifest: Manifest, rows: Array | None = None, *, split: str = 
         if not len(rows):
             raise UserError(f"no touch ends a clip of {frames} frames; take fewer, or 1")
     if not len(rows):
-        raise UserError("no row has a touch; cross-sensor tasks need the column 'touch', equal for the same place")
-    codes = np.stack([manifest.codes("touch", own=True), manifest.codes("sensor"), manifest.codes("unit", own=True)], 1)
+        raise UserError(
+            "no row has a touch; cross-sensor tasks need the column 'touch', equal for the same place"
+        )
+    codes = np.stack(
+        [
+            manifest.codes("touch", own=True),
+            manifest.codes("sensor"),
+            manifest.codes("unit", own=True),
+        ],
+        1,
+    )
     _, contact = np.unique(codes[rows], axis=0, return_inverse=True)
     return np.sort(best_rows(rows, contact.ravel(), _depth(manifest, rows, contact.ravel())))
 
@@ -425,7 +573,8 @@ def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
     depth = -np.abs(frame - middle[contact])
     for name in ("label.depth", "label.force"):
         if name in manifest.table.column_names:
-            values, source = numbers(manifest, (name,), rows)[:, 0], manifest.source[rows]
+            values = numbers(manifest, (name,), rows)[:, 0]
+            source = manifest.source[rows]
             measured = np.isin(source, source[np.isfinite(values)])
             depth[measured] = np.where(np.isfinite(values), values, -np.inf)[measured]
     return depth
@@ -438,14 +587,20 @@ def contact_vector(manifest: Manifest, rows: Array) -> Array:
     """
     names = [name for name in VECTOR if name in manifest.table.column_names]
     if not names:
-        raise UserError(f"the manifest has none of the columns {', '.join(VECTOR)}; add one, or leave the control out")
+        raise UserError(
+            f"the manifest has none of the columns {', '.join(VECTOR)}; add one, or leave the control out"
+        )
     values = numbers(manifest, names, rows)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise UserError(f"{manifest.where(int(rows[bad[0]]))} has no value in one of {', '.join(names)}; add it")
+        raise UserError(
+            f"{manifest.where(int(rows[bad[0]]))} has no value in one of {', '.join(names)}; add it"
+        )
     sensors = manifest.text_column("sensor")[rows]
     for sensor in np.unique(sensors):
         part = values[sensors == sensor]
         spread = part.std(axis=0, keepdims=True)
-        values[sensors == sensor] = (part - part.mean(axis=0, keepdims=True)) / np.where(spread > 0, spread, 1.0)
+        values[sensors == sensor] = (part - part.mean(axis=0, keepdims=True)) / np.where(
+            spread > 0, spread, 1.0
+        )
     return values.astype(np.float32)

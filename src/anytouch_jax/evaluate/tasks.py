@@ -24,8 +24,11 @@ from anytouch_jax.evaluate.statistics import Array
 T = TypeVar("T")
 Which = Literal["all", "press", "contact", "moving"]
 
-FORCE, SCORE = 0.05, 7.0  # newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
-GROUPS = ("grasp_group", "object", "touch")  # of a label probe: the first with a value that is not the label
+# newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
+FORCE = 0.05
+SCORE = 7.0
+# of a label probe: the first with a value that is not the label
+GROUPS = ("grasp_group", "object", "touch")
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,20 @@ TASKS = {
         Task("object", "label.object", groups=("grasp_group", "touch")),
         Task("slip", "label.slip", frames=3, which="contact", above=0.5),
         Task("force", "label.force", "regression", frames=3, which="contact", unit="N"),
-        Task("twist", "label.twist", frames=3, which="moving", classes=("clockwise", "counterclockwise")),
-        Task("slide", "label.slide", frames=3, which="moving", classes=("right", "down", "left", "up")),
+        Task(
+            "twist",
+            "label.twist",
+            frames=3,
+            which="moving",
+            classes=("clockwise", "counterclockwise"),
+        ),
+        Task(
+            "slide",
+            "label.slide",
+            frames=3,
+            which="moving",
+            classes=("right", "down", "left", "up"),
+        ),
         Task("indenter", "label.indenter"),
     )
 }
@@ -84,11 +99,21 @@ class Benchmark:
 
 
 def _benchmark(
-    name: str, dataset: str, label: str, paper: float, batch: int, rate: float, decay: float,
-    pooling: Pooling = "class", universal: bool = False, **task: Any,
-) -> Benchmark:  # fmt: skip
+    name: str,
+    dataset: str,
+    label: str,
+    paper: float,
+    batch: int,
+    rate: float,
+    decay: float,
+    pooling: Pooling = "class",
+    universal: bool = False,
+    **task: Any,
+) -> Benchmark:
     question = Task(name, label, which="all", where=(("dataset", dataset),), **task)
-    return Benchmark(question, pooling, GradientRecipe(batch=batch, rate=rate, decay=decay), universal, paper)
+    return Benchmark(
+        question, pooling, GradientRecipe(batch=batch, rate=rate, decay=decay), universal, paper
+    )
 
 
 # Paper, appendix "Downstream Datasets" and Tables 1 to 3; released code, run_probe_{TAG,Feel,OF1,OF2}.sh, main_probe.py
@@ -99,11 +124,39 @@ _OF: dict[str, Any] = {"label": "label.material", "rate": 1e-3, "decay": 0.01, "
 BENCHMARKS = {
     benchmark.task.name: benchmark
     for benchmark in (
-        _benchmark("touch_and_go_material", "touch_and_go", "label.material", 0.8082, test_list="material", **_TAG),
-        _benchmark("touch_and_go_roughness", "touch_and_go", "label.rough", 0.8674, test_list="rough", **_TAG),
-        _benchmark("touch_and_go_hardness", "touch_and_go", "label.hardness", 0.9468, test_list="material", **_TAG),
+        _benchmark(
+            "touch_and_go_material",
+            "touch_and_go",
+            "label.material",
+            0.8082,
+            test_list="material",
+            **_TAG,
+        ),
+        _benchmark(
+            "touch_and_go_roughness",
+            "touch_and_go",
+            "label.rough",
+            0.8674,
+            test_list="rough",
+            **_TAG,
+        ),
+        _benchmark(
+            "touch_and_go_hardness",
+            "touch_and_go",
+            "label.hardness",
+            0.9468,
+            test_list="material",
+            **_TAG,
+        ),
         _benchmark("feel_grasp", "feel", "label.success", 0.8053, 256, 1e-3, 0.05, fingers=True),
-        _benchmark("objectfolder1_material", "objectfolder1", paper=0.4962, batch=128, pooling="mean", **_OF),
+        _benchmark(
+            "objectfolder1_material",
+            "objectfolder1",
+            paper=0.4962,
+            batch=128,
+            pooling="mean",
+            **_OF,
+        ),
         _benchmark("objectfolder2_material", "objectfolder2", paper=0.7602, batch=256, **_OF),
     )
 }
@@ -138,26 +191,41 @@ def find_named(known: Mapping[str, T], name: str | T, kind: str) -> T:
 def available_tasks(table: Manifest) -> tuple[str, ...]:
     """Return the tasks for which the manifest has a label on some row."""
     paired = _has_values(table, _grasp_column(table)) and _has_values(table, "unit")
-    labelled = {name: task for name, task in TASKS.items() if _has_values(table, _label_column(table, task))}
+    labelled = {
+        name: task for name, task in TASKS.items() if _has_values(table, _label_column(table, task))
+    }
     return tuple(name for name, task in labelled.items() if paired or not task.fingers)
 
 
 def label_task(
-    table: Manifest, label: str, *, group: str = "", where: tuple[str, float] | None = None, sensor: str | None = None
+    table: Manifest,
+    label: str,
+    *,
+    group: str = "",
+    where: tuple[str, float] | None = None,
+    sensor: str | None = None,
 ) -> Task:
     """Return the task of any label column ("label." may be left out), on all rows that pass the filters.
 
     `group` defaults to the first of GROUPS with a value that is not the label. UserError for an unknown name.
     """
-    conditions: list[tuple[str, str | float]] = [(find_column(table, where[0]), where[1])] if where else []
+    conditions: list[tuple[str, str | float]] = (
+        [(find_column(table, where[0]), where[1])] if where else []
+    )
     if sensor is not None:
         if sensor not in (known := sorted(set(table.text_column("sensor")))):
             raise UserError(f"No row is of sensor {sensor!r}. The manifest has {', '.join(known)}.")
         conditions.append(("sensor", sensor))
     name = label.removeprefix("label.")
-    known = [one for one in GROUPS if one != name and (_has_values(table, one) or _has_values(table, f"label.{one}"))]
+    known = [
+        one
+        for one in GROUPS
+        if one != name and (_has_values(table, one) or _has_values(table, f"label.{one}"))
+    ]
     groups = tuple(find_column(table, column) for column in ([group] if group else known[:1]))
-    return Task(name, find_column(table, label), groups=groups, which="all", where=tuple(conditions))
+    return Task(
+        name, find_column(table, label), groups=groups, which="all", where=tuple(conditions)
+    )
 
 
 def find_column(table: Manifest, name: str) -> str:
@@ -166,15 +234,21 @@ def find_column(table: Manifest, name: str) -> str:
     for candidate in (f"label.{name}", name):
         if candidate in columns:
             if pa.types.is_nested(table.column(candidate).type):
-                raise UserError(f"Column {candidate!r} contains lists. A probe needs one value a row.")
+                raise UserError(
+                    f"Column {candidate!r} contains lists. A probe needs one value a row."
+                )
             return candidate
-    raise UserError(f"The manifest has no column {name!r} or 'label.{name}'. It has {', '.join(columns)}.")
+    raise UserError(
+        f"The manifest has no column {name!r} or 'label.{name}'. It has {', '.join(columns)}."
+    )
 
 
 def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> dict[str, Array]:
     """Return masks over `rows` (n,): values of `column` with a photograph or caption in train, and others, or {}."""
     values = table.text_column(column)
-    described = (table.present("image_path") | table.present("text")) & (table.text_column("split") == "train")
+    described = (table.present("image_path") | table.present("text")) & (
+        table.text_column("split") == "train"
+    )
     mask = np.isin(values[rows], np.setdiff1d(values[described], [""]))
     if mask.all() or not mask.any():
         return {}
@@ -188,25 +262,45 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     """
     task = replace(task, label=_label_column(table, task))
     if not _has_values(table, task.label):
-        known = ", ".join(name for name in table.table.column_names if name.startswith("label.")) or "none"
-        raise UserError(f"Task {task.name}: no row has a value in column {task.label!r}. The labels are {known}.")
-    labels, split = _labels(table, task), table.text_column("split")
+        known = (
+            ", ".join(name for name in table.table.column_names if name.startswith("label."))
+            or "none"
+        )
+        raise UserError(
+            f"Task {task.name}: no row has a value in column {task.label!r}. The labels are {known}."
+        )
+    labels = _labels(table, task)
+    split = table.text_column("split")
     if task.test_list is not None:  # whichever list decided the split of this manifest
         if "downstream_test" not in table.table.column_names:
-            raise UserError(f"Task {task.name} needs the column downstream_test. Index the data set again.")
-        listed = [task.test_list in name.split("+") for name in table.text_column("downstream_test")]
+            raise UserError(
+                f"Task {task.name} needs the column downstream_test. Index the data set again."
+            )
+        listed = [
+            task.test_list in name.split("+") for name in table.text_column("downstream_test")
+        ]
         split = np.where(listed, "test", "train")
     used = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
-    used &= np.isin(split, ("train", "val", "test")) & ~np.isin(table.text_column("sensor"), FIELD_SENSORS)
+    used &= np.isin(split, ("train", "val", "test")) & ~np.isin(
+        table.text_column("sensor"), FIELD_SENSORS
+    )
     for column, value in task.where:
-        used &= table.text_column(column) == value if isinstance(value, str) else table.number_column(column) > value
+        used &= (
+            table.text_column(column) == value
+            if isinstance(value, str)
+            else table.number_column(column) > value
+        )
     length = max(task.frames, frames or 1)
     if length > 1:
         used &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
     first = _choose_frames(table, task.which, np.flatnonzero(used))
-    rows, first, notes = _pair_fingers(table, task, first) if task.fingers else (first[:, None], first, ())
+    rows, first, notes = (
+        _pair_fingers(table, task, first) if task.fingers else (first[:, None], first, ())
+    )
     if not len(rows):
-        lacking = " and two fingers" if task.fingers else "" if task.which == "all" else " and contact"
+        lacking = (
+            " and two fingers" if task.fingers else "" if task.which == "all" else " and contact"
+        )
         raise UserError(
             f"Task {task.name}: no row of split train, val or test has a label in {task.label!r}{lacking}. "
             "Check the filters and the splits."
@@ -214,10 +308,13 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     if labels.dtype.kind == "U":
         notes += tuple(
             f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or Unicode form. They are "
-            "probed as different classes." for alike in spellings(labels[first].tolist())
-        )  # fmt: skip
+            "probed as different classes."
+            for alike in spellings(labels[first].tolist())
+        )
     sensors, units = (table.text_column(name)[first] for name in ("sensor", "unit"))
-    return TaskRows(rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes)
+    return TaskRows(
+        rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes
+    )
 
 
 def label_text(value: Any, source: str = "The label") -> str:
@@ -227,9 +324,13 @@ def label_text(value: Any, source: str = "The label") -> str:
     if not isinstance(value, float | np.floating):
         text = str(value).strip()
         # "none" is a class of the simulator (no slide, no twist); "None" is what Python prints for a missing value.
-        return "" if text == "None" or (text != "none" and text.lower() in EMPTY) else str(value)
+        if text == "None" or (text != "none" and text.lower() in EMPTY):
+            return ""
+        return str(value)
     if not np.isfinite(value) or value != int(value):
-        raise UserError(f"{source} contains {value:g}, a measured quantity, not a class. Probe it as a number.")
+        raise UserError(
+            f"{source} contains {value:g}, a measured quantity, not a class. Probe it as a number."
+        )
     return str(int(value))
 
 
@@ -240,7 +341,9 @@ def _has_values(table: Manifest, column: str) -> bool:
 def _label_column(table: Manifest, task: Task) -> str:
     """Return the label column of a task; `object` falls back to the manifest's object column."""
     fallback = task.label == "label.object" and task.label not in table.table.column_names
-    return "object" if fallback else task.label
+    if fallback:
+        return "object"
+    return task.label
 
 
 def _labels(table: Manifest, task: Task) -> Array:
@@ -251,7 +354,9 @@ def _labels(table: Manifest, task: Task) -> Array:
         return np.where(np.isfinite(number), np.where(number > task.above, "yes", "no"), "")
     values = table.column(task.label).to_pylist()
     texts = np.array([label_text(value, f"Column {task.label!r}") for value in values], dtype=str)
-    return np.where(np.isin(texts, task.classes), texts, "") if task.classes else texts
+    if task.classes:
+        return np.where(np.isin(texts, task.classes), texts, "")
+    return texts
 
 
 def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
@@ -260,7 +365,8 @@ def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
     rows = rows[_touching(table)[rows]]
     if which == "contact" or not len(rows):
         return rows
-    sequence, frame = table.codes("sequence", own=True), np.asarray(table.column("frame_index"))
+    sequence = table.codes("sequence", own=True)
+    frame = np.asarray(table.column("frame_index"))
     if which == "press":
         force = table.number_column("label.force")[rows]
         known = np.isfinite(force)
@@ -268,7 +374,8 @@ def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
         return np.sort(np.concatenate([rows[~known], deepest]))
     last = np.zeros(sequence.max() + 1)
     np.maximum.at(last, sequence, frame)
-    late = -np.abs(frame - 2 / 3 * last[sequence])[rows]  # motion lasts from a third to five sixths of a recording
+    # motion lasts from a third to five sixths of a recording
+    late = -np.abs(frame - 2 / 3 * last[sequence])[rows]
     slip = np.nan_to_num(table.number_column("label.slip")[rows], nan=0.0).round(2)
     return np.sort(best_rows(rows, sequence[rows], slip, late))
 
@@ -282,7 +389,9 @@ def best_rows(rows: Array, groups: Array, *keys: Array) -> Array:
 def _touching(table: Manifest) -> Array:
     """Return whether each frame is contact, bool (rows,), by force, flag or score; all are in a file without these."""
     # Force comes first: a flag or a score depends on the picture, and would leave out soft objects for some sensors.
-    force, contact_score = (table.number_column(f"label.{name}") for name in ("force", "contact_score"))
+    force, contact_score = (
+        table.number_column(f"label.{name}") for name in ("force", "contact_score")
+    )
     flag = known_contact(table)
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):
@@ -297,11 +406,15 @@ def _touching(table: Manifest) -> Array:
 def _groups(table: Manifest, columns: Sequence[str]) -> Array:
     """Return the group of each row: the first column with a value, else the sequence; keys differ between manifests."""
     sequence = table.text_column("sequence")
-    file = np.array([f" of file {number}" if len(table.files) > 1 else "" for number in table.source], dtype=str)
+    file = np.array(
+        [f" of file {number}" if len(table.files) > 1 else "" for number in table.source], dtype=str
+    )
     groups = np.char.add(np.char.add("sequence ", sequence), file)
     for name in reversed(columns):
         if name == "recording":
-            recordings = np.array([f"recording {key.rpartition('/')[0] or key}" for key in sequence])
+            recordings = np.array(
+                [f"recording {key.rpartition('/')[0] or key}" for key in sequence]
+            )
             groups = np.char.add(recordings, file) if len(set(recordings)) > 1 else groups
         elif name in table.table.column_names:
             values = table.text_column(name)
@@ -312,29 +425,47 @@ def _groups(table: Manifest, columns: Sequence[str]) -> Array:
 
 def _grasp_column(table: Manifest) -> str:
     """Return the column that two fingers of one grasp share."""
-    return "grasp_group" if "grasp_group" in table.table.column_names else "touch"
+    if "grasp_group" in table.table.column_names:
+        return "grasp_group"
+    return "touch"
 
 
 def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Array, tuple[str, ...]]:
     """Return rows (n, 2) of the two units of each grasp, by the units' names; the labelled row of each; and notes."""
     name = _grasp_column(table)
     rows = rows[table.present(name)[rows] & table.present("unit")[rows]]
-    grasp, unit = table.codes(name, own=True)[rows], table.text_column("unit")[rows]
+    grasp = table.codes(name, own=True)[rows]
+    unit = table.text_column("unit")[rows]
     order = np.lexsort((unit, grasp))
-    rows, grasp, unit = rows[order], grasp[order], unit[order]
+    rows = rows[order]
+    grasp = grasp[order]
+    unit = unit[order]
     starts, counts = np.unique(grasp, return_index=True, return_counts=True)[1:]
     whole = starts[counts == 2]
     whole = whole[unit[whole] != unit[whole + 1]]
     pairs = rows[whole[:, None] + np.arange(2)]
-    notes = [f"{len(starts) - len(whole)} grasps without two fingers left out"] if len(starts) > len(whole) else []
+    notes = (
+        [f"{len(starts) - len(whole)} grasps without two fingers left out"]
+        if len(starts) > len(whole)
+        else []
+    )
     labelled = pairs[:, 0]
     if task.phase == "after":
-        sequence, source = table.text_column("sequence"), table.source  # of the form <grasp>/after/<finger>
-        after = {(source[row], sequence[row]): row for row in range(len(table)) if "/after/" in sequence[row]}
-        keys = [(source[row], sequence[row].replace("/during/", "/after/")) for row in pairs.ravel()]
+        # of the form <grasp>/after/<finger>
+        sequence = table.text_column("sequence")
+        source = table.source
+        after = {
+            (source[row], sequence[row]): row
+            for row in range(len(table))
+            if "/after/" in sequence[row]
+        }
+        keys = [
+            (source[row], sequence[row].replace("/during/", "/after/")) for row in pairs.ravel()
+        ]
         pairs = np.array([after.get(key, -1) for key in keys], np.int64).reshape(pairs.shape)
         complete = (pairs >= 0).all(1)
-        pairs, labelled = pairs[complete], labelled[complete]
+        pairs = pairs[complete]
+        labelled = labelled[complete]
         if not complete.all():
             notes.append(f"{np.sum(~complete)} grasps without both frames after left out")
     order = np.argsort(labelled)

@@ -21,23 +21,29 @@ from anytouch_jax.sim.sensing.sensors import POWERS, Photometry
 
 Array = np.ndarray
 _Found = tuple[float, Array]  # a loss, and what has it
-PLACES = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of (u, v) that a coefficient drifts by
+# powers of (u, v) that a coefficient drifts by
+PLACES = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 # Largest tilt, and largest features of the halo, that change a colour: of open light, and of paint that is soon dark.
 _LIMITS = (0.95, (9.0, 9.0, 1.5)), (0.3, (0.03, 0.03, 0.06))
 DEPTHS = np.linspace(0.05, 1.6, 24)  # mm
 _REACH = np.array([[-np.inf, -np.inf, DEPTHS[0]], [np.inf, np.inf, DEPTHS[-1]]])  # of a pose
-_GRID, _SIDE = 96, 14.0  # points and mm of the solved gel
+# points and mm of the solved gel
+_GRID = 96
+_SIDE = 14.0
 SKIN = 0.13  # mm: detail that the coating and the lens pass
 # mm, of the soft shadow and of the gel: the best is chosen. The gel's decides the depth, and so the change by depth.
-HALOS, THICKNESSES = (0.35, 1.0, 1.6), (1.8, 2.3, 2.8, 3.3, 3.9, 4.6)
+HALOS = (0.35, 1.0, 1.6)
+THICKNESSES = (1.8, 2.3, 2.8, 3.3, 3.9, 4.6)
 THIN = 5  # the search looks at every so many pixels
 PLAIN = 9  # powers of the normal with which the presses are placed
-ROUNDS = (0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03)  # mm of place and depth
+# mm of place and depth
+ROUNDS = (0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03)
 FEATURES = len(POWERS) * len(PLACES)
 # Root mean square of the slope of the gel, weighted by its square, and of its depth in mm where the change is above a
 # quarter of the strongest. They give the right strength on average over simulated units, and set the scale without a
 # ball. Of 30 statistics of the slope this one differs least from unit to unit.
-USUAL_TILT, USUAL_DEPTH = 0.30, 0.27
+USUAL_TILT = 0.30
+USUAL_DEPTH = 0.27
 UNSURE = "Without a ball the strength is a usual one, which differs by {} (deviation over known sensors): edit contrast"
 
 
@@ -64,7 +70,9 @@ def grid_of(shape: tuple[int, int], width_mm: float) -> Grid:
     """Return the places of the pixels (H, W) of a picture that shows `width_mm`, with square pixels."""
     height, width = shape
     pixel = width_mm / width
-    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) * pixel, (np.arange(height) + 0.5 - height / 2) * pixel)
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5 - width / 2) * pixel, (np.arange(height) + 0.5 - height / 2) * pixel
+    )
     return Grid(x, y, 2 * x / width_mm, 2 * y / (height * pixel))
 
 
@@ -85,18 +93,26 @@ class _Profiles(NamedTuple):
 def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
     """Return the dents of a ball by thickness of the gel, halo, and number of the _LIMITS."""
     line = (np.arange(_GRID) - (_GRID - 1) / 2) * _SIDE / _GRID
-    away, radius = np.hypot(*np.meshgrid(line, line)), ball_mm / 2
-    surface = np.where(away < radius, np.sqrt(np.maximum(radius**2 - away**2, 0)) - radius, -radius - 5)
-    middle, pitch = _GRID // 2, _SIDE / _GRID
+    away = np.hypot(*np.meshgrid(line, line))
+    radius = ball_mm / 2
+    surface = np.where(
+        away < radius, np.sqrt(np.maximum(radius**2 - away**2, 0)) - radius, -radius - 5
+    )
+    middle = _GRID // 2
+    pitch = _SIDE / _GRID
     height = jnp.asarray(surface, jnp.float32)
 
     @jax.jit
     def solve(depths: Any, gel: Gel) -> Any:
-        return jax.vmap(lambda depth: press(height, depth, gel, pitch, fidelity="fast").displacement)(depths)
+        return jax.vmap(
+            lambda depth: press(height, depth, gel, pitch, fidelity="fast").displacement
+        )(depths)
 
     found = dict[tuple[float, float, int], _Profiles]()
     for thickness in THICKNESSES:
-        dents = np.asarray(solve(DEPTHS.astype(np.float32), Gel(150.0, thickness=np.float32(thickness))))
+        dents = np.asarray(
+            solve(DEPTHS.astype(np.float32), Gel(150.0, thickness=np.float32(thickness)))
+        )
 
         def rows(width: float, dents: Array = dents) -> tuple[Array, Array]:
             blurred = [cv2.GaussianBlur(dent, (0, 0), width / pitch) for dent in dents]
@@ -105,22 +121,28 @@ def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
 
         sharp = rows(SKIN)[1]
         for halo, (number, (steepest, widest)) in product(HALOS, enumerate(_LIMITS)):
-            found[thickness, halo, number] = _Profiles(line[middle:], sharp, *rows(halo), steepest, np.array(widest))
+            found[thickness, halo, number] = _Profiles(
+                line[middle:], sharp, *rows(halo), steepest, np.array(widest)
+            )
     return found
 
 
 def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]:
     """Return the arguments of `design` for a ball at `pose` x, y, depth mm and the places (N,) of a grid."""
-    dx, dy = grid.x - pose[0], grid.y - pose[1]
+    dx = grid.x - pose[0]
+    dy = grid.y - pose[1]
     away = np.hypot(dx, dy)
     k = float(np.clip(np.interp(pose[2], DEPTHS, np.arange(len(DEPTHS))), 0, len(DEPTHS) - 1.001))
-    low, share = int(k), k - int(k)
+    low = int(k)
+    share = k - int(k)
     slope, soft, wide = (
         np.interp(away, profiles.away, (1 - share) * table[low] + share * table[low + 1], right=0.0)
         for table in profiles[1:4]
     )
     cos, sin = (along / np.maximum(away, 1e-6) for along in (dx, dy))
-    tilt = slope * np.minimum(1 / np.sqrt(1 + slope**2), profiles.steepest / np.maximum(np.abs(slope), 1e-6))
+    tilt = slope * np.minimum(
+        1 / np.sqrt(1 + slope**2), profiles.steepest / np.maximum(np.abs(slope), 1e-6)
+    )
     glow = np.clip(np.stack([wide * cos, wide * sin, soft], 1), -profiles.widest, profiles.widest)
     return tilt * cos, tilt * sin, grid.u, grid.v, glow
 
@@ -133,7 +155,9 @@ def design(nx: Array, ny: Array, u: Array, v: Array, halo: Array, *, plain: bool
         return np.concatenate([normal, halo, np.stack(drift, 1)], 1)
     place = np.stack([u**i * v**j for i, j in PLACES], 1)
     columns = (normal[:, :, None] * place[:, None, :]).reshape(len(nx), -1)
-    return np.concatenate([columns, (halo[:, :, None] * place[:, None, :3]).reshape(len(nx), -1)], 1)
+    return np.concatenate(
+        [columns, (halo[:, :, None] * place[:, None, :3]).reshape(len(nx), -1)], 1
+    )
 
 
 def _ridge(gram: Array, target: Array, penalties: Array) -> Array:
@@ -143,13 +167,22 @@ def _ridge(gram: Array, target: Array, penalties: Array) -> Array:
 
 
 # What few presses do not show is small: high powers, drift over the picture, and a halo that copies the slopes.
-_PENALTY = np.concatenate([
-    np.ravel([[1e-4 * (1 if i + j == 1 else 5) * (1 + 4 * (p + q)) for p, q in PLACES] for i, j in POWERS]),
-    np.full(9, 1e-2),
-])  # fmt: skip
+_PENALTY = np.concatenate(
+    [
+        np.ravel(
+            [
+                [1e-4 * (1 if i + j == 1 else 5) * (1 + 4 * (p + q)) for p, q in PLACES]
+                for i, j in POWERS
+            ]
+        ),
+        np.full(9, 1e-2),
+    ]
+)
 
 
-def assemble(coefficients: Array, steepest: float = _LIMITS[0][0], widest: Any = _LIMITS[0][1]) -> Photometry:
+def assemble(
+    coefficients: Array, steepest: float = _LIMITS[0][0], widest: Any = _LIMITS[0][1]
+) -> Photometry:
     """Return the `Photometry` of the coefficients (129, 3) of `design`."""
     normal = coefficients[:FEATURES].reshape(len(POWERS), len(PLACES), 3).astype(np.float32)
     halo = coefficients[FEATURES:].reshape(3, 3, 3).astype(np.float32)
@@ -158,44 +191,74 @@ def assemble(coefficients: Array, steepest: float = _LIMITS[0][0], widest: Any =
 
 def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> Colour:
     """Fit colour changes f32 (N, H, W, 3) of presses of a ball. Raises UserError if no ball of that size fits."""
-    part, known = Grid(*(values.ravel() for values in grid_of(change.shape[1:3], width_mm))), _profiles(ball_mm)
+    part = Grid(*(values.ravel() for values in grid_of(change.shape[1:3], width_mm)))
+    known = _profiles(ball_mm)
     # A pixel that is not clear has change 0 and features 0.
-    flat, seen = change.reshape(len(change), -1, 3).astype(np.float64), clear.reshape(len(clear), -1, 1)
+    flat = change.reshape(len(change), -1, 3).astype(np.float64)
+    seen = clear.reshape(len(clear), -1, 1)
     flat = flat * seen
-    few, thin, some = flat[:, ::THIN], Grid(*(values[::THIN] for values in part)), seen[:, ::THIN]
+    few = flat[:, ::THIN]
+    thin = Grid(*(values[::THIN] for values in part))
+    some = seen[:, ::THIN]
     best = (THICKNESSES[2], HALOS[1], 0)
     poses = np.stack([_first_pose(one, part, known[best]) for one in flat])
     # Shadow and limits for one thickness; then thickness and shadow together, which replace each other; then limits.
-    for same, rounds in ((slice(1), ROUNDS[:4]), (slice(2, 3), ROUNDS[3:5]), (slice(2), ROUNDS[4:])):
+    for same, rounds in (
+        (slice(1), ROUNDS[:4]),
+        (slice(2, 3), ROUNDS[3:5]),
+        (slice(2), ROUNDS[4:]),
+    ):
         keys = [key for key in known if key[same] == best[same]]
         tries = {key: _placed(few, some, thin, known[key], poses, rounds) for key in keys}
         best = min(tries, key=lambda key: tries[key][0])
         poses = tries[best][1]
     if float(np.median(poses[:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
-        raise UserError(f"the dents are wider than those of a ball of {ball_mm:g} mm; check --width-mm and --ball-mm")
+        raise UserError(
+            f"the dents are wider than those of a ball of {ball_mm:g} mm; check --width-mm and --ball-mm"
+        )
     loss, coefficients = _colours(flat, seen, part, known[best], poses, plain=False)
     source = f"{len(change)} presses of a ball of {ball_mm:g} mm"
-    return Colour(assemble(coefficients, *_LIMITS[best[2]]), best[1], -loss / float((flat**2).sum()), source, best[0])
+    return Colour(
+        assemble(coefficients, *_LIMITS[best[2]]),
+        best[1],
+        -loss / float((flat**2).sum()),
+        source,
+        best[0],
+    )
 
 
-def _placed(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any) -> _Found:
+def _placed(
+    flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any
+) -> _Found:
     """Return the loss of `_colours`, and better poses (N, 3): the colours and the poses are found in turn."""
     for step, deep in rounds:
         # Deeper dents with fainter colours look nearly alike, so all depths are also tried together.
         tries = [poses * (1, 1, factor) for factor in (0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.25)]
-        losses, solutions = zip(*(_colours(flat, seen, part, profiles, one) for one in tries), strict=True)
+        losses, solutions = zip(
+            *(_colours(flat, seen, part, profiles, one) for one in tries), strict=True
+        )
         best = int(np.argmin(losses))
-        poses = np.stack([
-            _search(one, weight, part, profiles, pose, solutions[best], np.array([step, step, deep]))
-            for one, weight, pose in zip(flat, seen, tries[best], strict=True)
-        ])  # fmt: skip
+        poses = np.stack(
+            [
+                _search(
+                    one, weight, part, profiles, pose, solutions[best], np.array([step, step, deep])
+                )
+                for one, weight, pose in zip(flat, seen, tries[best], strict=True)
+            ]
+        )
     return _colours(flat, seen, part, profiles, poses, plain=False)[0], poses
 
 
-def _colours(flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, plain: bool = True) -> _Found:
+def _colours(
+    flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, plain: bool = True
+) -> _Found:
     """Return minus the squares of the change that the best colours explain, and these colours (22 or 129, 3)."""
-    rows = [w * design(*_features(part, profiles, pose), plain=plain) for pose, w in zip(poses, seen, strict=True)]
-    gram, target = sum(r.T @ r for r in rows), sum(r.T @ d for r, d in zip(rows, flat, strict=True))
+    rows = [
+        w * design(*_features(part, profiles, pose), plain=plain)
+        for pose, w in zip(poses, seen, strict=True)
+    ]
+    gram = sum(r.T @ r for r in rows)
+    target = sum(r.T @ d for r, d in zip(rows, flat, strict=True))
     found = _ridge(gram, target, np.full(len(gram), 1e-5) if plain else _PENALTY)
     return -float(2 * (target * found).sum() - (found * (gram @ found)).sum()), found
 
@@ -204,7 +267,8 @@ def _first_pose(change: Array, grid: Grid, profiles: _Profiles) -> Array:
     """Return a first place and depth: the middle of the strongest changes, and the depth whose slopes reach as far."""
     strength = np.abs(change).max(1)
     strong = strength > 0.4 * np.percentile(strength, 99.5)
-    x, y = float(np.median(grid.x[strong])), float(np.median(grid.y[strong]))
+    x = float(np.median(grid.x[strong]))
+    y = float(np.median(grid.y[strong]))
     pixel = float(np.ptp(grid.x)) * float(np.ptp(grid.y)) / len(grid.x)
     reach = np.sqrt(strong.sum() * pixel / np.pi)
     slopes = np.abs(profiles.slope)
@@ -213,7 +277,13 @@ def _first_pose(change: Array, grid: Grid, profiles: _Profiles) -> Array:
 
 
 def _search(
-    change: Array, seen: Array, grid: Grid, profiles: _Profiles, pose: Array, coefficients: Array, steps: Array
+    change: Array,
+    seen: Array,
+    grid: Grid,
+    profiles: _Profiles,
+    pose: Array,
+    coefficients: Array,
+    steps: Array,
 ) -> Array:
     """Return a pose that no step along x, y or depth makes better, after four steps at most."""
 
@@ -223,31 +293,43 @@ def _search(
 
     least = loss(pose)
     for _ in range(4):
-        moves = [np.clip(pose + sign * move, *_REACH) for move in np.diag(steps) for sign in (-1, 1)]
+        moves = [
+            np.clip(pose + sign * move, *_REACH) for move in np.diag(steps) for sign in (-1, 1)
+        ]
         losses = [loss(one) for one in moves]
         if min(losses) >= least:
             break
-        least, pose = min(losses), moves[int(np.argmin(losses))]
+        least = min(losses)
+        pose = moves[int(np.argmin(losses))]
     return pose
 
 
 def fit_presses(change: Array, clear: Array) -> Colour:
     """Fit colour changes f32 (N, H, W, 3) of presses of unknown objects: their slopes without a curl, see above."""
-    smooth, grid = np.stack([cv2.GaussianBlur(one, (0, 0), 1.0) for one in change]), grid_of(change.shape[1:3], 2.0)
+    smooth = np.stack([cv2.GaussianBlur(one, (0, 0), 1.0) for one in change])
+    grid = grid_of(change.shape[1:3], 2.0)
     strength = np.abs(smooth).max(-1)
     touched = strength > 0.25 * np.percentile(strength, 99.5, axis=(1, 2))[:, None, None]
     values, axes = np.linalg.eigh(np.cov(smooth.reshape(-1, 3).T, ddof=0))
-    main, coefficients = smooth[touched] @ axes[:, -1], np.zeros((FEATURES + 9, 3))
-    if values[1] < 0.03 * values[2] and main.mean() ** 2 > 0.1 * main.var():  # one colour, of one sign: no slope
-        coefficients[FEATURES + 6] = axes[:, -1] * np.sign(main.mean()) * np.sqrt((main**2).mean()) / USUAL_DEPTH
+    main = smooth[touched] @ axes[:, -1]
+    coefficients = np.zeros((FEATURES + 9, 3))
+    if (
+        values[1] < 0.03 * values[2] and main.mean() ** 2 > 0.1 * main.var()
+    ):  # one colour, of one sign: no slope
+        coefficients[FEATURES + 6] = (
+            axes[:, -1] * np.sign(main.mean()) * np.sqrt((main**2).mean()) / USUAL_DEPTH
+        )
         source = f"{len(change)} presses of unknown objects, of a gel that changes by depth. {UNSURE.format('30 %')}"
         return Colour(assemble(coefficients), 0.35, float(values[2] / values.sum()), source)
     values, axes = np.linalg.eigh(np.cov(smooth[clear].T, ddof=0))
-    white = (smooth @ axes[:, 1:]) / np.sqrt(values[1:])  # (N, H, W, 2), uncorrelated: slopes up to a turn
+    # (N, H, W, 2), uncorrelated: slopes up to a turn
+    white = (smooth @ axes[:, 1:]) / np.sqrt(values[1:])
     down, across = (np.gradient(white, axis=axis)[clear] for axis in (1, 2))
     best = (np.inf, np.eye(2))
     for mirror, angle in product((1, -1), np.linspace(0, np.pi, 180, endpoint=False)):
-        turn = np.array([[np.cos(angle), np.sin(angle)], [-mirror * np.sin(angle), mirror * np.cos(angle)]])
+        turn = np.array(
+            [[np.cos(angle), np.sin(angle)], [-mirror * np.sin(angle), mirror * np.cos(angle)]]
+        )
         curl = down @ turn[0] - across @ turn[1]
         best = min(best, (float((curl**2).sum()), turn), key=lambda one: one[0])
     slopes = white @ best[1].T
@@ -260,7 +342,9 @@ def fit_presses(change: Array, clear: Array) -> Colour:
         square = (fitting**2).sum(-1)
         fitting *= USUAL_TILT / np.sqrt((square**2).sum() / square.sum())
         rows = (fitting[..., None] * place[:, :, None]).reshape(*smooth.shape[:3], 6)[clear]
-        linear = _ridge(rows.T @ rows, rows.T @ smooth[clear], np.array([0, 0.05, 0.05] * 2)).reshape(2, 3, 3)
+        linear = _ridge(
+            rows.T @ rows, rows.T @ smooth[clear], np.array([0, 0.05, 0.05] * 2)
+        ).reshape(2, 3, 3)
         colours = np.einsum("hwp,dpc->hwdc", place, linear)
         square = colours @ colours.swapaxes(2, 3)
         square += 0.01 * np.trace(square.mean((0, 1))) * np.eye(2)

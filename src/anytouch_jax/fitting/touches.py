@@ -30,7 +30,10 @@ sample = jax.jit(endless.sample_touches, static_argnames=("sampling", "count"))
 
 
 def own_world(
-    sensor: str | Path, split: Literal["train", "test"], known: Sequence[str] = CAMERAS, ball_mm: float | None = None
+    sensor: str | Path,
+    split: Literal["train", "test"],
+    known: Sequence[str] = CAMERAS,
+    ball_mm: float | None = None,
 ) -> World:
     """Return the world of your sensor (family 0) and the `known` ones, with objects of a split of training.
 
@@ -53,14 +56,21 @@ def own_touches(key: Any, world: World, *, size: int = SIZE) -> SimulatedTouches
 
 
 def compare(
-    frames: Array, gel: Array, sensor: str | Path, out: Path, *, ball_mm: float | None = None, seed: int = 0
+    frames: Array,
+    gel: Array,
+    sensor: str | Path,
+    out: Path,
+    *,
+    ball_mm: float | None = None,
+    seed: int = 0,
 ) -> float:
     """Write a picture of real frames u8 (N, h, w, 3) above simulated ones, and return what a classifier still sees.
 
     Both are presses of a ball of `ball_mm`, if that is given. The result is the share of held-out pictures that a
     linear classifier names rightly as real or simulated: 0.5 is chance.
     """
-    world, count = own_world(sensor, "train", ball_mm=ball_mm), min(len(frames), 2 * COUNT)
+    world = own_world(sensor, "train", ball_mm=ball_mm)
+    count = min(len(frames), 2 * COUNT)
     real = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
     parts = [
         jax.device_get(own_touches(jax.random.fold_in(jax.random.key(seed), n), world))
@@ -70,7 +80,9 @@ def compare(
     behind = np.concatenate([part.background[:, 1] for part in parts])[: len(real)]
     atomic_write(out, encode(_picture(real, made)))
     small = [_small(frame) - _small(gel) for frame in real]
-    return separable(small, [a.astype(np.float32) - b for a, b in zip(made, behind, strict=True)], seed)
+    return separable(
+        small, [a.astype(np.float32) - b for a, b in zip(made, behind, strict=True)], seed
+    )
 
 
 def _small(picture: Array) -> Array:
@@ -98,8 +110,10 @@ def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
     for fold in range(FOLDS):
         test = order[fold::FOLDS]
         train = np.setdiff1d(order, test)
-        middle, scale = rows[train].mean(0), rows[train].std(0) + 1e-6
-        x, y = (rows[train] - middle) / scale, kind[train]
+        middle = rows[train].mean(0)
+        scale = rows[train].std(0) + 1e-6
+        x = (rows[train] - middle) / scale
+        y = kind[train]
         weights = np.linalg.solve(x.T @ x + 10.0 * np.eye(x.shape[1]), x.T @ (y - y.mean()))
         guess = ((rows[test] - middle) / scale) @ weights + y.mean()
         right.append(np.sign(guess) == kind[test])
@@ -114,5 +128,7 @@ def _statistics(change: Array) -> Array:
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=0)).mean((0, 1))))
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=1)).mean((0, 1))))
     colours = np.cov(change.reshape(-1, 3).T) + np.eye(3)
-    parts.append((colours / np.sqrt(np.outer(np.diag(colours), np.diag(colours))))[np.triu_indices(3, 1)])
+    parts.append(
+        (colours / np.sqrt(np.outer(np.diag(colours), np.diag(colours))))[np.triu_indices(3, 1)]
+    )
     return np.concatenate(parts)

@@ -26,7 +26,9 @@ def _matcher(model: ModelConfig) -> Mlp | Dense | None:
     model = replace(model, dtype="float32") if model.dtype == "bfloat16" else model
     if model.match_head == "mlp":
         return Mlp(model.embed, model.embed, model, gelu, outputs=1)
-    return Dense(model.embed, 1, model) if model.match_head == "linear" else None
+    if model.match_head == "linear":
+        return Dense(model.embed, 1, model)
+    return None
 
 
 class AnyTouch(nnx.Module):
@@ -35,7 +37,8 @@ class AnyTouch(nnx.Module):
     def __init__(self, model: ModelConfig) -> None:
         self.touch = TouchEncoder(model)
         self.decoder = TouchDecoder(model)
-        self.frames, self.embed = model.frames, model.embed
+        self.frames = model.frames
+        self.embed = model.embed
         if model.fields:
             self.fields = FieldDecoder(model)
         if model.image is not None:
@@ -49,18 +52,25 @@ class AnyTouch(nnx.Module):
             self.logit_scale = table()
         self.matcher = _matcher(model)
 
-    def encode_touch(self, clip: Array, sensor: Array, join: str = "mean", keep_ids: Array | None = None) -> Array:
+    def encode_touch(
+        self, clip: Array, sensor: Array, join: str = "mean", keep_ids: Array | None = None
+    ) -> Array:
         """Return touch embeddings (B, E) from the class token, see `Net.encode_touch`."""
         if keep_ids is not None:
             return self.touch.features(clip, sensor, keep_ids)
         return self._over_segments(self.touch.features, clip, sensor, join)
 
-    def encode_poolings(self, clip: Array, sensor: Array, join: str = "mean") -> tuple[Array, Array]:
+    def encode_poolings(
+        self, clip: Array, sensor: Array, join: str = "mean"
+    ) -> tuple[Array, Array]:
         """Return in one pass `encode_touch`, and the mean over projected patch tokens (the release's "global")."""
 
         def both(clip: Array, sensor: Array) -> tuple[Array, Array]:
-            hidden, special = self.touch.hidden(clip, sensor), self.decoder.special
-            return self.touch.embedding(hidden[:, 0]), jnp.mean(self.touch.projection(hidden[:, special:]), axis=1)
+            hidden = self.touch.hidden(clip, sensor)
+            special = self.decoder.special
+            return self.touch.embedding(hidden[:, 0]), jnp.mean(
+                self.touch.projection(hidden[:, special:]), axis=1
+            )
 
         return self._over_segments(both, clip, sensor, join)
 
@@ -72,8 +82,10 @@ class AnyTouch(nnx.Module):
         parts = tokens.segments(clip, self.frames)
         b, s = parts.shape[:2]
         joins = {
-            "mean": lambda z: z.mean(1), "sum": lambda z: z.sum(1), "concat": lambda z: z.reshape(b, s * z.shape[2]),
-        }  # fmt: skip
+            "mean": lambda z: z.mean(1),
+            "sum": lambda z: z.sum(1),
+            "concat": lambda z: z.reshape(b, s * z.shape[2]),
+        }
         values = features(parts.reshape(b * s, *parts.shape[2:]), jnp.repeat(sensor, s))
         return jax.tree.map(lambda z: joins[join](z.reshape(b, s, z.shape[-1])), values)
 
@@ -82,20 +94,30 @@ class AnyTouch(nnx.Module):
         return self.touch.projection(self.touch.hidden(clip, sensor, keep_ids))
 
     def reconstruct(
-        self, clip: Array, sensor: Array, keep_ids: Array, restore_ids: Array, frames: int,
+        self,
+        clip: Array,
+        sensor: Array,
+        keep_ids: Array,
+        restore_ids: Array,
+        frames: int,
         decoder_sensor: Array | None = None,
-    ) -> Array:  # fmt: skip
+    ) -> Array:
         """Return pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B, T, H, W, 3)."""
-        latent, own = self.encode_tokens(clip, sensor, keep_ids), None
+        latent = self.encode_tokens(clip, sensor, keep_ids)
+        own = None
         if hasattr(self.decoder, "sensor_projection"):
-            own = rows_of(self.touch.sensor_tokens[...], sensor if decoder_sensor is None else decoder_sensor)
+            own = rows_of(
+                self.touch.sensor_tokens[...], sensor if decoder_sensor is None else decoder_sensor
+            )
         return self.decoder(latent, restore_ids, frames, own)
 
     def measure(self, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
         """Return the fields of the last frame of clips, see `FieldDecoder`."""
         return self.fields(self.touch.states(clip, sensor, STATES), clip, aspect)
 
-    def encode_and_measure(self, clip: Array, sensor: Array, aspect: Array) -> tuple[Array, Array, FieldOutput]:
+    def encode_and_measure(
+        self, clip: Array, sensor: Array, aspect: Array
+    ) -> tuple[Array, Array, FieldOutput]:
         """Return in one pass `encode_poolings` and `measure` of clips of one segment."""
         states = self.touch.states(clip, sensor, STATES)
         hidden = states[..., -self.touch.width :]
@@ -108,5 +130,6 @@ class AnyTouch(nnx.Module):
             raise ValueError("this network has no matching head (model.match_head is none)")
         product = z_first * z_second
         if isinstance(self.matcher, Mlp):
-            product = product * self.embed  # entries of a product of unit vectors are about 1 / E: to order one
+            # entries of a product of unit vectors are about 1 / E: to order one
+            product = product * self.embed
         return self.matcher(product)[:, 0]

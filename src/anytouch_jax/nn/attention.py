@@ -11,11 +11,18 @@ from jax import Array
 
 from anytouch_jax.config import ModelConfig
 
-CACHE = 1_700_000  # bytes of logits that fit in a core's cache: six heads of a still at 262 tokens
+# bytes of logits that fit in a core's cache: six heads of a still at 262 tokens
+CACHE = 1_700_000
 
 
 def attention(
-    q: Array, k: Array, v: Array, *, implementation: str, causal: bool = False, mask: Array | None = None
+    q: Array,
+    k: Array,
+    v: Array,
+    *,
+    implementation: str,
+    causal: bool = False,
+    mask: Array | None = None,
 ) -> Array:
     """Return softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool marks keys to read.
 
@@ -25,7 +32,9 @@ def attention(
     """
     free = mask is None and not causal and q.shape == k.shape
     if implementation == "auto":
-        implementation = "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
+        implementation = (
+            "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
+        )
     if implementation == "mapped" and free and q.size:
         return mapped(q, k, v)
     keys = None if mask is None else mask[:, None, None, :]
@@ -37,7 +46,9 @@ def attention(
 def usable(model: ModelConfig) -> ModelConfig:
     """Return `model` with a form of attention that this machine has, for weights trained by cuDNN."""
     there = model.attention != "cudnn" or jax.default_backend() == "gpu"
-    return model if there else replace(model, attention="auto")
+    if there:
+        return model
+    return replace(model, attention="auto")
 
 
 @jax.custom_vjp
@@ -84,7 +95,9 @@ def _heads(x: Array, shape: tuple[int, ...]) -> Array:
 
 def _product(subscripts: str, a: Array, b: Array) -> Array:
     """Return a product of small matrices in the wider of both types, summed in float32 or wider."""
-    return jnp.einsum(subscripts, a, b, preferred_element_type=jnp.promote_types(a.dtype, jnp.float32))
+    return jnp.einsum(
+        subscripts, a, b, preferred_element_type=jnp.promote_types(a.dtype, jnp.float32)
+    )
 
 
 def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:

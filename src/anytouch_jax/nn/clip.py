@@ -35,12 +35,15 @@ class ImageTower(nnx.Module):
         self.blocks = stacked_blocks(stack, model, model.norm_eps, ACTIVATIONS[model.activation])
         self.post_norm = LayerNorm(stack.width, model.norm_eps, model.dtype)
         self.projection = Dense(stack.width, model.embed, model, bias=False)
-        self.patch_size, self.remat = model.patch, model.remat
+        self.patch_size = model.patch
+        self.remat = model.remat
 
     def hidden(self, image: Array) -> Array:
         """Return the last hidden states (V, 1 + N, D) of normalised images (V, H, W, 3)."""
         x = self.patch(tokens.patchify(image[:, None], self.patch_size)[:, :, 0])
-        start = jnp.broadcast_to(self.class_token[...].astype(x.dtype)[None, None], (len(x), 1, x.shape[-1]))
+        start = jnp.broadcast_to(
+            self.class_token[...].astype(x.dtype)[None, None], (len(x), 1, x.shape[-1])
+        )
         x = jnp.concatenate([start, x], axis=1) + self.position[...].astype(x.dtype)[None]
         return run_blocks(self.blocks, self.pre_norm(x), remat=self.remat)
 
@@ -60,14 +63,20 @@ class TextEncoder(nnx.Module):
         width = tower.stack.width
         self.token = table(tower.vocab, width)
         self.position = table(tower.length, width)
-        self.blocks = stacked_blocks(tower.stack, model, model.norm_eps, ACTIVATIONS[model.activation])
+        self.blocks = stacked_blocks(
+            tower.stack, model, model.norm_eps, ACTIVATIONS[model.activation]
+        )
         self.final_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
-        self.end_token, self.dtype, self.remat = tower.end_token, stored(model.dtype), model.remat
+        self.end_token = tower.end_token
+        self.dtype = stored(model.dtype)
+        self.remat = model.remat
 
     def hidden(self, ids: Array, mask: Array | None = None) -> Array:
         """Return normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on readable tokens."""
-        x = (rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]).astype(self.dtype)
+        x = (rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]).astype(
+            self.dtype
+        )
         return self.final_norm(run_blocks(self.blocks, x, remat=self.remat, causal=True, mask=mask))
 
     def pooled(self, ids: Array, mask: Array | None = None) -> Array:
@@ -84,7 +93,8 @@ class Lora(nnx.Module):
     """Low-rank factors of one projection in every block: a (depth, D, r), b (depth, r, D)."""
 
     def __init__(self, depth: int, width: int, rank: int) -> None:
-        self.a, self.b = table(depth, width, rank), table(depth, rank, width)
+        self.a = table(depth, width, rank)
+        self.b = table(depth, rank, width)
 
 
 def merge_lora(params: Params, alpha: float) -> Params:
@@ -97,7 +107,9 @@ def merge_lora(params: Params, alpha: float) -> Params:
         return params
     attention = dict(params["image"]["blocks"]["attention"])
     for name, factors in params["lora"].items():
-        update = jnp.einsum("ldr,lre->lde", factors["a"], factors["b"]) * (alpha / factors["a"].shape[-1])
+        update = jnp.einsum("ldr,lre->lde", factors["a"], factors["b"]) * (
+            alpha / factors["a"].shape[-1]
+        )
         attention[name] = attention[name] | {"kernel": attention[name]["kernel"] + update}
     image = params["image"] | {"blocks": params["image"]["blocks"] | {"attention": attention}}
     return {name: value for name, value in params.items() if name != "lora"} | {"image": image}

@@ -54,7 +54,12 @@ class Net:
         return _with(params, *_skeleton(AnyTouch, replace(self.model, lora_rank=0)))
 
     def encode_touch(
-        self, params: Params, clip: Array, sensor: Array, join: str = "mean", keep_ids: Array | None = None
+        self,
+        params: Params,
+        clip: Array,
+        sensor: Array,
+        join: str = "mean",
+        keep_ids: Array | None = None,
     ) -> Array:
         """Return touch embeddings (B, E) of normalised clips (B, T, H, W, 3), from the class token; not unit-norm.
 
@@ -64,20 +69,32 @@ class Net:
         """
         return self.bind(params).encode_touch(clip, sensor, join, keep_ids)
 
-    def encode_poolings(self, params: Params, clip: Array, sensor: Array, join: str = "mean") -> tuple[Array, Array]:
+    def encode_poolings(
+        self, params: Params, clip: Array, sensor: Array, join: str = "mean"
+    ) -> tuple[Array, Array]:
         """Return both poolings (B, E) in one pass: the class token and the mean over patch tokens."""
         return self.bind(params).encode_poolings(clip, sensor, join)
 
-    def encode_tokens(self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
+    def encode_tokens(
+        self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None
+    ) -> Array:
         """Return the projected sequence (B, 1 + S + K, E) of class, sensor and patch tokens: the decoder's input."""
         return self.bind(params).encode_tokens(clip, sensor, keep_ids)
 
     def reconstruct(
-        self, params: Params, clip: Array, sensor: Array, keep_ids: Array, restore_ids: Array, frames: int,
+        self,
+        params: Params,
+        clip: Array,
+        sensor: Array,
+        keep_ids: Array,
+        restore_ids: Array,
+        frames: int,
         decoder_sensor: Array | None = None,
-    ) -> Array:  # fmt: skip
+    ) -> Array:
         """Return pixels (B, N, frames, P*P*3) of every position from the visible patches `keep_ids` (B, K)."""
-        return self.bind(params).reconstruct(clip, sensor, keep_ids, restore_ids, frames, decoder_sensor)
+        return self.bind(params).reconstruct(
+            clip, sensor, keep_ids, restore_ids, frames, decoder_sensor
+        )
 
     def measure(self, params: Params, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
         """Return depth, shear, contact and force of normalised clips (B, T, H, W, 3), see `nn.fields`.
@@ -107,7 +124,9 @@ class Net:
     def scale(self, params: Params) -> Array:
         """Return 1 / tau f32 (), the learned factor on cosine similarities (Eq. 3): 100 at most."""
         log = self.bind(params).logit_scale[...]
-        return jnp.exp(log + jax.lax.stop_gradient(jnp.minimum(log, math.log(losses.MOST_SCALE)) - log))
+        return jnp.exp(
+            log + jax.lax.stop_gradient(jnp.minimum(log, math.log(losses.MOST_SCALE)) - log)
+        )
 
 
 def build(model: ModelConfig) -> Net:
@@ -147,7 +166,8 @@ def _cached_skeleton(kind: Callable[[Any], Any], options: Any, _: DTypeLike) -> 
 
 def _with(params: Params, graph: Any, state: Any) -> Any:
     """Return the module of a skeleton with these parameters."""
-    state = jax.tree.map(lambda leaf: leaf, state)  # a copy: the skeleton is shared between traces
+    # a copy: the skeleton is shared between traces
+    state = jax.tree.map(lambda leaf: leaf, state)
     nnx.replace_by_pure_dict(state, params)
     return nnx.merge(graph, state)
 
@@ -157,15 +177,20 @@ def _drawn(abstract: Params, model: ModelConfig, key: Array) -> Params:
     return jax.tree_util.tree_map_with_path(partial(_first_value, model=model, seed=seed), abstract)
 
 
-def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: ModelConfig, seed: list[int]) -> Array:
+def _first_value(
+    path: Any, leaf: jax.ShapeDtypeStruct, *, model: ModelConfig, seed: list[int]
+) -> Array:
     """Return the initial value of the parameter at `path`: every rule of initialisation is here."""
-    name, shape = "/".join(entry.key for entry in path), leaf.shape
+    name = "/".join(entry.key for entry in path)
+    shape = leaf.shape
     last = name.rsplit("/", 1)[-1]
     rng = np.random.default_rng([*seed, zlib.crc32(name.encode())])
     if name == "logit_scale":
         value = -np.log(model.temperature)
     elif name == "decoder/position":
-        value = jax.jit(tokens.sincos_table, static_argnums=(0, 1))(shape[1], model.image_size // model.patch)
+        value = jax.jit(tokens.sincos_table, static_argnums=(0, 1))(
+            shape[1], model.image_size // model.patch
+        )
     elif last == "scale":
         value = np.ones(shape)
     elif last in ("bias", "b"):  # b: LoRA starts as no change
@@ -175,4 +200,5 @@ def _first_value(path: Any, leaf: jax.ShapeDtypeStruct, *, model: ModelConfig, s
         value = rng.uniform(-1, 1, shape) * np.sqrt(6 / (inputs + shape[-1]))
     else:  # tokens and positions; LoRA's a
         value = rng.standard_normal(shape) * (shape[-2] ** -0.5 if last == "a" else 0.02)
-    return jax.device_put(np.asarray(value, leaf.dtype))  # jnp.asarray would compile a program for each shape
+    # jnp.asarray would compile a program for each shape
+    return jax.device_put(np.asarray(value, leaf.dtype))

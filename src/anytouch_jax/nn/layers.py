@@ -34,13 +34,16 @@ def stored(dtype: DTypeLike) -> jnp.dtype:
 def product(x: Array, kernel: Array, dtype: DTypeLike) -> Array:
     """Return x (rows, inputs) @ kernel (inputs, outputs), both rounded to `dtype`, as `stored(dtype)`."""
     if stored(dtype) != dtype:
-        return checkpoint_name(_narrow(x.astype(stored(dtype)), kernel, jnp.dtype(dtype)), "product")
+        return checkpoint_name(
+            _narrow(x.astype(stored(dtype)), kernel, jnp.dtype(dtype)), "product"
+        )
     return x.astype(dtype) @ kernel.astype(dtype)
 
 
 # A policy of jax.checkpoint: keep matrix products, with those of this module, and recompute the rest.
 products_saveable = jax.checkpoint_policies.save_from_both_policies(
-    jax.checkpoint_policies.dots_with_no_batch_dims_saveable, jax.checkpoint_policies.save_only_these_names("product")
+    jax.checkpoint_policies.dots_with_no_batch_dims_saveable,
+    jax.checkpoint_policies.save_only_these_names("product"),
 )
 
 
@@ -74,7 +77,9 @@ def _turned(x: Array) -> Array:
     """Return x^T as a copy. The branch keeps XLA from folding it into the product. NaN stays NaN."""
     if not x.size:
         return x.T
-    return lax.cond(x[0, 0] < jnp.inf, lambda x: x.T, lambda x: jnp.full(x.shape[::-1], jnp.nan, x.dtype), x)
+    return lax.cond(
+        x[0, 0] < jnp.inf, lambda x: x.T, lambda x: jnp.full(x.shape[::-1], jnp.nan, x.dtype), x
+    )
 
 
 @jax.custom_vjp
@@ -148,7 +153,8 @@ class LayerNorm(nnx.Module):
     def __init__(self, width: int, eps: float, dtype: DTypeLike) -> None:
         self.scale = table(width)
         self.bias = table(width)
-        self.eps, self.dtype = eps, stored(dtype)
+        self.eps = eps
+        self.dtype = stored(dtype)
 
     def __call__(self, x: Array) -> Array:
         wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
@@ -162,13 +168,18 @@ class Attention(nnx.Module):
     """Multi-head attention of (B, Q, D) over (B, S, D): `project`, `attend` and `out`."""
 
     def __init__(self, stack: Stack, model: ModelConfig) -> None:
-        self.query, self.key, self.value, self.out = (Dense(stack.width, stack.width, model) for _ in range(4))
-        self.heads, self.implementation = stack.heads, model.attention
+        self.query, self.key, self.value, self.out = (
+            Dense(stack.width, stack.width, model) for _ in range(4)
+        )
+        self.heads = stack.heads
+        self.implementation = model.attention
 
     def project(self, asks: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return q (B, Q, H, D / H) and k, v (B, S, H, D / H)."""
         parts = (self.query(asks), self.key(x), self.value(x))
-        q, k, v = (part.reshape(*part.shape[:2], self.heads, part.shape[2] // self.heads) for part in parts)
+        q, k, v = (
+            part.reshape(*part.shape[:2], self.heads, part.shape[2] // self.heads) for part in parts
+        )
         return q, k, v
 
     def attend(self, q: Array, k: Array, v: Array, *, causal: bool, mask: Array | None) -> Array:
@@ -179,7 +190,9 @@ class Attention(nnx.Module):
 class Mlp(nnx.Module):
     """Two linear layers with an activation between them."""
 
-    def __init__(self, width: int, hidden: int, model: ModelConfig, act: Activation, outputs: int = 0) -> None:
+    def __init__(
+        self, width: int, hidden: int, model: ModelConfig, act: Activation, outputs: int = 0
+    ) -> None:
         self.up = Dense(width, hidden, model)
         self.down = Dense(hidden, outputs or width, model)
         self.act = act
@@ -202,7 +215,9 @@ class Block(nnx.Module):
         self.norm2 = LayerNorm(stack.width, eps, model.dtype)
         self.mlp = Mlp(stack.width, stack.mlp, model, act)
 
-    def __call__(self, x: Array, *, causal: bool = False, mask: Array | None = None, turn: Turn | None = None) -> Array:
+    def __call__(
+        self, x: Array, *, causal: bool = False, mask: Array | None = None, turn: Turn | None = None
+    ) -> Array:
         q, k, v = self._before(x)
         q, k = (q, k) if turn is None else (turn(q), turn(k))
         return self._after(x, self.attention.attend(q, k, v, causal=causal, mask=mask))
@@ -226,13 +241,19 @@ class Block(nnx.Module):
 
 def stacked_blocks(
     stack: Stack, model: ModelConfig, eps: float, act: Activation, kind: type[Block] = Block
-) -> Block:  # fmt: skip
+) -> Block:
     """Return `stack.depth` blocks as one, every parameter with a leading axis of that length."""
     return nnx.vmap(lambda: kind(stack, model, eps, act), axis_size=stack.depth)()
 
 
 def run_blocks(
-    blocks: Block, x: Array, *, remat: bool, causal: bool = False, mask: Array | None = None, turn: Turn | None = None
+    blocks: Block,
+    x: Array,
+    *,
+    remat: bool,
+    causal: bool = False,
+    mask: Array | None = None,
+    turn: Turn | None = None,
 ) -> Array:
     """Send `x` (B, S, D) through stacked blocks by lax.scan, so that compile time does not grow with depth.
 
@@ -263,10 +284,14 @@ def _but_last(blocks: Block, x: Array, remat: bool) -> Array:
     # than the last block does for a batch of one. A gradient through it would be added up whole, block by block.
 
     def body(x: Array, number: Array) -> tuple[Array, None]:
-        block = jax.tree.map(lambda values: jax.lax.dynamic_index_in_dim(values, number, keepdims=False), blocks)
+        block = jax.tree.map(
+            lambda values: jax.lax.dynamic_index_in_dim(values, number, keepdims=False), blocks
+        )
         return block(x), None
 
-    steps, is_one = _depth(blocks) - 1, isinstance(x.shape[0], int) and x.shape[0] == 1  # an export's batch is a symbol
+    # an export's batch is a symbol
+    steps = _depth(blocks) - 1
+    is_one = isinstance(x.shape[0], int) and x.shape[0] == 1
     # One touch by few blocks: with constant parameters nothing is taken out of the stack, and it takes a tenth less.
     return jax.lax.scan(body, x, jnp.arange(steps), unroll=steps if is_one and steps < 12 else 1)[0]
 

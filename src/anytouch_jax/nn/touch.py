@@ -35,7 +35,8 @@ class TouchPatch(nnx.Module):
     def __init__(self, model: ModelConfig) -> None:
         rows = (len(model.sensors),) if model.patch_encoder == "sensor" else ()
         self.kernel = table(*rows, model.frames, model.patch**2 * 3, model.touch.width)
-        self.own, self.dtype = bool(rows), jnp.dtype(model.dtype)
+        self.own = bool(rows)
+        self.dtype = jnp.dtype(model.dtype)
 
     def __call__(self, patches: Array, sensor: Array) -> Array:
         """Project (B, K, T, P*P*3) to (B, K, D). A still is a clip of equal frames (Sec. 3.1): kernels are summed."""
@@ -46,7 +47,8 @@ class TouchPatch(nnx.Module):
             matrix = kernel.reshape(-1, kernel.shape[-1])
             x = product(patches.reshape(-1, len(matrix)), matrix, self.dtype)
             return x.reshape(*patches.shape[:2], kernel.shape[-1])
-        each, own = rows_of(kernel, sensor), stored(self.dtype)
+        each = rows_of(kernel, sensor)
+        own = stored(self.dtype)
         return jnp.einsum("bktc,btcd->bkd", patches.astype(own), each.astype(own))
 
 
@@ -60,27 +62,40 @@ class TouchEncoder(nnx.Module):
         self.position = table(model.patches + 1, width)
         self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width)
         self.pre_norm = LayerNorm(width, model.norm_eps, model.dtype) if model.pre_norm else None
-        self.blocks = stacked_blocks(model.touch, model, model.norm_eps, ACTIVATIONS[model.activation])
+        self.blocks = stacked_blocks(
+            model.touch, model, model.norm_eps, ACTIVATIONS[model.activation]
+        )
         self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
-        self.patch_size, self.depth, self.width, self.remat = model.patch, model.touch.depth, width, model.remat
+        self.patch_size = model.patch
+        self.depth = model.touch.depth
+        self.width = width
+        self.remat = model.remat
 
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
         patches = tokens.patchify(clip, self.patch_size)
-        position = jnp.broadcast_to(self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape))
+        position = jnp.broadcast_to(
+            self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape)
+        )
         if keep_ids is not None:
-            patches, position = tokens.keep(patches, keep_ids), tokens.keep(position, keep_ids)
+            patches = tokens.keep(patches, keep_ids)
+            position = tokens.keep(position, keep_ids)
         x = self.patch(patches, sensor)
         start = jnp.broadcast_to(
-            (self.class_token[...] + self.position[...][0])[None, None], (clip.shape[0], 1, x.shape[-1])
+            (self.class_token[...] + self.position[...][0])[None, None],
+            (clip.shape[0], 1, x.shape[-1]),
         )
         own = rows_of(self.sensor_tokens[...], sensor)
-        return jnp.concatenate([start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)], axis=1)
+        return jnp.concatenate(
+            [start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)], axis=1
+        )
 
     def _first(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         x = self.tokens(clip, sensor, keep_ids)
-        return x if self.pre_norm is None else self.pre_norm(x)
+        if self.pre_norm is None:
+            return x
+        return self.pre_norm(x)
 
     def hidden(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the last hidden states (B, 1 + S + K, D), without the final norm (golden Q5)."""
@@ -93,10 +108,15 @@ class TouchEncoder(nnx.Module):
         They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT, Ranftl et al. 2021).
         """
         x = self._first(clip, sensor)
-        states, before = [], 0
+        states = []
+        before = 0
         for number in range(count):
             block = round(number * self.depth / (count - 1)) if count > 1 else self.depth
-            x = run_blocks(blocks_between(self.blocks, before, block), x, remat=self.remat) if block > before else x
+            x = (
+                run_blocks(blocks_between(self.blocks, before, block), x, remat=self.remat)
+                if block > before
+                else x
+            )
             states.append(x)
             before = block
         return jnp.concatenate(states, axis=-1)
@@ -115,7 +135,8 @@ class TouchDecoder(nnx.Module):
     """Light ViT that predicts every position from the visible ones, with a head for stills and one for clips."""
 
     def __init__(self, model: ModelConfig) -> None:
-        width, pixels = model.decoder.width, model.patch**2 * 3
+        width = model.decoder.width
+        pixels = model.patch**2 * 3
         self.embed = Dense(model.embed, width, model)
         self.mask_token = table(width)
         self.position = table(model.patches + 1, width)
@@ -125,15 +146,25 @@ class TouchDecoder(nnx.Module):
         self.clip_head = Dense(width, pixels * (model.frames + 1), model)
         if model.decoder_sensor_tokens:
             self.sensor_projection = Dense(model.touch.width, width, model, bias=False)
-        self.special, self.remat = 1 + model.sensor_tokens, model.remat
+        self.special = 1 + model.sensor_tokens
+        self.remat = model.remat
 
-    def __call__(self, latent: Array, restore_ids: Array, frames: int, sensor_tokens: Array | None = None) -> Array:
+    def __call__(
+        self, latent: Array, restore_ids: Array, frames: int, sensor_tokens: Array | None = None
+    ) -> Array:
         """Return pixels (B, N, frames, P*P*3) of (B, 1 + S + K, E). `sensor_tokens` (B, S, D) replace encoded ones."""
         x = self.embed(latent)
         position = self.position[...].astype(x.dtype)
         start = x[:, :1] + position[None, :1]
-        own = x[:, 1 : self.special] if sensor_tokens is None else self.sensor_projection(sensor_tokens)
-        grid = tokens.restore(x[:, self.special :], self.mask_token[...], restore_ids) + position[None, 1:]
+        own = (
+            x[:, 1 : self.special]
+            if sensor_tokens is None
+            else self.sensor_projection(sensor_tokens)
+        )
+        grid = (
+            tokens.restore(x[:, self.special :], self.mask_token[...], restore_ids)
+            + position[None, 1:]
+        )
         x = jnp.concatenate([start, own, grid], axis=1)
         x = self.norm(run_blocks(self.blocks, x, remat=self.remat))[:, self.special :]
         return self.pixels(x, frames)

@@ -59,7 +59,8 @@ class VitConfig:
     output_bias: bool = False
     rotary: bool = False  # Patches turn queries and keys (DINOv3) and have no positions.
     tanh: bool = False  # GELU by tanh.
-    pool: bool = False  # A learned query reads the normed tokens (SigLIP). Its output takes the place of a projection.
+    # A learned query reads the normed tokens (SigLIP). Its output takes the place of a projection.
+    pool: bool = False
 
     @property
     def start(self) -> int:
@@ -92,7 +93,8 @@ class ScaledBlock(Block):
 
     def __init__(self, stack, model, eps, act) -> None:  # type: ignore[no-untyped-def]
         super().__init__(stack, model, eps, act)
-        self.scale1, self.scale2 = LayerScale(stack.width), LayerScale(stack.width)
+        self.scale1 = LayerScale(stack.width)
+        self.scale2 = LayerScale(stack.width)
 
     @lean
     def _after(self, x: Array, heads: Array) -> Array:
@@ -111,7 +113,9 @@ class AttentionPool(nnx.Module):
 
     def __call__(self, x: Array) -> Array:
         """Return (B, 1, D) of tokens (B, S, D)."""
-        probe = jnp.broadcast_to(self.probe[...][None, None], (x.shape[0], 1, x.shape[2])).astype(x.dtype)
+        probe = jnp.broadcast_to(self.probe[...][None, None], (x.shape[0], 1, x.shape[2])).astype(
+            x.dtype
+        )
         heads = self.attention.attend(*self.attention.project(probe, x), causal=False, mask=None)
         y = self.attention.out(heads.reshape(probe.shape))
         return y + self.mlp(self.norm(y))
@@ -123,11 +127,13 @@ class TubePatch(nnx.Module):
     def __init__(self, frames: int, model: ModelConfig, *, bias: bool = True) -> None:
         self.kernel = table(frames, model.patch**2 * 3, model.touch.width)
         self.bias = table(model.touch.width) if bias else None
-        self.patch, self.dtype = model.patch, jnp.dtype(model.dtype)
+        self.patch = model.patch
+        self.dtype = jnp.dtype(model.dtype)
 
     def __call__(self, clip: Array) -> Array:
         """Project (B, T, H, W, 3) to (B, T / frames * N, D), time first."""
-        kernel, cut = self.kernel[...], tokens.patchify(clip, self.patch)
+        kernel = self.kernel[...]
+        cut = tokens.patchify(clip, self.patch)
         matrix = kernel.reshape(-1, kernel.shape[-1])
         tubes = jnp.swapaxes(cut.reshape(*cut.shape[:2], -1, len(matrix)), 1, 2)
         x = product(tubes.reshape(-1, len(matrix)), matrix, self.dtype)
@@ -140,7 +146,9 @@ class Vit(nnx.Module):
 
     def __init__(self, form: VitConfig) -> None:
         model, stack = form.model, form.model.touch
-        width, act, eps = stack.width, partial(jax.nn.gelu, approximate=True) if form.tanh else gelu, model.norm_eps
+        width = stack.width
+        act = partial(jax.nn.gelu, approximate=True) if form.tanh else gelu
+        eps = model.norm_eps
         kind = ScaledBlock if form.layer_scale else Block
         self.form = form
         self.patch = TubePatch(form.tubelet, model, bias=form.patch_bias)
@@ -151,17 +159,22 @@ class Vit(nnx.Module):
         self.periods = table(width // stack.heads // 4) if form.rotary else None
         computed = form.grid is None and not form.rotary
         self.frequency = table(form.axes, -(-width // (2 * form.axes))) if computed else None
-        self.position = table(int(np.prod(form.grid)) + form.class_token, width) if form.grid else None
+        self.position = (
+            table(int(np.prod(form.grid)) + form.class_token, width) if form.grid else None
+        )
         self.calibration = TubePatch(form.calibration, model) if form.calibration else None
         places = int(np.prod(form.grid)) if form.grid and form.calibration else 0
         self.calibration_position = table(places, width) if places else None
         self.pre_norm = LayerNorm(width, eps, model.dtype) if form.pre_norm else None
         self.blocks = stacked_blocks(stack, model, eps, act, kind)
         if form.trunk:
-            stack, eps = stack.__class__(width, form.trunk, stack.heads, stack.mlp), form.trunk_eps
+            stack = stack.__class__(width, form.trunk, stack.heads, stack.mlp)
+            eps = form.trunk_eps
         self.trunk = stacked_blocks(stack, model, eps, act, kind) if form.trunk else None
         self.post_norm = LayerNorm(width, eps, model.dtype)
-        self.projection = Dense(width, form.outputs, model, bias=form.output_bias) if form.outputs else None
+        self.projection = (
+            Dense(width, form.outputs, model, bias=form.output_bias) if form.outputs else None
+        )
         self.pool = AttentionPool(form.model.touch, model, act) if form.pool else None
 
     def __call__(self, clip: Array, sensor: Array, calibration: Array | None = None) -> VitOutput:
@@ -171,16 +184,22 @@ class Vit(nnx.Module):
         """
         form, remat = self.form, self.form.model.remat
         x = self.patch(clip)
-        grid = (clip.shape[1] // form.tubelet, *(side // form.model.patch for side in clip.shape[2:4]))
+        grid = (
+            clip.shape[1] // form.tubelet,
+            *(side // form.model.patch for side in clip.shape[2:4]),
+        )
         position = None if form.rotary else self._positions(grid)
         x = x if position is None else x + position[None, -x.shape[1] :].astype(x.dtype)
-        parts, batch = [], x.shape[0]
+        parts = []
+        batch = x.shape[0]
         if self.class_token is not None:
             first = self.class_token[...]
             first = first if self.position is None or position is None else first + position[0]
             parts.append(jnp.broadcast_to(first[None, None], (batch, 1, x.shape[-1])))
         if self.registers is not None:
-            parts.append(jnp.broadcast_to(self.registers[...][None], (batch, *self.registers[...].shape)))
+            parts.append(
+                jnp.broadcast_to(self.registers[...][None], (batch, *self.registers[...].shape))
+            )
         if self.sensor_tokens is not None:
             parts.append(rows_of(self.sensor_tokens[...], sensor))
         x = jnp.concatenate([*(part.astype(x.dtype) for part in parts), x], axis=1)
@@ -195,7 +214,8 @@ class Vit(nnx.Module):
         encoded = hidden = run_blocks(self.blocks, x, remat=remat, turn=turn)
         if self.trunk is not None:
             hidden = run_blocks(self.trunk, encoded, remat=remat)
-        encoded, hidden = encoded[:, :length], hidden[:, :length]
+        encoded = encoded[:, :length]
+        hidden = hidden[:, :length]
         normed = self.post_norm(hidden)
         last = self.pool or self.projection
         return VitOutput(encoded, hidden, normed, normed if last is None else last(normed))
@@ -205,26 +225,44 @@ class Vit(nnx.Module):
         assert self.periods is not None
         axes = [(np.arange(side, dtype=np.float32) + 0.5) / side * 2 - 1 for side in grid[1:]]
         places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2, 1)
-        return jnp.asarray(2 * np.pi * places / self.periods[...][None, None]).reshape(len(places), -1)
+        return jnp.asarray(2 * np.pi * places / self.periods[...][None, None]).reshape(
+            len(places), -1
+        )
 
     def _positions(self, grid: tuple[int, ...]) -> Array:
         """Return positions of a grid (time, rows, columns), after that of the class token if they are stored."""
-        if self.frequency is not None:  # per axis [sines, cosines] of whole coordinates, cut at the width
-            places = np.stack(np.meshgrid(*map(np.arange, grid), indexing="ij"), axis=-1).reshape(-1, 3)
+        if (
+            self.frequency is not None
+        ):  # per axis [sines, cosines] of whole coordinates, cut at the width
+            places = np.stack(np.meshgrid(*map(np.arange, grid), indexing="ij"), axis=-1).reshape(
+                -1, 3
+            )
             places = places[:, 3 - len(self.frequency[...]) :]
             angle = places[:, :, None].astype(np.float32) * self.frequency[...][None]
-            waves = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(len(places), -1)
+            waves = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(
+                len(places), -1
+            )
             return waves[:, : self.form.model.touch.width]
         assert self.position is not None and self.form.grid is not None
-        stored, (time, rows, columns) = self.position[...], self.form.grid
+        stored = self.position[...]
+        (time, rows, columns) = self.form.grid
         if grid == self.form.grid:
             return stored
         if self.form.resample == "none" or grid[0] != time:
             asked, there = (" x ".join(map(str, sizes)) for sizes in (grid, self.form.grid))
-            raise ValueError(f"the positions are those of {there} patches (time, rows, columns), not {asked}")
-        kernels = [cubic(*sizes, self.form.resample) for sizes in ((rows, grid[1]), (columns, grid[2]))]
+            raise ValueError(
+                f"the positions are those of {there} patches (time, rows, columns), not {asked}"
+            )
+        kernels = [
+            cubic(*sizes, self.form.resample) for sizes in ((rows, grid[1]), (columns, grid[2]))
+        ]
         first, table = jnp.split(stored, [len(stored) - time * rows * columns])
-        table = jnp.einsum("ir,jc,trcd->tijd", *kernels, table.reshape(time, rows, columns, -1), precision="highest")
+        table = jnp.einsum(
+            "ir,jc,trcd->tijd",
+            *kernels,
+            table.reshape(time, rows, columns, -1),
+            precision="highest",
+        )
         return jnp.concatenate([first, table.reshape(-1, table.shape[-1])])
 
 
@@ -233,7 +271,9 @@ def _turned(x: Array, angles: Array) -> Array:
     first, patches = jnp.split(x, [x.shape[1] - len(angles)], axis=1)
     cos, sin = (wave(angles)[None, :, None].astype(x.dtype) for wave in (jnp.cos, jnp.sin))
     one, two = jnp.split(patches, 2, axis=-1)
-    return jnp.concatenate([first, jnp.concatenate([one * cos - two * sin, two * cos + one * sin], axis=-1)], axis=1)
+    return jnp.concatenate(
+        [first, jnp.concatenate([one * cos - two * sin, two * cos + one * sin], axis=-1)], axis=1
+    )
 
 
 def cubic(old: int, new: int, resample: Resample = "bicubic") -> np.ndarray:
@@ -250,7 +290,9 @@ def cubic(old: int, new: int, resample: Resample = "bicubic") -> np.ndarray:
     taps = np.floor(centre).astype(int) + np.arange(-int(2 * zoom) - 1, int(2 * zoom) + 3)
     far = np.abs(centre - taps) / zoom
     weight = np.where(
-        far <= 1, ((a + 2) * far - (a + 3)) * far**2 + 1, np.where(far < 2, a * (((far - 5) * far + 8) * far - 4), 0)
+        far <= 1,
+        ((a + 2) * far - (a + 3)) * far**2 + 1,
+        np.where(far < 2, a * (((far - 5) * far + 8) * far - 4), 0),
     )
     if wide:
         weight = np.where((taps >= 0) & (taps < old), weight, 0)

@@ -9,7 +9,10 @@ from jax import Array
 STATES = 3  # hidden states of the encoder that are read
 HALF = 2  # pixels of the picture for one of the fields, along each axis
 # Typical sizes of the outputs, so that the last layer works with numbers of order one.
-LENGTH, STRESS, FORCE, TORQUE = 0.02, 0.02, 0.01, 0.002
+LENGTH = 0.02
+STRESS = 0.02
+FORCE = 0.01
+TORQUE = 0.002
 
 
 class FieldOutput(NamedTuple):

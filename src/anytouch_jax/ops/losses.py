@@ -39,13 +39,17 @@ def row_sums(x: Array) -> Array:
     if jax.default_backend() != "cpu":
         return jnp.sum(x, axis=-1, keepdims=True)
     rows = x.reshape(math.prod(x.shape[:-1]), x.shape[-1])
-    return jnp.dot(rows, jnp.ones((x.shape[-1], 1), x.dtype), precision="highest").reshape(*x.shape[:-1], 1)
+    return jnp.dot(rows, jnp.ones((x.shape[-1], 1), x.dtype), precision="highest").reshape(
+        *x.shape[:-1], 1
+    )
 
 
 def _equal_shapes(**arrays: Array) -> None:
     """Raise ValueError for arrays of two shapes, which would be broadcast in silence."""
     if len({x.shape for x in arrays.values()}) > 1:
-        raise ValueError(f"{', '.join(f'{name} {x.shape}' for name, x in arrays.items())} must have one shape")
+        raise ValueError(
+            f"{', '.join(f'{name} {x.shape}' for name, x in arrays.items())} must have one shape"
+        )
 
 
 def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
@@ -57,7 +61,8 @@ def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
     (x,) = _wide(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=eps))
     scale = jnp.ldexp(jnp.ones_like(largest), jnp.clip(-jnp.frexp(largest)[1], -126, 126))
-    x, least = x * scale, eps * scale
+    x = x * scale
+    least = eps * scale
     return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=-1, keepdims=True), least * least))
 
 
@@ -79,13 +84,17 @@ def reconstruction_loss(
     may be garbage. Returns the sum and {"reconstruction", "next_frame"}. A batch with nothing hidden has a
     reconstruction loss of 0. Raises ValueError for shapes that do not fit, and for a next frame without another.
     """
-    (pred, target), hidden = _wide(pred, target), jnp.asarray(hidden, bool)
+    (pred, target) = _wide(pred, target)
+    hidden = jnp.asarray(hidden, bool)
     _equal_shapes(pred=pred, target=target)
     if pred.ndim != 4 or hidden.shape != pred.shape[:2] or pred.shape[2] <= next_frame:
         wanted = "(B, N, T, C) with T of 2 or more" if next_frame else "(B, N, T, C)"
-        raise ValueError(f"pred must be {wanted} and hidden (B, N), not {pred.shape} and {hidden.shape}")
+        raise ValueError(
+            f"pred must be {wanted} and hidden (B, N), not {pred.shape} and {hidden.shape}"
+        )
     frames = pred.shape[2] - next_frame
-    counts = hidden[..., None] | (jnp.arange(pred.shape[2]) >= frames)[None, None]  # (B, N, T)
+    # (B, N, T)
+    counts = hidden[..., None] | (jnp.arange(pred.shape[2]) >= frames)[None, None]
     error = jnp.mean(jnp.where(counts[..., None], pred - target, 0.0) ** 2, axis=-1)
     loss = mean(jnp.mean(error[..., :frames], axis=-1), jnp.sum(hidden))
     metrics = {"reconstruction": loss}
@@ -96,7 +105,13 @@ def reconstruction_loss(
 
 
 def info_nce(
-    a: ArrayLike, b: ArrayLike, scale: ArrayLike, present: ArrayLike, *, groups: int = 1, place: ArrayLike | None = None
+    a: ArrayLike,
+    b: ArrayLike,
+    scale: ArrayLike,
+    present: ArrayLike,
+    *,
+    groups: int = 1,
+    place: ArrayLike | None = None,
 ) -> Array:
     """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
 
@@ -106,15 +121,19 @@ def info_nce(
     Rows of one `place` i32 (B,) are no negatives of each other. Raises ValueError for shapes that do not fit, and for
     groups of unequal size.
     """
-    (a, b, scale), present = _wide(a, b, scale), jnp.asarray(present, bool)
+    (a, b, scale) = _wide(a, b, scale)
+    present = jnp.asarray(present, bool)
     _equal_shapes(a=a, b=b)
     if a.ndim != 2 or present.shape != a.shape[:1]:
-        raise ValueError(f"a and b must be (B, E) and present (B,), not {a.shape} and {present.shape}")
+        raise ValueError(
+            f"a and b must be (B, E) and present (B,), not {a.shape} and {present.shape}"
+        )
     rows, width = a.shape
     if groups < 1 or rows % groups:
         raise ValueError(f"{rows} rows cannot be cut into {groups} groups of equal size")
     scale = jnp.minimum(scale, jnp.finfo(scale.dtype).max)
-    scale = scale * jax.lax.stop_gradient(jnp.where(scale > MOST_SCALE, MOST_SCALE / scale, 1.0))  # it can fall again
+    # it can fall again
+    scale = scale * jax.lax.stop_gradient(jnp.where(scale > MOST_SCALE, MOST_SCALE / scale, 1.0))
     present = present.reshape(groups, rows // groups)
     a, b = (jnp.where(present[..., None], x.reshape(*present.shape, width), 0.0) for x in (a, b))
     # The factor is up to 100: the reduced precision that accelerators use by default would show in the loss.
@@ -122,7 +141,9 @@ def info_nce(
     rivals = present[:, None, :]
     if place is not None:
         place = jnp.asarray(place).reshape(present.shape)
-        rivals = rivals & ((place[:, :, None] != place[:, None, :]) | jnp.eye(place.shape[1], dtype=bool)[None])
+        rivals = rivals & (
+            (place[:, :, None] != place[:, None, :]) | jnp.eye(place.shape[1], dtype=bool)[None]
+        )
     logits = jnp.where(rivals, logits, jnp.finfo(logits.dtype).min)
     own = jnp.diagonal(logits, axis1=1, axis2=2)
     loss = jnp.where(present, jax.nn.logsumexp(logits, axis=-1) - own, 0.0)
@@ -135,7 +156,8 @@ def centered(x: ArrayLike, present: ArrayLike) -> Array:
 
     Not in the paper. A vector within 0.001 of the mean stays shorter than 1: such a spread is rounding.
     """
-    (x,), present = _wide(x), jnp.asarray(present, bool)[:, None]
+    (x,) = _wide(x)
+    present = jnp.asarray(present, bool)[:, None]
     x = jnp.where(present, x, 0.0)
     mean = jnp.sum(x, axis=0, keepdims=True) / jnp.maximum(jnp.sum(present).astype(x.dtype), 1)
     return normalise(jnp.where(present, x - mean, 0.0), eps=1e-3)
@@ -165,31 +187,43 @@ def alignment_loss(
     given = {"touch": (touch, None), "vision": (image, has_image), "text": (text, has_text)}
     z = {
         name: (jnp.asarray(x), everyone if has is None else jnp.asarray(has, bool))
-        for name, (x, has) in given.items() if x is not None
-    }  # fmt: skip
+        for name, (x, has) in given.items()
+        if x is not None
+    }
     if center:
         z = {name: (centered(x, has), has) for name, (x, has) in z.items()}
     if len(weights) != 3:
-        raise ValueError(f"weights are three factors, of touch-vision, touch-text and vision-text, not {len(weights)}")
+        raise ValueError(
+            f"weights are three factors, of touch-vision, touch-text and vision-text, not {len(weights)}"
+        )
     scale, *weights = _wide(scale, *weights)
-    total, metrics = jnp.zeros((), _wide(touch)[0].dtype), Metrics()
+    total = jnp.zeros((), _wide(touch)[0].dtype)
+    metrics = Metrics()
     pairs = (("touch", "vision"), ("touch", "text"), ("vision", "text"))
     for (first, second), weight in zip(pairs, weights, strict=True):
         if first not in z or second not in z:
             continue
-        (a, has_a), (b, has_b) = z[first], z[second]
+        (a, has_a) = z[first]
+        (b, has_b) = z[second]
         both = has_a & has_b
         forth = info_nce(a, b, scale, both, groups=groups)
         back = info_nce(b, a, scale, both, groups=groups)
         total = total + weight.astype(forth.dtype) * (forth + back)
         metrics |= {
-            f"{first}_to_{second}": forth, f"{second}_to_{first}": back, f"{first}_{second}_pairs": jnp.sum(both),
-        }  # fmt: skip
+            f"{first}_to_{second}": forth,
+            f"{second}_to_{first}": back,
+            f"{first}_{second}_pairs": jnp.sum(both),
+        }
     return total, metrics
 
 
 def contrast_loss(
-    first: ArrayLike, second: ArrayLike, scale: ArrayLike, *, groups: int = 1, place: ArrayLike | None = None
+    first: ArrayLike,
+    second: ArrayLike,
+    scale: ArrayLike,
+    *,
+    groups: int = 1,
+    place: ArrayLike | None = None,
 ) -> tuple[Array, Array]:
     """InfoNCE matching between the two unit-norm touches (B, E) of each pair. Not in the paper.
 
@@ -202,7 +236,8 @@ def contrast_loss(
     forth = info_nce(first, second, scale, everyone, groups=groups, place=place)
     back = info_nce(second, first, scale, everyone, groups=groups, place=place)
     place = jnp.arange(len(first)) if place is None else jnp.asarray(place)
-    nearest = jnp.argmax(first @ second.T, axis=1) if len(first) else place  # there is no largest of nothing
+    # there is no largest of nothing
+    nearest = jnp.argmax(first @ second.T, axis=1) if len(first) else place
     return (forth + back) / 2, mean((place[nearest] == place).astype(jnp.float32))
 
 

@@ -19,7 +19,8 @@ def patchify(clip: ArrayLike, patch: int) -> Array:
     b, t, h, w, c = _shape(clip := jnp.asarray(clip), "a clip", "B T H W C")
     if patch < 1 or h % patch or w % patch:
         raise ValueError(f"a {h} x {w} image cannot be cut into patches of {patch} pixels")
-    rows, columns = h // patch, w // patch
+    rows = h // patch
+    columns = w // patch
     grid = clip.reshape(b, t, rows, patch, columns, patch, c)
     return grid.transpose(0, 2, 4, 1, 3, 5, 6).reshape(b, rows * columns, t, patch * patch * c)
 
@@ -32,8 +33,11 @@ def unpatchify(patches: ArrayLike, patch: int, height: int) -> Array:
     b, n, t, size = _shape(patches := jnp.asarray(patches), "patches", "B N T P*P*C")
     rows = 0 if patch < 1 or height % patch else height // patch
     if rows < 1 or n % rows or size % patch**2:
-        raise ValueError(f"{n} patches of {size} values and {patch} pixels do not make images of height {height}")
-    columns, colours = n // rows, size // patch**2
+        raise ValueError(
+            f"{n} patches of {size} values and {patch} pixels do not make images of height {height}"
+        )
+    columns = n // rows
+    colours = size // patch**2
     grid = patches.reshape(b, rows, columns, t, patch, patch, colours)
     return grid.transpose(0, 3, 1, 4, 2, 5, 6).reshape(b, t, height, columns * patch, colours)
 
@@ -57,7 +61,8 @@ def sincos_table(width: int, grid: int) -> Array:
         )
     frequency = 10000.0 ** (-jnp.arange(width // 4) / (width // 4))
     angle = jnp.arange(grid, dtype=frequency.dtype)[:, None] * frequency[None, :]
-    axis = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=1)  # (grid, width / 2)
+    # (grid, width / 2)
+    axis = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=1)
     cols = jnp.tile(axis, (grid, 1))
     rows = jnp.repeat(axis, grid, axis=0)
     table = jnp.concatenate([cols, rows], axis=1)
@@ -89,7 +94,9 @@ def universal_probability(progress: ArrayLike, start: float, end: float) -> Arra
     return start + (end - start) * jnp.clip(jnp.asarray(progress, float), 0, 1)
 
 
-def draw_tokens(sensor: ArrayLike, uniform: ArrayLike, probability: ArrayLike, universal_row: int) -> Array:
+def draw_tokens(
+    sensor: ArrayLike, uniform: ArrayLike, probability: ArrayLike, universal_row: int
+) -> Array:
     """Replace a sensor's row by the universal one where `uniform` < p_u: i ~ Bernoulli(p_u) (Eq. 7).
 
     `sensor` i32 (B,), `uniform` (B,) in [0, 1). Returns rows i32 (B,) of the sensor-token table.
@@ -104,7 +111,9 @@ def count_visible(positions: int, ratio: float) -> int:
     Raises ValueError for a negative number, and for a ratio outside 0 to 1.
     """
     if positions < 0 or not 0 <= ratio <= 1:
-        raise ValueError(f"a share between 0 and 1 of 0 or more positions stays visible, not {ratio} of {positions}")
+        raise ValueError(
+            f"a share between 0 and 1 of 0 or more positions stays visible, not {ratio} of {positions}"
+        )
     return int(positions * ratio)
 
 
@@ -125,7 +134,8 @@ def random_mask(noise: ArrayLike, keep: int) -> tuple[Array, Array, Array]:
 
 def keep(x: ArrayLike, keep_ids: ArrayLike) -> Array:
     """Return the positions `keep_ids` i32 (B, K) of `x` (B, N, ...), as (B, K, ...) (He et al., 2022)."""
-    x, keep_ids = jnp.asarray(x), jnp.asarray(keep_ids)
+    x = jnp.asarray(x)
+    keep_ids = jnp.asarray(keep_ids)
     ids = keep_ids.reshape(keep_ids.shape + (1,) * (x.ndim - 2))
     return jnp.take_along_axis(x, ids, axis=1)
 
@@ -140,4 +150,6 @@ def restore(visible: ArrayLike, mask_token: ArrayLike, restore_ids: ArrayLike) -
     if missing < 0:
         raise ValueError(f"{count} visible positions do not fit into {restore_ids.shape[1]}")
     hidden = jnp.broadcast_to(jnp.asarray(mask_token, visible.dtype), (batch, missing, width))
-    return jnp.take_along_axis(jnp.concatenate([visible, hidden], axis=1), restore_ids[..., None], axis=1)
+    return jnp.take_along_axis(
+        jnp.concatenate([visible, hidden], axis=1), restore_ids[..., None], axis=1
+    )

@@ -30,28 +30,38 @@ from anytouch_jax.sim.sensing import photo
 from anytouch_jax.sim.sensing.own import find_sensor
 from anytouch_jax.sim.world import objects
 
-MANIFEST, SETTINGS, PARTS = "manifest.parquet", "dataset.json", "parts"
+MANIFEST = "manifest.parquet"
+SETTINGS = "dataset.json"
+PARTS = "parts"
 GROUP = 8  # touches in a part
 VERSION = 7  # a change of the simulator that changes the data of a seed raises it
 Row = dict[str, Any]
 
 
 def simulate(
-    scenes: Scenes, out: str | Path, *, threads: int = 2, progress: Callable[[int, int], None] = lambda done, of: None
+    scenes: Scenes,
+    out: str | Path,
+    *,
+    threads: int = 2,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Path:
     """Simulate `scenes` into the folder `out`, or continue there, and return the manifest's path.
 
     A seed gives the same bytes on the same machine. Raises UserError if `out` has other contents or cannot be written.
     """
-    out = Path(out).expanduser().resolve()  # pyarrow reads a leading ~ and a colon in its own way
+    # pyarrow reads a leading ~ and a colon in its own way
+    out = Path(out).expanduser().resolve()
     if threads < 1:
         raise UserError(f"threads must be at least 1, not {threads}")
-    things, splits = scene.objects_and_splits(scenes)  # may fail, so it comes before the folder is made
+    # may fail, so it comes before the folder is made
+    things, splits = scene.objects_and_splits(scenes)
     try:
         _claim(scenes, out)
         with lock(out / SETTINGS) as free:
             if not free:
-                raise UserError(f"another process simulates into {out}: wait for it, or give another folder")
+                raise UserError(
+                    f"another process simulates into {out}: wait for it, or give another folder"
+                )
             return _simulate(scenes, things, splits, out, threads, progress)
     except (FileExistsError, NotADirectoryError) as error:
         raise UserError(f"{error.filename or out} is a file; give a folder") from None
@@ -62,11 +72,17 @@ def simulate(
 
 
 def _simulate(
-    scenes: Scenes, things: Any, splits: Sequence[str], out: Path, threads: int, progress: Callable[[int, int], None]
+    scenes: Scenes,
+    things: Any,
+    splits: Sequence[str],
+    out: Path,
+    threads: int,
+    progress: Callable[[int, int], None],
 ) -> Path:
     target = out / MANIFEST
     if target.exists():
-        shutil.rmtree(out / PARTS, ignore_errors=True)  # left by a kill after the rename
+        # left by a kill after the rename
+        shutil.rmtree(out / PARTS, ignore_errors=True)
         return target
     (out / PARTS).mkdir(parents=True, exist_ok=True)
     end = scenes.first + scenes.touches
@@ -82,10 +98,17 @@ def _simulate(
             if file in finished:
                 continue
             touches = [scene.draw_touch(scenes, number, splits) for number in group]
-            by_sensor = [[scene.draw_recording(scenes, touch, name) for touch in touches] for name in scenes.sensors]
+            by_sensor = [
+                [scene.draw_recording(scenes, touch, name) for touch in touches]
+                for name in scenes.sensors
+            ]
             futures = [
-                pool.submit(_write_recording, scenes, things[recording.touch.object], recording, take, out)
-                for recordings, takes in zip(by_sensor, solving.map(recorder.record, by_sensor), strict=True)
+                pool.submit(
+                    _write_recording, scenes, things[recording.touch.object], recording, take, out
+                )
+                for recordings, takes in zip(
+                    by_sensor, solving.map(recorder.record, by_sensor), strict=True
+                )
                 for recording, take in zip(recordings, takes, strict=True)
             ]
             _write_table([row for future in futures for row in future.result()], file)
@@ -101,17 +124,22 @@ def _simulate(
 def _claim(scenes: Scenes, out: Path) -> None:
     """Write the settings into the folder, or check that they equal those of the folder."""
     settings = {"version": VERSION} | dataclasses.asdict(scenes)
-    for name, default in (("units", "each"), ("first", 0)):  # data sets from before these settings continue
+    # data sets from before these settings continue
+    for name, default in (("units", "each"), ("first", 0)):
         if settings[name] == default:
             del settings[name]
-    text, file = json.dumps(settings, indent=2) + "\n", out / SETTINGS
+    text = json.dumps(settings, indent=2) + "\n"
+    file = out / SETTINGS
     if file.exists():
-        old, new = _read_settings(file), json.loads(text)
+        old = _read_settings(file)
+        new = json.loads(text)
         pairs = {name: (old.get(name), new.get(name)) for name in (*new, *old)}
         changes = [f"{name} {a!r}, not {b!r}" for name, (a, b) in pairs.items() if a != b]
         if not changes:
             return
-        raise UserError(f"{out} holds a data set with {'; '.join(changes)}: give another folder, or the same options")
+        raise UserError(
+            f"{out} holds a data set with {'; '.join(changes)}: give another folder, or the same options"
+        )
     if out.is_dir() and any(path.name != f"{SETTINGS}.tmp" for path in out.iterdir()):
         raise UserError(f"{out} is not empty and holds no simulated data set: give another folder")
     out.mkdir(parents=True, exist_ok=True)
@@ -125,7 +153,9 @@ def _read_settings(file: Path) -> dict[str, Any]:
     except ValueError:
         settings = None
     if not isinstance(settings, dict) or "version" not in settings:
-        raise UserError(f"{file} does not hold the settings of a simulated data set: give another folder")
+        raise UserError(
+            f"{file} does not hold the settings of a simulated data set: give another folder"
+        )
     return settings
 
 
@@ -133,8 +163,10 @@ def _write_recording(
     scenes: Scenes, thing: objects.Object, recording: Recording, take: ClipOutput, out: Path
 ) -> list[Row]:
     """Write the files of one recording. Returns the rows of its frames and of its background."""
-    touch, sensor = recording.touch, find_sensor(recording.sensor)
-    kind, name = sensor.kind, f"{touch.number:06d}-{sensor.name}"
+    touch = recording.touch
+    sensor = find_sensor(recording.sensor)
+    kind = sensor.kind
+    name = f"{touch.number:06d}-{sensor.name}"
     common = _common_row(scenes, thing, recording, sensor.name) | {"sequence": name}
     folder = Path(sensor.name) / f"{touch.number:06d}"
     (out / folder).mkdir(parents=True, exist_ok=True)
@@ -145,7 +177,9 @@ def _write_recording(
         image = photo.photograph(thing, touch.place, rng, scenes.size or 224)
         _write_image(out / photograph, image)
     if recording.has_text:
-        caption = objects.caption(thing, np.random.default_rng([scenes.seed, scene.CAPTION, recording.seed]))
+        caption = objects.caption(
+            thing, np.random.default_rng([scenes.seed, scene.CAPTION, recording.seed])
+        )
     background = None if kind == "field" else folder / "background.jpg"
     common |= {"image_path": photograph and photograph.as_posix(), "text": caption}
     common["background_path"] = background and background.as_posix()
@@ -162,13 +196,20 @@ def _write_recording(
         rows.append(
             common
             | {"path": path.as_posix(), "frame_index": t, "field_path": field and field.as_posix()}
-            | {f"label.{name}": float(np.float32(values[t])) for name, values in take.labels.items()}
-            | ({} if recording.depth[t] > 0 else {"touch": None})  # no place is touched in this frame
+            | {
+                f"label.{name}": float(np.float32(values[t]))
+                for name, values in take.labels.items()
+            }
+            | (
+                {} if recording.depth[t] > 0 else {"touch": None}
+            )  # no place is touched in this frame
         )
     if background is not None:
         _write_image(out / background, take.background, int(recording.unit.quality))
         lock = {"path": background.as_posix(), "sequence": f"{name}-background", "frame_index": 0}
-        rows.append(common | lock | {"split": "background", "touch": None, "text": None, "image_path": None})
+        rows.append(
+            common | lock | {"split": "background", "touch": None, "text": None, "image_path": None}
+        )
     return rows
 
 
@@ -176,19 +217,30 @@ def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording, sen
     """Return the columns that all frames of a recording share."""
     touch = recording.touch
     return {
-        "sensor": sensor, "split": touch.split, "dataset": f"simulated-{scenes.grade}",
+        "sensor": sensor,
+        "split": touch.split,
+        "dataset": f"simulated-{scenes.grade}",
         "unit": f"{sensor}-{f'{touch.split}-{touch.number:06d}' if scenes.units == 'each' else scenes.seed}",
-        "stride": 1, "touch": f"{touch.number:06d}", "object": thing.name, "license": "CC0-1.0", "commercial": True,
-        "grade": scenes.grade, "label.object": thing.name, "label.material": thing.material.name,
-        "label.hardness": objects.hardness_of(thing), "label.roughness": objects.roughness_of(thing),
-        "label.indenter": thing.shape.primitive, "label.texture": thing.shape.texture,
-    } | scene.directions(recording)  # fmt: skip
+        "stride": 1,
+        "touch": f"{touch.number:06d}",
+        "object": thing.name,
+        "license": "CC0-1.0",
+        "commercial": True,
+        "grade": scenes.grade,
+        "label.object": thing.name,
+        "label.material": thing.material.name,
+        "label.hardness": objects.hardness_of(thing),
+        "label.roughness": objects.roughness_of(thing),
+        "label.indenter": thing.shape.primitive,
+        "label.texture": thing.shape.texture,
+    } | scene.directions(recording)
 
 
 def _write_table(rows: list[Row], file: Path) -> None:
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: [row.get(name) for row in rows] for name in names})
-    os.sync()  # the files that the table lists: once a part is cheaper than once an image
+    # the files that the table lists: once a part is cheaper than once an image
+    os.sync()
     with atomic_path(file, part=file.with_suffix(".tmp")) as part:
         pq.write_table(table, part)
 

@@ -24,19 +24,26 @@ class Draws:
 
     def __init__(self, key: jax.Array, most: int = 64) -> None:
         uniform, normal = jax.random.split(key)
-        self._block = {"uniform": jax.random.uniform(uniform, (most,)), "normal": jax.random.normal(normal, (most,))}
+        self._block = {
+            "uniform": jax.random.uniform(uniform, (most,)),
+            "normal": jax.random.normal(normal, (most,)),
+        }
         self._used = dict.fromkeys(self._block, 0)
 
     def _take(self, kind: str, shape: tuple[int, ...]) -> jax.Array:
-        first, count = self._used[kind], math.prod(shape)
+        first = self._used[kind]
+        count = math.prod(shape)
         self._used[kind] += count
         if first + count > len(self._block[kind]):
-            raise ValueError(f"more than {len(self._block[kind])} {kind} values; ask for a larger block")
+            raise ValueError(
+                f"more than {len(self._block[kind])} {kind} values; ask for a larger block"
+            )
         return self._block[kind][first : first + count].reshape(shape)
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> jax.Array:
         """Return uniform values in low..high."""
-        low, high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
+        low = jnp.asarray(low, jnp.float32)
+        high = jnp.asarray(high, jnp.float32)
         shape = np.broadcast_shapes(low.shape, high.shape) if size is None else _shape(size)
         return low + (high - low) * self._take("uniform", shape)
 
@@ -68,7 +75,9 @@ class Draws:
 
 
 def _shape(size: Any) -> tuple[int, ...]:
-    return (size,) if isinstance(size, int) else tuple(size)
+    if isinstance(size, int):
+        return (size,)
+    return tuple(size)
 
 
 @lru_cache(maxsize=4)
@@ -84,11 +93,15 @@ Rng = np.random.Generator | Draws
 
 def namespace_of(rng: Rng) -> ModuleType:
     """Return the array library of the draws, numpy or jax.numpy."""
-    return jnp if isinstance(rng, Draws) else np
+    if isinstance(rng, Draws):
+        return jnp
+    return np
 
 
 def either(rng: Rng, condition: Any, draw: Callable[[], Any], otherwise: Any) -> Any:
     """Return `draw()` if the condition holds. numpy draws only then, and JAX always."""
     if isinstance(rng, Draws):
         return jnp.where(condition, draw(), otherwise)
-    return draw() if condition else otherwise
+    if condition:
+        return draw()
+    return otherwise

@@ -23,11 +23,35 @@ from jax import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel
 from anytouch_jax.sim.draws import Draws
-from anytouch_jax.sim.recorder import RELIEF, SPACING, ClipInput, ClipOutput, View, simulate_clip, stack_trees
-from anytouch_jax.sim.scene import Scenes, draw_by_hand, draw_gesture, draw_place, moved, objects_and_splits
+from anytouch_jax.sim.recorder import (
+    RELIEF,
+    SPACING,
+    ClipInput,
+    ClipOutput,
+    View,
+    simulate_clip,
+    stack_trees,
+)
+from anytouch_jax.sim.scene import (
+    Scenes,
+    draw_by_hand,
+    draw_gesture,
+    draw_place,
+    moved,
+    objects_and_splits,
+)
 from anytouch_jax.sim.sensing.optics import Photometry
 from anytouch_jax.sim.sensing.own import find_sensor
-from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Sensor, bases, draw_drift, draw_unit, look
+from anytouch_jax.sim.sensing.sensors import (
+    MOST_BASES,
+    SENSORS,
+    Markers,
+    Sensor,
+    bases,
+    draw_drift,
+    draw_unit,
+    look,
+)
 from anytouch_jax.sim.world import shapes
 from anytouch_jax.sim.world.objects import Object, draw_object
 
@@ -57,7 +81,8 @@ class World(NamedTuple):
     relief: Any  # f16 (n, RELIEF, RELIEF) mm
     material: Any  # f32 (n, 2) modulus kPa, friction
     families: SensorFamily  # stacked over the sensors
-    gels: Any  # f32 (sensors, MOST_BASES, 40, 40, 3) untouched gels in 0..1, black where there are fewer
+    # f32 (sensors, MOST_BASES, 40, 40, 3) untouched gels in 0..1, black where there are fewer
+    gels: Any
     places: Any  # f32 (n, P, 2) mm, places of each object of which there is a photograph
 
 
@@ -114,10 +139,23 @@ def family(sensor: Sensor) -> SensorFamily:
     """Return the numbers of a camera sensor. Raises UserError for a field sensor."""
     photometry = look(sensor)
     markers = sensor.markers or Markers(pitch=2.0, radius=0.3, share=0.0)
-    shade = (sensor.skin, sensor.contrast, sensor.vignette, sensor.halo, sensor.noise, sensor.spread)
+    shade = (
+        sensor.skin,
+        sensor.contrast,
+        sensor.vignette,
+        sensor.halo,
+        sensor.noise,
+        sensor.spread,
+    )
     lattice = (markers.pitch, markers.radius, markers.aspect, markers.share, markers.bend)
     widest = np.minimum(photometry.widest, 1e3)
-    numbers = (sensor.field, (sensor.gel.modulus, sensor.gel.thickness), shade, lattice, markers.ink)
+    numbers = (
+        sensor.field,
+        (sensor.gel.modulus, sensor.gel.thickness),
+        shade,
+        lattice,
+        markers.ink,
+    )
     field, gel, shades, dots, ink = (np.asarray(x, np.float32) for x in numbers)
     light = jax.tree.map(lambda x: np.asarray(x, np.float32), photometry._replace(widest=widest))
     return SensorFamily(field, gel, shades, dots, ink, light)
@@ -139,9 +177,19 @@ def as_sensor(numbers: SensorFamily) -> Sensor:
     gel = Gel(modulus=numbers.gel[0], poisson=0.48, thickness=numbers.gel[1])
     markers = Markers(pitch, radius, aspect, share, tuple(numbers.ink), bend)
     return Sensor(
-        "family", (numbers.field[0], numbers.field[1]), (0, 0), gel, markers, "image", skin, contrast, vignette, halo,
-        noise, spread=spread,
-    )  # fmt: skip
+        "family",
+        (numbers.field[0], numbers.field[1]),
+        (0, 0),
+        gel,
+        markers,
+        "image",
+        skin,
+        contrast,
+        vignette,
+        halo,
+        noise,
+        spread=spread,
+    )
 
 
 def objects_of(
@@ -154,23 +202,46 @@ def objects_of(
     things, splits = objects_and_splits(scenes)
     own = [thing for thing, name in zip(things, splits, strict=True) if name == split]
     if not own:
-        raise UserError(f"no object of {len(things)} is in split {split}; draw more objects, or hold out more")
-    return (*own, *(
-        draw_object(thing.shape.primitive, thing.shape.texture, thing.material.name, thing.seed ^ (number << 20))
-        for number in range(1, variants) for thing in own
-    ))  # fmt: skip
+        raise UserError(
+            f"no object of {len(things)} is in split {split}; draw more objects, or hold out more"
+        )
+    return (
+        *own,
+        *(
+            draw_object(
+                thing.shape.primitive,
+                thing.shape.texture,
+                thing.material.name,
+                thing.seed ^ (number << 20),
+            )
+            for number in range(1, variants)
+            for thing in own
+        ),
+    )
 
 
-def make_world(things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, places: int = 1, seed: int = 0) -> World:
+def make_world(
+    things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, places: int = 1, seed: int = 0
+) -> World:
     """Return the world of these objects and sensors, as numpy arrays. `places` of each object can be photographed."""
-    reliefs = over_cores(partial(shapes.relief, pixels=RELIEF, pitch=SPACING), [thing.shape for thing in things])
+    reliefs = over_cores(
+        partial(shapes.relief, pixels=RELIEF, pitch=SPACING), [thing.shape for thing in things]
+    )
     relief = np.stack([np.asarray(one, np.float16) for one in reliefs])
-    material = np.array([(thing.material.modulus, thing.material.friction) for thing in things], np.float32)
+    material = np.array(
+        [(thing.material.modulus, thing.material.friction) for thing in things], np.float32
+    )
     rng = np.random.default_rng([seed, _PLACES])
-    spots = np.stack([[draw_place(rng)[0] for _ in range(places)] for _ in things]).astype(np.float32)
+    spots = np.stack([[draw_place(rng)[0] for _ in range(places)] for _ in things]).astype(
+        np.float32
+    )
     kinds = [find_sensor(name) for name in sensors]
     return World(
-        relief, material, stack_trees([family(one) for one in kinds]), np.stack([*map(untouched, kinds)]), spots
+        relief,
+        material,
+        stack_trees([family(one) for one in kinds]),
+        np.stack([*map(untouched, kinds)]),
+        spots,
     )
 
 
@@ -192,14 +263,23 @@ def sample_touches(
 
 def simulate_drawn(drawn: DrawnTouches, sampling: Sampling) -> SimulatedTouches:
     """Return what `sample_touches` returns of drawn touches."""
-    out = jax.vmap(jax.vmap(partial(_simulate_take, sampling=sampling)))(drawn.clip, drawn.numbers, drawn.pitch)
+    out = jax.vmap(jax.vmap(partial(_simulate_take, sampling=sampling)))(
+        drawn.clip, drawn.numbers, drawn.pitch
+    )
     field = drawn.numbers.field
     fields = None if out.field is None else out.field[:, :, -1]
     return SimulatedTouches(
-        out.image, out.background, drawn.sensor, drawn.object, drawn.photo, fields,
-        field[..., 1] * drawn.clip.unit.zoom, jnp.log(field[..., 0] / field[..., 1]), drawn.numbers.gel[..., 0],
+        out.image,
+        out.background,
+        drawn.sensor,
+        drawn.object,
+        drawn.photo,
+        fields,
+        field[..., 1] * drawn.clip.unit.zoom,
+        jnp.log(field[..., 0] / field[..., 1]),
+        drawn.numbers.gel[..., 0],
         out.labels,
-    )  # fmt: skip
+    )
 
 
 def draw_touches(
@@ -210,11 +290,19 @@ def draw_touches(
     return jax.vmap(partial(_draw, world=world, sampling=sampling, gallery=gallery))(keys)
 
 
-def _simulate_take(clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling: Sampling) -> ClipOutput:
+def _simulate_take(
+    clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling: Sampling
+) -> ClipOutput:
     """Return the simulated clip of one take by a sensor of these numbers, on a grid of `pitch` mm."""
     side = (sampling.field_size, sampling.field_size)
     view = View((GRID, GRID), pitch, (sampling.size, sampling.size), numbers.photometry, True, side)
-    return simulate_clip(clip, sensor=as_sensor(numbers), fidelity=sampling.fidelity, fields=sampling.fields, view=view)
+    return simulate_clip(
+        clip,
+        sensor=as_sensor(numbers),
+        fidelity=sampling.fidelity,
+        fields=sampling.fields,
+        view=view,
+    )
 
 
 def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -> DrawnTouches:
@@ -233,18 +321,22 @@ def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -
     relief = world.relief[thing]
 
     def take(key: Array, number: Array) -> tuple[Array, ClipInput, SensorFamily, Array]:
-        rng, families = Draws(key, 2048), len(world.gels)  # blotches are 1,600 values
+        # blotches are 1,600 values
+        rng = Draws(key, 2048)
+        families = len(world.gels)
         sensor = rng.integers(families)
         if gallery is not None:
             sensor = jnp.where(number == 1, gallery, sensor)
-        own_gels, numbers = sensor, jax.tree.map(lambda x: x[sensor], world.families)
+        own_gels = sensor
+        numbers = jax.tree.map(lambda x: x[sensor], world.families)
         if sampling.wild:
             is_wild = rng.uniform() < sampling.wild
             other = jax.tree.map(lambda x: x[rng.integers(families)], world.families)
             numbers = jax.tree.map(partial(jnp.where, is_wild), wild(numbers, other, rng), numbers)
             sensor = jnp.where(is_wild, families, sensor)
         pitch = jnp.max(numbers.field) / GRID
-        whole = numbers.shade[5] < 1  # one device, which is not cropped or upside down
+        # one device, which is not cropped or upside down
+        whole = numbers.shade[5] < 1
         numbers = numbers._replace(field=numbers.field * jnp.where(whole, 1.0, _cropped(rng)))
         unit = draw_unit(as_sensor(numbers), rng, world.gels, own_gels)
         down = jnp.where(whole, 1.0, rng.choice([-1.0, 1.0]))
@@ -253,14 +345,26 @@ def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -
         straight = (gesture, yaw, jnp.zeros(2), jnp.zeros(2))
         own, turn, offset, tilt = jax.tree.map(partial(jnp.where, by_hand), hand, straight)
         shown = own.shown * (steps / CLIP_OF if steps else rng.uniform(-0.5, 0.5) * 2)
-        times = own.middle + (shown * jnp.linspace(-0.5, 0.5, steps + 1) if steps else shown[None] / 2)
+        times = own.middle + (
+            shown * jnp.linspace(-0.5, 0.5, steps + 1) if steps else shown[None] / 2
+        )
         motion, depth = moved(own, times, 0.04, jnp)
-        depth = jnp.where(jnp.max(depth) < LEAST_DEPTH, own.depth, depth)  # something is touched
+        # something is touched
+        depth = jnp.where(jnp.max(depth) < LEAST_DEPTH, own.depth, depth)
         depth = jnp.where(rng.uniform() < sampling.free, -1.0, depth)
         clip = ClipInput(
-            relief, place, jnp.stack([*offset, turn]), motion, depth, tilt, world.material[thing, 0],
-            world.material[thing, 1], unit, draw_drift(sampling.frames, rng), rng.integers(2**23).astype(jnp.uint32),
-        )  # fmt: skip
+            relief,
+            place,
+            jnp.stack([*offset, turn]),
+            motion,
+            depth,
+            tilt,
+            world.material[thing, 0],
+            world.material[thing, 1],
+            unit,
+            draw_drift(sampling.frames, rng),
+            rng.integers(2**23).astype(jnp.uint32),
+        )
         return sensor, clip, numbers, pitch
 
     number = jnp.arange(sampling.takes)
@@ -272,19 +376,25 @@ def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -
 def _cropped(rng: Draws) -> Array:
     """Return the share (2,) of the field's height and width that is shown: a camera may cut one side."""
     share = jnp.where(rng.uniform() < 0.5, rng.uniform(0.7, 1.0), 1.0)
-    return jnp.where(rng.uniform() < 0.5, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])) * (share - 1) + 1
+    return (
+        jnp.where(rng.uniform() < 0.5, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])) * (share - 1)
+        + 1
+    )
 
 
 def wild(one: SensorFamily, other: SensorFamily, rng: Draws) -> SensorFamily:
     """Return a family between two, with lights of other colours, and dots of another size, distance and ink."""
     share = rng.uniform()
     mixed: SensorFamily = jax.tree.map(lambda a, b: share * a + (1 - share) * b, one, other)
-    turn = jnp.asarray(_ORDERS)[rng.integers(len(_ORDERS))] * rng.choice(
-        [-1.0, 1.0]
-    )  # lights that change places, or a side
-    photometry = mixed.photometry._replace(normal=mixed.photometry.normal @ turn, halo=mixed.photometry.halo @ turn)
+    # lights that change places, or a side
+    turn = jnp.asarray(_ORDERS)[rng.integers(len(_ORDERS))] * rng.choice([-1.0, 1.0])
+    photometry = mixed.photometry._replace(
+        normal=mixed.photometry.normal @ turn, halo=mixed.photometry.halo @ turn
+    )
     pitch = rng.uniform(0.9, 2.6)
     radius = pitch * rng.uniform(0.08, 0.28)
-    markers = jnp.stack([pitch, radius, rng.uniform(0.7, 1.6), rng.uniform(0.2, 0.9), rng.uniform(0.0, 0.15)])
+    markers = jnp.stack(
+        [pitch, radius, rng.uniform(0.7, 1.6), rng.uniform(0.2, 0.9), rng.uniform(0.0, 0.15)]
+    )
     ink = rng.choice([0.1, 0.1, 0.9]) + rng.uniform(-0.1, 0.1, (3,))
     return mixed._replace(photometry=photometry, markers=markers, ink=ink)

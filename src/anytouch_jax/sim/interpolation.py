@@ -20,9 +20,12 @@ def spline(positions: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     knots = jnp.arange(-2.0, count + 2.0)
     d = positions[:, None] - knots[None, :]
     a = jnp.abs(d)
-    near, far = a < 1, a < 2
+    near = a < 1
+    far = a < 2
     value = jnp.where(near, 2 / 3 - a**2 + a**3 / 2, jnp.where(far, (2 - a) ** 3 / 6, 0.0))
-    slope = jnp.sign(d) * jnp.where(near, -2 * a + 1.5 * a**2, jnp.where(far, -((2 - a) ** 2) / 2, 0.0))
+    slope = jnp.sign(d) * jnp.where(
+        near, -2 * a + 1.5 * a**2, jnp.where(far, -((2 - a) ** 2) / 2, 0.0)
+    )
     return _fold(value), _fold(slope)
 
 
@@ -42,7 +45,9 @@ def blur(count: int, sigma: float | jax.Array) -> jax.Array:
 def average(count: int, cells: int) -> npt.NDArray[np.float32]:
     """Return the means (cells, count) over `cells` equal parts of `count` samples. Samples on a border are divided."""
     left = np.arange(cells)[:, None] * count / cells
-    overlap = np.minimum(left + count / cells, np.arange(count) + 1) - np.maximum(left, np.arange(count))
+    overlap = np.minimum(left + count / cells, np.arange(count) + 1) - np.maximum(
+        left, np.arange(count)
+    )
     return np.asarray(np.maximum(overlap, 0) * cells / count, np.float32)
 
 
@@ -55,14 +60,18 @@ def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.A
     rows, columns = raster.shape
     dtype = jnp.promote_types(raster.dtype, jnp.float32)
     place = (jnp.asarray(y) / pitch + (rows - 1) / 2, jnp.asarray(x) / pitch + (columns - 1) / 2)
-    index, weights, inside = [], [], jnp.ones(place[0].shape, bool)
+    index = []
+    weights = []
+    inside = jnp.ones(place[0].shape, bool)
     for at, count in zip(place, (rows, columns), strict=True):
         slack = 1e-3  # rounding must not move a place on the border outside
         inside = inside & (at >= -slack) & (at <= count - 1 + slack)
         at = jnp.clip(jnp.nan_to_num(at), 0, count - 1)
         first = jnp.floor(at)
-        f = (at - first).astype(dtype)  # Catmull-Rom weights of the four neighbours, exactly 0, 1, 0, 0 at 0
-        outer, inner = ((-0.5 * f + 1.0) * f - 0.5) * f, (1.5 * f - 2.5) * f * f + 1.0
+        # Catmull-Rom weights of the four neighbours, exactly 0, 1, 0, 0 at 0
+        f = (at - first).astype(dtype)
+        outer = ((-0.5 * f + 1.0) * f - 0.5) * f
+        inner = (1.5 * f - 2.5) * f * f + 1.0
         weights.append((outer, inner, ((-1.5 * f + 2.0) * f + 0.5) * f, (0.5 * f - 0.5) * f * f))
         index.append([jnp.clip(first.astype(jnp.int32) + i, 0, count - 1) for i in (-1, 0, 1, 2)])
     flat = jnp.asarray(raster).reshape(-1)

@@ -23,12 +23,18 @@ from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
 
 Array = np.ndarray
 Grade = Literal["fine", "coarse"]
-MOTIONS = ("hold", "slide", "slide", "twist", "twist")  # a gesture has the number of one, each as likely
+# a gesture has the number of one, each as likely
+MOTIONS = ("hold", "slide", "slide", "twist", "twist")
 
 FIELDS = ("displacement", "pressure", "shear")
 _MAX_SIZE = 4096  # pixels of a side
 # Tags that separate the random streams of a seed.
-_OBJECTS, _TOUCH, _RECORDING, PHOTO, CAPTION, _UNIT = 1, 2, 3, 4, 5, 6
+_OBJECTS = 1
+_TOUCH = 2
+_RECORDING = 3
+PHOTO = 4
+CAPTION = 5
+_UNIT = 6
 
 
 @dataclass(frozen=True)
@@ -64,7 +70,9 @@ class Scenes:
     def __post_init__(self) -> None:
         for name in self.fields:
             if name not in FIELDS:
-                raise UserError(f"there is no simulated field {name!r}; choose among {', '.join(FIELDS)}")
+                raise UserError(
+                    f"there is no simulated field {name!r}; choose among {', '.join(FIELDS)}"
+                )
         kinds = [find_sensor(name) for name in self.sensors]
         for what, names in (("sensor", [one.name for one in kinds]), ("field", self.fields)):
             if len(set(names)) != len(names):
@@ -73,16 +81,24 @@ class Scenes:
             raise UserError("name at least one sensor")
         check(self)
         if self.size and not 16 <= self.size <= _MAX_SIZE:
-            raise UserError(f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not {self.size}")
+            raise UserError(
+                f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not {self.size}"
+            )
         if self.fields and all(one.kind == "field" for one in kinds):
-            raise UserError("fields are written next to images, and no sensor has a camera: omit --fields")
+            raise UserError(
+                "fields are written next to images, and no sensor has a camera: omit --fields"
+            )
         low, high = self.depth
         if not 0 <= low <= high < math.inf:
-            raise UserError(f"depth is a range of mm from 0 on, lowest first, not {low:g} to {high:g}")
+            raise UserError(
+                f"depth is a range of mm from 0 on, lowest first, not {low:g} to {high:g}"
+            )
         thin = min(kinds, key=lambda one: one.gel.thickness)
         thinnest = thin.gel.thickness * (THINNEST if self.units == "each" else 1.0)
         if high >= thinnest:
-            raise UserError(f"depth {high:g} mm may go through the gel of {thin.name}: stay below {thinnest:g} mm")
+            raise UserError(
+                f"depth {high:g} mm may go through the gel of {thin.name}: stay below {thinnest:g} mm"
+            )
 
 
 class Touch(NamedTuple):
@@ -144,10 +160,16 @@ def objects_and_splits(scenes: Scenes) -> tuple[tuple[Object, ...], tuple[str, .
     try:
         training, test = hold_out(objects, scenes.held_out, scenes.seed)
     except UserError as error:
-        raise UserError(f"--objects {scenes.objects} and --held-out {scenes.held_out:g}: {error}") from None
+        raise UserError(
+            f"--objects {scenes.objects} and --held-out {scenes.held_out:g}: {error}"
+        ) from None
     split = {thing.name: "test" for thing in test}
-    with contextlib.suppress(UserError):  # too few remain for a validation set
-        split |= {thing.name: "val" for thing in hold_out(training, scenes.held_out / 2, scenes.seed + 1)[1]}
+    # too few remain for a validation set
+    with contextlib.suppress(UserError):
+        split |= {
+            thing.name: "val"
+            for thing in hold_out(training, scenes.held_out / 2, scenes.seed + 1)[1]
+        }
     return objects, tuple(split.get(thing.name, "train") for thing in objects)
 
 
@@ -155,7 +177,9 @@ def draw_touch(scenes: Scenes, number: int, splits: Sequence[str]) -> Touch:
     """Return touch `number`. Objects take turns in a seeded order. Places are within 3 mm of the middle."""
     rng = np.random.default_rng([scenes.seed, _TOUCH, number])
     turn, place = divmod(number, len(splits))
-    thing = int(np.random.default_rng([scenes.seed, _OBJECTS, turn]).permutation(len(splits))[place])
+    thing = int(
+        np.random.default_rng([scenes.seed, _OBJECTS, turn]).permutation(len(splits))[place]
+    )
     place, yaw = draw_place(rng)
     return Touch(number, thing, splits[thing], place, yaw, draw_gesture(scenes.depth, rng))
 
@@ -163,33 +187,49 @@ def draw_touch(scenes: Scenes, number: int, splits: Sequence[str]) -> Touch:
 def draw_place(rng: Rng) -> tuple[Any, Any]:
     """Return a place (2,) mm within 3 mm of an object's middle, and the yaw of the sensor there."""
     xp = namespace_of(rng)
-    angle, away = rng.uniform(0, 2 * math.pi), 3.0 * xp.sqrt(rng.uniform())
+    angle = rng.uniform(0, 2 * math.pi)
+    away = 3.0 * xp.sqrt(rng.uniform())
     return xp.stack([xp.cos(angle), xp.sin(angle)]) * away, rng.uniform(-math.pi, math.pi)
 
 
 def draw_gesture(depths: tuple[float, float], rng: Rng, like: Gesture | None = None) -> Gesture:
     """Return a gesture. With `like`, its depth is similar and its speed and motion are drawn."""
-    xp, (low, high) = namespace_of(rng), depths
-    depth = rng.uniform(low, high) if like is None else xp.clip(like.depth * rng.uniform(0.7, 1.3), low, high)
+    xp = namespace_of(rng)
+    (low, high) = depths
+    depth = (
+        rng.uniform(low, high)
+        if like is None
+        else xp.clip(like.depth * rng.uniform(0.7, 1.3), low, high)
+    )
     motion = rng.integers(len(MOTIONS))
-    angle, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.4, 2.5)
+    angle = rng.uniform(0, 2 * math.pi)
+    length = rng.uniform(0.4, 2.5)
     turn = rng.choice([-1, 1]) * rng.uniform(math.radians(4), math.radians(20))
     slides, twists = ((motion >= first) & (motion <= first + 1) for first in (1, 3))
     slide = xp.stack([xp.cos(angle), xp.sin(angle)]) * length * slides
     phases = rng.uniform([0, 0.1, 0, 0.25, 0, 0.08, 0], [0.15, 0.35, 0.15, 0.5, 0.2, 0.2, 0.1])
     phases = phases / phases.sum()
-    first, last = phases[:2].sum() * 0.8, 1 - phases[5:].sum()
-    shown, middle = xp.exp(rng.uniform(math.log(0.35), math.log(1.2))), rng.uniform(first, last)
+    first = phases[:2].sum() * 0.8
+    last = 1 - phases[5:].sum()
+    shown = xp.exp(rng.uniform(math.log(0.35), math.log(1.2)))
+    middle = rng.uniform(first, last)
     lift = either(rng, rng.uniform() < 0.12, lambda: rng.uniform(first, last), -1.0)
     regrasp = rng.normal(0, 1, 3) * np.array([0.8, 0.8, math.radians(8)])
     return Gesture(depth, motion, slide, turn * twists, phases, shown, middle, lift, regrasp)
 
 
-def draw_by_hand(depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: Any) -> tuple[Gesture, Any, Any, Any]:
+def draw_by_hand(
+    depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: Any
+) -> tuple[Gesture, Any, Any, Any]:
     """Return another sensor's gesture, yaw, offset (2,) mm and tilt (2,) at a touch of grade coarse."""
     gesture = draw_gesture(depths, rng, gesture)
     yaw = yaw + math.radians(12) * rng.standard_normal()
-    return gesture, yaw, 0.8 * rng.standard_normal(2), math.tan(math.radians(2.5)) * rng.standard_normal(2)
+    return (
+        gesture,
+        yaw,
+        0.8 * rng.standard_normal(2),
+        math.tan(math.radians(2.5)) * rng.standard_normal(2),
+    )
 
 
 def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
@@ -198,18 +238,29 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     rng = np.random.default_rng([scenes.seed, _RECORDING, touch.number, sensor_number(kind)])
     unit = draw_unit(kind, rng)
     if scenes.units == "one":  # not mirrored, not rotated, not moved
-        unit, none = draw_unit(kind, np.random.default_rng([scenes.seed, _UNIT, sensor_number(kind)])), np.zeros(2)
-        unit = unit._replace(mirror=np.float32(none + 1), rotation=np.float32(0), offset=np.float32(none))
+        unit = draw_unit(kind, np.random.default_rng([scenes.seed, _UNIT, sensor_number(kind)]))
+        none = np.zeros(2)
+        unit = unit._replace(
+            mirror=np.float32(none + 1), rotation=np.float32(0), offset=np.float32(none)
+        )
     if kind.kind == "field":  # it has no camera
-        unit = unit._replace(mirror=np.ones(2, np.float32), window=np.zeros(2, np.float32), zoom=np.float32(1))
-    gesture, yaw, offset, tilt = touch.gesture, touch.yaw, np.zeros(2), np.zeros(2)
+        unit = unit._replace(
+            mirror=np.ones(2, np.float32), window=np.zeros(2, np.float32), zoom=np.float32(1)
+        )
+    gesture = touch.gesture
+    yaw = touch.yaw
+    offset = np.zeros(2)
+    tilt = np.zeros(2)
     if scenes.grade == "coarse":
         gesture, yaw, offset, tilt = draw_by_hand(scenes.depth, rng, gesture, yaw)
     motion, depth = trajectory(scenes.frames, gesture)
     start = np.array([*offset, yaw])
     has_photo, has_text = (bool(rng.random() < share) for share in (scenes.vision, scenes.text))
-    seed, drift = int(rng.integers(2**31)), draw_drift(scenes.frames, rng)
-    return Recording(touch, sensor, unit, start, motion, depth, tilt, gesture, drift, has_photo, has_text, seed)
+    seed = int(rng.integers(2**31))
+    drift = draw_drift(scenes.frames, rng)
+    return Recording(
+        touch, sensor, unit, start, motion, depth, tilt, gesture, drift, has_photo, has_text, seed
+    )
 
 
 def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
@@ -241,16 +292,21 @@ MOVES = (0.1, math.radians(1))  # mm and rad that the gel must be moved to be la
 
 def directions(recording: Recording) -> dict[str, str]:
     """Return labels of the motion in contact as the image shows it: `label.motion`, `label.twist` and `label.slide`."""
-    unit, touching = recording.unit, recording.depth > 0
+    unit = recording.unit
+    touching = recording.depth > 0
     steps = np.diff(trajectory(len(touching), recording.gesture._replace(lift=-1.0))[0], axis=0)
     *slid, turn = steps[touching[1:] & touching[:-1]].sum(0)
     turn *= float(unit.mirror[0] * unit.mirror[1])
-    motion, twist, slide = "hold", "none", "none"
+    motion = "hold"
+    twist = "none"
+    slide = "none"
     if MOTIONS[recording.gesture.motion] == "twist" and abs(turn) > MOVES[1]:
-        motion, twist = "twist", "clockwise" if turn > 0 else "counterclockwise"
+        motion = "twist"
+        twist = "clockwise" if turn > 0 else "counterclockwise"
     elif MOTIONS[recording.gesture.motion] == "slide" and math.hypot(*slid) > MOVES[0]:
         motion = "slide"
-        c, s = math.cos(float(unit.rotation)), math.sin(float(unit.rotation))
+        c = math.cos(float(unit.rotation))
+        s = math.sin(float(unit.rotation))
         x, y = np.array([[c, -s], [s, c]]) @ np.asarray(slid) * np.asarray(unit.mirror)
         slide = ("right", "down", "left", "up")[round(math.atan2(y, x) / (math.pi / 2)) % 4]
     return {"label.motion": motion, "label.twist": twist, "label.slide": slide}

@@ -27,7 +27,9 @@ from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
 Tree = Any
 Example = tuple[Any, Callable[[], Any]]  # the shapes of a batch, and a function that makes it
-_SIGNAL, _SKIPPED = "signal", "skipped_samples"  # the metrics of a step that its ballot adds
+# the metrics of a step that its ballot adds
+_SIGNAL = "signal"
+_SKIPPED = "skipped_samples"
 # batches(start, stop) -> (step, batch, numbers of the loader for the log) for each step of the range
 Item = tuple[int, Any, Mapping[str, Any]]
 Batches = Callable[[int, int], Iterator[Item]]
@@ -53,11 +55,22 @@ class FitResult:
 
 
 def fit(
-    config: Config, *, params: Tree, loss_fn: LossFn, batches: Batches, run_dir: Path | str,
-    trained: TrainedFn | None = None, stop_after: int | None = None, on_report: Report | None = None,
-    metadata: Mapping[str, Any] | None = None, log: Log | None = None, mesh: Mesh | None = None, curve: bool = False,
-    until: float | None = None, examples: Sequence[Example] = (),
-) -> FitResult:  # fmt: skip
+    config: Config,
+    *,
+    params: Tree,
+    loss_fn: LossFn,
+    batches: Batches,
+    run_dir: Path | str,
+    trained: TrainedFn | None = None,
+    stop_after: int | None = None,
+    on_report: Report | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    log: Log | None = None,
+    mesh: Mesh | None = None,
+    curve: bool = False,
+    until: float | None = None,
+    examples: Sequence[Example] = (),
+) -> FitResult:
     """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
 
     `params` are the first parameters; when a run continues, only their shapes matter. `loss_fn` and `trained` are those
@@ -70,20 +83,26 @@ def fit(
     see.
     """
     refuse_forked()
-    run_dir, mesh = Path(run_dir), mesh or meshes.make_mesh(fsdp=config.run.fsdp)
-    log, lead = log or to_stderr, jax.process_index() == 0
+    run_dir = Path(run_dir)
+    mesh = mesh or meshes.make_mesh(fsdp=config.run.fsdp)
+    log = log or to_stderr
+    lead = jax.process_index() == 0
     stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
     with contextlib.ExitStack() as stack:
         if lead:
             stack.enter_context(progress.alone_in(run_dir))
             progress.open_run(run_dir, config)
         else:
-            progress.continues(run_dir, config)  # each process reports a changed setting
+            # each process reports a changed setting
+            progress.continues(run_dir, config)
             log = silent
         meshes.check_shared(run_dir / "figures")
         with writing(folder := run_dir / "checkpoints"):
-            text, about = to_json(config), dict(metadata or {})
-            checkpoints = Checkpoints(folder, keep=config.run.keep, config_json=text, metadata=about)
+            text = to_json(config)
+            about = dict(metadata or {})
+            checkpoints = Checkpoints(
+                folder, keep=config.run.keep, config_json=text, metadata=about
+            )
         stack.push(checkpoints.leave)
         state, start = _first_state(config, params, checkpoints, mesh)
         if start:
@@ -115,32 +134,51 @@ class _Loop:
     begun: float | None = None  # when the first step had ended, in a run for a time
     pending: tuple[int, dict[str, jax.Array], dict[str, Any]] | None = None
     row: dict[str, Any] = field(default_factory=dict)
-    losses: list[float] = field(default_factory=list)  # since the last checkpoint: their mean decides which is the best
+    # since the last checkpoint: their mean decides which is the best
+    losses: list[float] = field(default_factory=list)
     traces: int = 0
-    shared_signal: signal.Signals | None = None  # the signal that one of several processes received
+    # the signal that one of several processes received
+    shared_signal: signal.Signals | None = None
     waited: float = 0.0
 
     def __post_init__(self) -> None:
         self.ballot = meshes.Ballot(self.mesh) if jax.process_count() > 1 else None
-        self.clock, self.last = time.perf_counter(), LastStep()
+        self.clock = time.perf_counter()
+        self.last = LastStep()
 
     def run(
-        self, state: TrainState, start: int, stop: int, batches: Batches, loss_fn: LossFn, trained: TrainedFn | None,
-        interrupt: list[signal.Signals], examples: Sequence[Example] = (),
-    ) -> FitResult:  # fmt: skip
+        self,
+        state: TrainState,
+        start: int,
+        stop: int,
+        batches: Batches,
+        loss_fn: LossFn,
+        trained: TrainedFn | None,
+        interrupt: list[signal.Signals],
+        examples: Sequence[Example] = (),
+    ) -> FitResult:
         """Run steps `start` to `stop`, or until a signal arrives."""
-        every, figures = self.config.run.save_every, self.config.run.figure_every
-        step_fn, sharding = self.compile(state, loss_fn, trained), meshes.batch_sharding(self.mesh)
+        every = self.config.run.save_every
+        figures = self.config.run.figure_every
+        step_fn = self.compile(state, loss_fn, trained)
+        sharding = meshes.batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
-        seed_key = jax.jit(lambda: jax.random.key(self.config.run.seed), out_shardings=meshes.replicated(self.mesh))()
+        seed_key = jax.jit(
+            lambda: jax.random.key(self.config.run.seed), out_shardings=meshes.replicated(self.mesh)
+        )()
         step_fn = self.ahead(step_fn, state, seed_key, examples)
-        done, saved, reported, placed = start, start, start, None
+        done = start
+        saved = start
+        reported = start
+        placed = None
         with contextlib.closing(self.awaited(batches, start, stop)) as feed:
             for step, batch, info in feed:
                 placed = meshes.put_batch(batch, sharding)
                 state, metrics = step_fn(state, placed, seed_key, *self.progress())
                 if self.ballot:
-                    votes = self.ballot.cast(int(interrupt[0]) if interrupt else 0, int(info.get(_SKIPPED, 0)))
+                    votes = self.ballot.cast(
+                        int(interrupt[0]) if interrupt else 0, int(info.get(_SKIPPED, 0))
+                    )
                     metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), votes, strict=True))
                 self.log_metrics()  # of the step before, while this one runs
                 self.last.began(metrics)
@@ -165,19 +203,27 @@ class _Loop:
         if figures > 0 and reported < done and not signalled:
             self.report(done, state, placed)
         if signalled:
-            self.log(f"stopped by {signalled.name} after step {done} and saved, the same command continues from here")
+            self.log(
+                f"stopped by {signalled.name} after step {done} and saved, the same command continues from here"
+            )
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
-    def ahead(self, step_fn: Any, state: TrainState, key: jax.Array, examples: Sequence[Example]) -> Callable[..., Any]:
+    def ahead(
+        self, step_fn: Any, state: TrainState, key: jax.Array, examples: Sequence[Example]
+    ) -> Callable[..., Any]:
         """Return the step, compiled for the batch of each example side by side. Others compile when they come."""
 
         def form(batch: Any) -> Any:
-            return jax.tree.structure(batch), tuple((x.shape, x.dtype) for x in jax.tree.leaves(batch))
+            return jax.tree.structure(batch), tuple(
+                (x.shape, x.dtype) for x in jax.tree.leaves(batch)
+            )
 
         sharding = meshes.batch_sharding(self.mesh)
 
         def build(shapes: Any) -> tuple[Any, Any]:
-            batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
+            batch = jax.tree.map(
+                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes
+            )
             return form(batch), step_fn.lower(state, batch, key, *self.progress()).compile()
 
         if len(examples) < 2:
@@ -195,11 +241,17 @@ class _Loop:
             return ()
         if self.begun is None:
             return (np.float32(0),)
-        return (np.float32(min((time.monotonic() - self.begun) / max(self.until - self.begun, 1e-3), 1.0)),)
+        return (
+            np.float32(
+                min((time.monotonic() - self.begun) / max(self.until - self.begun, 1e-3), 1.0)
+            ),
+        )
 
     def awaited(self, batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
         """Yield the batches of steps `start` to `stop` in order, count the time without one, and close their source."""
-        source, expected, requested = batches(start, stop), start, time.perf_counter()
+        source = batches(start, stop)
+        expected = start
+        requested = time.perf_counter()
         try:
             for step, batch, info in source:
                 if step != expected:
@@ -208,10 +260,13 @@ class _Loop:
                 if ended is not None:
                     self.waited += time.perf_counter() - max(requested, ended)
                 yield step, batch, info
-                expected, requested = expected + 1, time.perf_counter()
+                expected = expected + 1
+                requested = time.perf_counter()
                 if expected == stop:
                     return
-            raise UserError(f"the data ended after {expected} of {stop} steps. Pass batches for every step.")
+            raise UserError(
+                f"the data ended after {expected} of {stop} steps. Pass batches for every step."
+            )
         finally:
             getattr(source, "close", lambda: None)()
 
@@ -219,8 +274,16 @@ class _Loop:
         self, state: TrainState, loss_fn: LossFn, trained: TrainedFn | None
     ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
         """Return the jitted step, which keeps the sharding of the state and is traced once a batch structure."""
-        loss_fn, tx, options = meshes.gathering(loss_fn, self.mesh), optimizer(self.config), self.config.optim
-        step = make_step(loss_fn, tx, total_steps=self.config.run.steps, accumulate=options.accumulate, trained=trained)
+        loss_fn = meshes.gathering(loss_fn, self.mesh)
+        tx = optimizer(self.config)
+        options = self.config.optim
+        step = make_step(
+            loss_fn,
+            tx,
+            total_steps=self.config.run.steps,
+            accumulate=options.accumulate,
+            trained=trained,
+        )
 
         @functools.wraps(step)
         def counted(*args: Any) -> Any:
@@ -228,13 +291,18 @@ class _Loop:
             return step(*args)
 
         places = jax.tree.map(lambda x: x.sharding, state)
-        return jax.jit(counted, donate_argnums=meshes.donated(), out_shardings=(places, meshes.replicated(self.mesh)))
+        return jax.jit(
+            counted,
+            donate_argnums=meshes.donated(),
+            out_shardings=(places, meshes.replicated(self.mesh)),
+        )
 
     def log_metrics(self) -> None:
         """Fetch and write the metrics of the pending step; stop the run when too many were skipped in a row."""
         if self.pending is None:
             return
-        (step, metrics, info), self.pending = self.pending, None
+        (step, metrics, info) = self.pending
+        self.pending = None
         numbers = jax.device_get(metrics)
         if number := int(numbers.pop(_SIGNAL, 0)):
             self.shared_signal = signal.Signals(number)
@@ -244,7 +312,8 @@ class _Loop:
         elapsed = max(now - self.clock, 1e-9)
         rate = {"samples_per_second": info["samples"] / elapsed}
         rate |= {"wait": self.waited, "wait_share": self.waited / elapsed}
-        self.clock, self.waited = now, 0.0
+        self.clock = now
+        self.waited = 0.0
         self.row = self.record.write(step, {"loss": numbers["loss"]} | numbers | info | rate)
         self.losses += [] if self.row["loss"] is None else [self.row["loss"]]
         self.advance(self.row)
@@ -262,7 +331,9 @@ class _Loop:
         """
         self.log_metrics()
         self.record.sync()
-        metrics = {name: value for name, value in self.row.items() if isinstance(value, int | float)}
+        metrics = {
+            name: value for name, value in self.row.items() if isinstance(value, int | float)
+        }
         if self.losses:
             metrics["loss"] = sum(self.losses) / len(self.losses)
         if since < self.config.run.save_every:
@@ -277,21 +348,29 @@ class _Loop:
         if self.on_report is not None:
             self.log_metrics()
             try:
-                self.on_report(done, meshes.gather(merge(state.trainable, state.frozen)), meshes.gather(batch))
+                self.on_report(
+                    done, meshes.gather(merge(state.trainable, state.frozen)), meshes.gather(batch)
+                )
             except Exception as error:
                 self.log(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
 
 
-def _first_state(config: Config, params: Tree, checkpoints: Checkpoints, mesh: Mesh) -> tuple[TrainState, int]:
+def _first_state(
+    config: Config, params: Tree, checkpoints: Checkpoints, mesh: Mesh
+) -> tuple[TrainState, int]:
     """Return the state of the latest complete checkpoint and its step, or a new state, sharded over the mesh."""
     init = functools.partial(init_state, config=config)
     shapes = jax.eval_shape(init, params)
     places = meshes.state_sharding(shapes, mesh)
     if latest := meshes.broadcast(checkpoints.latest() or 0):
-        wanted = jax.tree.map(lambda x, at: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at), shapes, places)
+        wanted = jax.tree.map(
+            lambda x, at: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at), shapes, places
+        )
         return checkpoints.restore(wanted, latest), latest
-    return jax.jit(init, out_shardings=places)(meshes.put_state(params, meshes.state_sharding(params, mesh))), 0
+    return jax.jit(init, out_shardings=places)(
+        meshes.put_state(params, meshes.state_sharding(params, mesh))
+    ), 0
 
 
 class LastStep:
@@ -305,7 +384,8 @@ class LastStep:
         end = self._end = []  # the thread of an older step has another list
 
         def wait() -> None:
-            with contextlib.suppress(Exception):  # the loop raises the error when it reads the metrics
+            # the loop raises the error when it reads the metrics
+            with contextlib.suppress(Exception):
                 jax.block_until_ready(metrics)
                 end.append(time.perf_counter())
 
@@ -314,4 +394,6 @@ class LastStep:
 
     def ended(self) -> float | None:
         """Return when the step ended, or None if it still runs or failed."""
-        return self._end[0] if self._end else None
+        if self._end:
+            return self._end[0]
+        return None

@@ -30,15 +30,20 @@ _CONTINUE = "run the same command again to continue from the last complete check
 _COUNTS = ("JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
-def make_mesh(data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None) -> Mesh:
+def make_mesh(
+    data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None
+) -> Mesh:
     """Return a mesh with axes (data, fsdp). `data` None takes all devices. Raises ConfigError if there are too few."""
     devices = list(jax.devices() if devices is None else devices)
     if fsdp < 1 or (data is None and len(devices) % fsdp):
         raise ConfigError(f"--run.fsdp {fsdp} must be a divisor of the {len(devices)} devices")
     data = len(devices) // fsdp if data is None else data
     if not 0 < data * fsdp <= len(devices):
-        raise ConfigError(f"a mesh of {data} x {fsdp} needs {data * fsdp} devices, but there are {len(devices)}")
-    auto = (AxisType.Auto, AxisType.Auto)  # jit places the computation: the default is explicit axes
+        raise ConfigError(
+            f"a mesh of {data} x {fsdp} needs {data * fsdp} devices, but there are {len(devices)}"
+        )
+    # jit places the computation: the default is explicit axes
+    auto = (AxisType.Auto, AxisType.Auto)
     return jax.make_mesh((data, fsdp), BATCH_AXES, axis_types=auto, devices=devices[: data * fsdp])
 
 
@@ -75,7 +80,9 @@ def put_state(tree: Tree, places: Tree) -> Tree:
     if jax.process_count() == 1:
         return jax.device_put(host, places, may_alias=False)
     # device_put would compare every array among all processes.
-    return jax.tree.map(lambda x, place: jax.make_array_from_callback(x.shape, place, x.__getitem__), host, places)
+    return jax.tree.map(
+        lambda x, place: jax.make_array_from_callback(x.shape, place, x.__getitem__), host, places
+    )
 
 
 def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
@@ -97,19 +104,26 @@ def donated() -> tuple[int, ...]:
 
     On a CPU none is: XLA would copy every parameter and moment (`experiments/results/tried.md`).
     """
-    return () if jax.default_backend() == "cpu" else (0,)
+    if jax.default_backend() == "cpu":
+        return ()
+    return (0,)
 
 
 def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
     """Send a host batch to the devices, a share of the rows of each process. Raises ConfigError for a remainder."""
-    devices, processes = sharding.num_devices, jax.process_count()
+    devices = sharding.num_devices
+    processes = jax.process_count()
     for leaf in jax.tree.leaves(batch):
         rows = leaf.shape[0] * processes
         if rows % devices:
-            raise ConfigError(f"{rows} rows cannot be divided among {devices} devices. Choose a multiple with --batch.")
+            raise ConfigError(
+                f"{rows} rows cannot be divided among {devices} devices. Choose a multiple with --batch."
+            )
     if processes == 1:
         return jax.device_put(batch, sharding)
-    return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), batch)
+    return jax.tree.map(
+        lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), batch
+    )
 
 
 def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
@@ -121,7 +135,8 @@ def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
         return None
     remove_old(folder, "*-cache")
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    compilation_cache.reset_cache()  # a program compiled before would have switched the cache off
+    # a program compiled before would have switched the cache off
+    compilation_cache.reset_cache()
     return folder
 
 
@@ -159,25 +174,36 @@ def joined(environ: Mapping[str, str] = os.environ) -> Iterator[_Process | None]
         jax.distributed.shutdown()
     except BaseException as error:
         message, status = _exit_message(error)
-        with contextlib.suppress(OSError):  # the reader of these streams may be gone
+        # the reader of these streams may be gone
+        with contextlib.suppress(OSError):
             sys.stdout.flush()
             sys.stderr.write(f"{process or 'this process'}: {message}\n")
             sys.stderr.flush()
-        if process and isinstance(error, UserError):  # wait for the others: jax aborts one whose coordinator leaves
+        if process and isinstance(
+            error, UserError
+        ):  # wait for the others: jax aborts one whose coordinator leaves
             (thread := threading.Thread(target=_shutdown, daemon=True)).start()
             thread.join(PATIENCE)
-        os._exit(status)  # jax's threads and exit handlers would wait for processes that have ended
+        # jax's threads and exit handlers would wait for processes that have ended
+        os._exit(status)
 
 
 def _initialize(environ: Mapping[str, str]) -> _Process:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    jax.config.update("jax_enable_preemption_service", False)  # it would swallow SIGTERM, which `Ballot` shares
+    # it would swallow SIGTERM, which `Ballot` shares
+    jax.config.update("jax_enable_preemption_service", False)
     kwargs: dict[str, Any] = {"coordinator_address": environ.get("JAX_COORDINATOR_ADDRESS")}
     if environ.get("JAX_PROCESS_ID"):
-        kwargs |= {"process_id": _number(environ, "JAX_PROCESS_ID"), "cluster_detection_method": "deactivate"}
-    count = process_count(environ)  # SLURM_NTASKS, which jax reads, may be that of another job step
+        kwargs |= {
+            "process_id": _number(environ, "JAX_PROCESS_ID"),
+            "cluster_detection_method": "deactivate",
+        }
+    # SLURM_NTASKS, which jax reads, may be that of another job step
+    count = process_count(environ)
     try:
-        jax.distributed.initialize(num_processes=count, heartbeat_timeout_seconds=HEARTBEAT, **kwargs)
+        jax.distributed.initialize(
+            num_processes=count, heartbeat_timeout_seconds=HEARTBEAT, **kwargs
+        )
     except (RuntimeError, ValueError, KeyError) as error:
         raise UserError(
             f"cannot join the other processes ({_first_line(error)}). Set JAX_COORDINATOR_ADDRESS to host:port of "
@@ -194,7 +220,9 @@ def _exit_message(error: BaseException) -> tuple[str, int]:
         return "stopped by SIGTERM before the first step", 0
     if isinstance(error, UserError):
         return str(error), 2
-    if isinstance(error, jax.errors.JaxRuntimeError):  # a collective fails so when another process was lost
+    if isinstance(
+        error, jax.errors.JaxRuntimeError
+    ):  # a collective fails so when another process was lost
         return f"{_first_line(error)}; if another process was lost, {_CONTINUE}", 1
     return "".join(traceback.format_exception(error)) + _CONTINUE, 1
 
@@ -206,7 +234,9 @@ def _shutdown() -> None:
 
 def _number(environ: Mapping[str, str], name: str) -> int:
     if not environ[name].isdigit():
-        raise ConfigError(f"the environment variable {name} must be a whole number, not {environ[name]!r}")
+        raise ConfigError(
+            f"the environment variable {name} must be a whole number, not {environ[name]!r}"
+        )
     return int(environ[name])
 
 
@@ -219,7 +249,8 @@ class Ballot:
 
     def __init__(self, mesh: Mesh) -> None:
         self._sharding = batch_sharding(mesh)
-        devices = self._sharding.num_devices // jax.process_count()  # of one process: all cast the same vote
+        # of one process: all cast the same vote
+        devices = self._sharding.num_devices // jax.process_count()
         self._count = jax.jit(
             lambda votes: (jnp.max(votes[:, 0]), jnp.sum(votes[:, 1]) // devices),
             out_shardings=replicated(mesh),
@@ -227,18 +258,23 @@ class Ballot:
 
     def cast(self, number: int, skipped: int) -> tuple[jax.Array, jax.Array]:
         """Return the largest `number` and the sum of `skipped` over the processes, both i32 ()."""
-        shape, vote = (self._sharding.num_devices, 2), np.array([[number, skipped]], np.int32)
+        shape = (self._sharding.num_devices, 2)
+        vote = np.array([[number, skipped]], np.int32)
         return self._count(jax.make_array_from_callback(shape, self._sharding, lambda _: vote))
 
 
 def gather(tree: Tree) -> Tree:
     """Return a tree of arrays as numpy, sharded over several processes or not. Every process must call it."""
-    return tree if jax.process_count() == 1 else multihost_utils.process_allgather(tree, tiled=True)
+    if jax.process_count() == 1:
+        return tree
+    return multihost_utils.process_allgather(tree, tiled=True)
 
 
 def broadcast(number: int) -> int:
     """Return the number that process 0 passes. Every process must call it."""
-    return number if jax.process_count() == 1 else int(multihost_utils.broadcast_one_to_all(np.int32(number)))
+    if jax.process_count() == 1:
+        return number
+    return int(multihost_utils.broadcast_one_to_all(np.int32(number)))
 
 
 def check_shared(folder: Path) -> None:
@@ -249,4 +285,6 @@ def check_shared(folder: Path) -> None:
     visible = multihost_utils.process_allgather(np.int32(folder.is_dir()))
     if not visible.all():
         blind = ", ".join(str(i) for i in np.flatnonzero(visible == 0))
-        raise UserError(f"{folder} is not visible to process {blind}. Choose a run folder on a disk that all share.")
+        raise UserError(
+            f"{folder} is not visible to process {blind}. Choose a run folder on a disk that all share."
+        )

@@ -40,7 +40,9 @@ class Packing(NamedTuple):
         """Return one array a group."""
         leaves = self.treedef.flatten_up_to(tree)
         return tuple(
-            leaves[group[0]] if len(group) == 1 else jnp.concatenate([leaves[i].reshape(-1) for i in group])
+            leaves[group[0]]
+            if len(group) == 1
+            else jnp.concatenate([leaves[i].reshape(-1) for i in group])
             for group in self.groups
         )
 
@@ -51,7 +53,11 @@ class Packing(NamedTuple):
             start = 0
             for i in group:
                 size = int(np.prod(self.shapes[i]))
-                leaves[i] = array if len(group) == 1 else array[start : start + size].reshape(self.shapes[i])
+                leaves[i] = (
+                    array
+                    if len(group) == 1
+                    else array[start : start + size].reshape(self.shapes[i])
+                )
                 start += size
         return self.treedef.unflatten(leaves)
 
@@ -61,7 +67,9 @@ class Packing(NamedTuple):
         if len(leaves) == 1:
             return values[leaves[0]]
         # The index is known while tracing: jnp.repeat would leave XLA to fold a cumulative sum for seconds.
-        return values[np.repeat(np.asarray(leaves, np.int32), [int(np.prod(self.shapes[i])) for i in leaves])]
+        return values[
+            np.repeat(np.asarray(leaves, np.int32), [int(np.prod(self.shapes[i])) for i in leaves])
+        ]
 
 
 def packing(tree: Tree, small: int = SMALL) -> Packing:
@@ -99,12 +107,16 @@ def match_rules(rules: Sequence[tuple[str, T]], names: Iterable[str]) -> dict[st
     for name in names:
         values = [value for pattern, value in rules if re.search(pattern, name)]
         if not values:
-            raise ConfigError(f'no rule matches the parameter {name}. End the rules with ("", value).')
+            raise ConfigError(
+                f'no rule matches the parameter {name}. End the rules with ("", value).'
+            )
         matched[name] = values[0]
     return matched
 
 
-def learning_rate(t: Array | float, *, peak: float, floor: float, warmup: float, total: float, decay: str) -> Array:
+def learning_rate(
+    t: Array | float, *, peak: float, floor: float, warmup: float, total: float, decay: str
+) -> Array:
     """Return the learning rate at time `t`, f32 of its shape.
 
     It rises linearly from 0 to `peak` at `warmup`, falls to `floor` at `total`, and stays there. `t`, `warmup` and
@@ -132,10 +144,13 @@ def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | flo
     Block i of 1 to L of the touch encoder has the factor layer_decay^(L - i), parameters before the blocks
     layer_decay^L, and all others 1. In BEiT's fine-tuning (Bao et al. 2022) the last block has layer_decay.
     """
-    depth, decay = config.model.touch.depth, config.optim.layer_decay
+    depth = config.model.touch.depth
+    decay = config.optim.layer_decay
     if name.startswith("touch/blocks/"):
         return jnp.expand_dims(decay ** jnp.arange(depth - 1, -1, -1.0), range(1, len(shape)))
-    return decay**depth if re.match(r"touch/(?!post_norm|projection)", name) else 1.0
+    if re.match(r"touch/(?!post_norm|projection)", name):
+        return decay**depth
+    return 1.0
 
 
 def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
@@ -146,12 +161,15 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
     `learning_rate`, or that of `schedule` at `step`, so that a skipped step does not shift the schedule. If `good`
     bool () is False, the state stays.
     """
-    options, rate = config.optim, schedule(config)
+    options = config.optim
+    rate = schedule(config)
 
     def init(params: Tree) -> OptState:
         layout = packing(params)
         mu, nu = (tuple(jnp.zeros_like(x) for x in layout.pack(params)) for _ in range(2))
-        return OptState(jnp.zeros(len(layout.shapes), jnp.int32), mu, nu, jnp.zeros((), jnp.float32))
+        return OptState(
+            jnp.zeros(len(layout.shapes), jnp.int32), mu, nu, jnp.zeros((), jnp.float32)
+        )
 
     def update(
         grads: Tree,
@@ -179,34 +197,53 @@ def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
 
 
 def _adamw(
-    config: Config, layout: Packing, grads: Tree, state: OptState, params: Tree, used: Tree | None,
-    good: Array | bool, rate: Array,
-) -> tuple[list[Array], Array, tuple[Array, ...], tuple[Array, ...]]:  # fmt: skip
+    config: Config,
+    layout: Packing,
+    grads: Tree,
+    state: OptState,
+    params: Tree,
+    used: Tree | None,
+    good: Array | bool,
+    rate: Array,
+) -> tuple[list[Array], Array, tuple[Array, ...], tuple[Array, ...]]:
     """Return packed updates, counts and moments. An unused leaf has update 0."""
     options = config.optim
-    uses = np.asarray([True] * len(layout.shapes) if used is None else layout.treedef.flatten_up_to(used))
-    decays = np.asarray(list(match_rules(config.weight_decay, flatten(params)).values()), np.float32)
+    uses = np.asarray(
+        [True] * len(layout.shapes) if used is None else layout.treedef.flatten_up_to(used)
+    )
+    decays = np.asarray(
+        list(match_rules(config.weight_decay, flatten(params)).values()), np.float32
+    )
     count = state.counts + uses.astype(np.int32)
-    first, second = (1.0 - jnp.float32(beta) ** count for beta in (options.beta1, options.beta2))  # bias corrections
+    # bias corrections
+    first, second = (1.0 - jnp.float32(beta) ** count for beta in (options.beta1, options.beta2))
     gradients = layout.pack(grads)
     use = [layout.spread(k, uses) for k in range(len(gradients))]
     if options.grad_clip is not None:
-        length = global_norm([jnp.where(here, g, 0) for here, g in zip(use, gradients, strict=True)])
+        length = global_norm(
+            [jnp.where(here, g, 0) for here, g in zip(use, gradients, strict=True)]
+        )
         gradients = tuple(g * jnp.minimum(1.0, options.grad_clip / length) for g in gradients)
-    updates, mus, nus = [], list(state.mu), list(state.nu)
+    updates = []
+    mus = list(state.mu)
+    nus = list(state.nu)
     for k, (grad, value) in enumerate(zip(gradients, layout.pack(params), strict=True)):
         if not np.any(use[k]):
             updates.append(jnp.zeros_like(value))
             continue
         keep = good if np.all(use[k]) else use[k] & good
-        mu, nu = (
-            options.beta1 * mus[k] + (1 - options.beta1) * grad,
-            options.beta2 * nus[k] + (1 - options.beta2) * grad * grad,
+        mu = options.beta1 * mus[k] + (1 - options.beta1) * grad
+        nu = options.beta2 * nus[k] + (1 - options.beta2) * grad * grad
+        mus[k], nus[k] = (
+            jnp.where(keep, new, old).astype(old.dtype) for new, old in ((mu, mus[k]), (nu, nus[k]))
         )
-        mus[k], nus[k] = (jnp.where(keep, new, old).astype(old.dtype) for new, old in ((mu, mus[k]), (nu, nus[k])))
         # One division comes last, which XLA does not repeat for each reader.
         size = jnp.sqrt(nus[k] / layout.spread(k, second)) + options.eps
-        update = -rate * (mus[k] / layout.spread(k, first) + layout.spread(k, decays) * value * size) / size
+        update = (
+            -rate
+            * (mus[k] / layout.spread(k, first) + layout.spread(k, decays) * value * size)
+            / size
+        )
         if not np.all(use[k]):  # where a count is 0, the corrected moments are NaN
             update = jnp.where(use[k], update, 0.0)
         updates.append(update.astype(value.dtype))

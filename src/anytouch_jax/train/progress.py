@@ -34,7 +34,9 @@ def silent(sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+def progress(
+    start: int, stop: int, log: Log, *, curve: bool = False
+) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     """Give a function for the metrics of each step: a bar on a terminal (with a `curve` of the loss), or log lines."""
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
@@ -47,7 +49,13 @@ def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterato
         yield line
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
     from rich.text import Text
 
     losses: list[float] = []
@@ -64,7 +72,12 @@ def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterato
         losses.extend(() if row["loss"] is None else (row["loss"],))
         bar.update(task, completed=row["step"] + 1, description=summary(row))
 
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )
     with Bar(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("compiling", total=stop, completed=start)
         yield advance
@@ -72,13 +85,20 @@ def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterato
 
 def chart(losses: Sequence[float], width: int = 64, height: int = 8) -> str:
     """Draw losses as text: a column is the mean of equally many steps. The scale is written on the left."""
-    columns = [float(part.mean()) for part in np.array_split(np.asarray(losses), min(width, len(losses)))]
-    low, high = min(columns), max(columns)
-    eighths = [1 + round((8 * height - 1) * (value - low) / ((high - low) or 1.0)) for value in columns]
+    columns = [
+        float(part.mean()) for part in np.array_split(np.asarray(losses), min(width, len(losses)))
+    ]
+    low = min(columns)
+    high = max(columns)
+    eighths = [
+        1 + round((8 * height - 1) * (value - low) / ((high - low) or 1.0)) for value in columns
+    ]
     lines = []
     for line in reversed(range(height)):
         mark = {height - 1: f"{high:9.4f} ", 0: f"{low:9.4f} "}.get(line, " " * 10)
-        lines.append(mark + "".join(" ▁▂▃▄▅▆▇█"[min(8, max(0, full - 8 * line))] for full in eighths))
+        lines.append(
+            mark + "".join(" ▁▂▃▄▅▆▇█"[min(8, max(0, full - 8 * line))] for full in eighths)
+        )
     return "\n".join(lines)
 
 
@@ -88,7 +108,11 @@ def summary(row: Mapping[str, Any]) -> str:
     skipped = f"  skipped {row['skipped_batches']}" if row["skipped_batches"] else ""
     replaced = row.get("skipped_samples", 0)
     skipped += f"  {replaced:.0f} samples could not be read and were replaced" if replaced else ""
-    waits = f"  waits for data {row['wait_share']:.0%}" if row.get("wait_share", 0) >= _WAIT_SHARE else ""
+    waits = (
+        f"  waits for data {row['wait_share']:.0%}"
+        if row.get("wait_share", 0) >= _WAIT_SHARE
+        else ""
+    )
     return f"loss {loss}  {row['samples_per_second']:.0f} samples/s{skipped}{waits}"
 
 
@@ -120,8 +144,13 @@ def terminating() -> Iterator[None]:
 
 # Settings that may change when a run continues: they decide where and how fast it runs, not its numbers. `pretrain`
 # compares the content of the manifests, since a data set may have moved. The run folder has a copy of the tokenizer.
-CHANGEABLE = {f"data.{name}" for name in ("cache", "manifests", "on_bad_sample", "prefetch", "threads", "tokenizer")}
-CHANGEABLE |= {f"run.{n}" for n in ("figure_every", "fsdp", "keep", "max_skipped", "save_every", "tensorboard")}
+CHANGEABLE = {
+    f"data.{name}"
+    for name in ("cache", "manifests", "on_bad_sample", "prefetch", "threads", "tokenizer")
+}
+CHANGEABLE |= {
+    f"run.{n}" for n in ("figure_every", "fsdp", "keep", "max_skipped", "save_every", "tensorboard")
+}
 
 
 @contextlib.contextmanager
@@ -153,7 +182,9 @@ def alone_in(run_dir: Path) -> Iterator[None]:
         with writing(run_dir):
             free = stack.enter_context(lock(run_dir / ".lock"))
         if not free:
-            raise UserError(f"another process trains in {run_dir}. Wait for it, or choose another folder with --run.")
+            raise UserError(
+                f"another process trains in {run_dir}. Wait for it, or choose another folder with --run."
+            )
         _locked.add(mine)
         stack.callback(_locked.discard, mine)
         yield
@@ -161,7 +192,8 @@ def alone_in(run_dir: Path) -> Iterator[None]:
 
 def begun_with(run_dir: Path) -> Config | None:
     """Return the settings that a run started with, or None without a complete checkpoint. Raises UserError."""
-    path, done = run_dir / "config.json", steps(run_dir / "checkpoints")
+    path = run_dir / "config.json"
+    done = steps(run_dir / "checkpoints")
     if not done:
         return None
     try:
@@ -170,7 +202,9 @@ def begun_with(run_dir: Path) -> Config | None:
         path = run_dir / "checkpoints" / f"{done[-1]:08d}"
         return from_json(read_record(path)["config"], allow_retired=False)
     except (ConfigError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read ({error}). Choose another run folder, or repair the file.") from None
+        raise UserError(
+            f"{path} cannot be read ({error}). Choose another run folder, or repair the file."
+        ) from None
 
 
 def open_run(run_dir: Path, config: Config) -> None:
@@ -186,7 +220,8 @@ def continues(run_dir: Path, config: Config) -> bool:
     """Return whether a folder has a run to continue. Raises UserError for changed settings, but those CHANGEABLE."""
     if (begun := begun_with(run_dir)) is None:
         return False
-    before, now = _flat(dataclasses.asdict(begun)), _flat(dataclasses.asdict(config))
+    before = _flat(dataclasses.asdict(begun))
+    now = _flat(dataclasses.asdict(config))
     changed = [
         f"{name} was {before.get(name)!r} and is now {now.get(name)!r}"
         for name in sorted(before.keys() | now.keys())
@@ -206,7 +241,11 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         value = tuple(value) if isinstance(value, list) else value
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+        flat |= (
+            _flat(value, f"{prefix}{name}.")
+            if isinstance(value, Mapping)
+            else {prefix + name: value}
+        )
     return flat
 
 
@@ -217,7 +256,9 @@ class Record:
     numbers also go to an event file. Only the `lead` process writes. Raises UserError for a full disk.
     """
 
-    def __init__(self, run_dir: Path, start: int, *, tensorboard: bool = False, lead: bool = True) -> None:
+    def __init__(
+        self, run_dir: Path, start: int, *, tensorboard: bool = False, lead: bool = True
+    ) -> None:
         self.path = run_dir / "metrics.jsonl"
         self.skipped = self.in_a_row = 0
         self._board = _tensorboard(run_dir, start) if tensorboard and lead else None
@@ -264,7 +305,11 @@ class Record:
 
 def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
     """Remove the lines of step `start` and later, and incomplete ones, and return the rest."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True) if path.exists() else []
+    lines = (
+        path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+        if path.exists()
+        else []
+    )
     rows: dict[str, dict[str, Any]] = {}
     for line in lines:
         with contextlib.suppress(ValueError):

@@ -40,7 +40,9 @@ def split(params: Tree, rules: Sequence[tuple[str, bool]]) -> tuple[Tree, Tree]:
     """Split nested parameters into (trainable, frozen) by (regex, frozen?) rules. The first match decides."""
     leaves = flatten(params)
     frozen = match_rules(rules, leaves)
-    trainable, fixed = ({name: leaves[name] for name in leaves if frozen[name] == part} for part in (False, True))
+    trainable, fixed = (
+        {name: leaves[name] for name in leaves if frozen[name] == part} for part in (False, True)
+    )
     return nest(trainable), nest(fixed)
 
 
@@ -61,7 +63,9 @@ def init_state(params: Tree, config: Config) -> TrainState:
     """Return the state before the first step: parameters split by `config.frozen`, moments zero."""
     refuse_forked()
     trainable, frozen = split(params, config.frozen)
-    return TrainState(jnp.zeros((), jnp.int32), trainable, frozen, optimizer(config).init(trainable))
+    return TrainState(
+        jnp.zeros((), jnp.int32), trainable, frozen, optimizer(config).init(trainable)
+    )
 
 
 def make_step(
@@ -96,9 +100,13 @@ def make_step(
         if progress is None:
             progress = state.step.astype(jnp.float32) / total_steps
 
-        def loss(trainable: Tree, frozen: Tree, part: Any, key: Array, progress: Array) -> LossAndMetrics:
+        def loss(
+            trainable: Tree, frozen: Tree, part: Any, key: Array, progress: Array
+        ) -> LossAndMetrics:
             value, metrics = loss_fn(merge(trainable, frozen), part, key, progress)
-            return value.astype(jnp.float32), {k: jnp.asarray(v, jnp.float32) for k, v in metrics.items()}
+            return value.astype(jnp.float32), {
+                k: jnp.asarray(v, jnp.float32) for k, v in metrics.items()
+            }
 
         parts = batch if accumulate == 1 else micro_batches(batch, accumulate)
         used = nest(match_rules(trained(batch), flatten(state.trainable))) if trained else None
@@ -108,12 +116,23 @@ def make_step(
             (value, metrics), grads = function(state.trainable, state.frozen, part, key, progress)
             return value, metrics, grads
 
-        value, metrics, grads = gradients(parts, key) if accumulate == 1 else _mean_over(gradients, parts, key)
+        value, metrics, grads = (
+            gradients(parts, key) if accumulate == 1 else _mean_over(gradients, parts, key)
+        )
         layout = packing(state.trainable)
-        norms = {"grad_norm": global_norm(layout.pack(grads)), "param_norm": global_norm(layout.pack(state.trainable))}
+        norms = {
+            "grad_norm": global_norm(layout.pack(grads)),
+            "param_norm": global_norm(layout.pack(state.trainable)),
+        }
         # As the change waits for both norms, XLA overwrites parameters and moments in place.
-        good = jnp.isfinite(value) & jnp.isfinite(norms["grad_norm"]) & jnp.isfinite(norms["param_norm"])
-        updates, opt_state = tx.update(grads, state.opt_state, state.trainable, used=used, step=at, good=good)
+        good = (
+            jnp.isfinite(value)
+            & jnp.isfinite(norms["grad_norm"])
+            & jnp.isfinite(norms["param_norm"])
+        )
+        updates, opt_state = tx.update(
+            grads, state.opt_state, state.trainable, used=used, step=at, good=good
+        )
         return _finish(state, good, metrics | norms | {"loss": value}, updates, opt_state)
 
     return step
@@ -153,7 +172,9 @@ def micro_batches(batch: Any, accumulate: int) -> Any:
 
     def deal(x: Array) -> Array:
         if x.shape[0] % accumulate:
-            raise ConfigError(f"a batch of {x.shape[0]} rows is not divisible by --optim.accumulate {accumulate}")
+            raise ConfigError(
+                f"a batch of {x.shape[0]} rows is not divisible by --optim.accumulate {accumulate}"
+            )
         return jnp.swapaxes(x.reshape(x.shape[0] // accumulate, accumulate, *x.shape[1:]), 0, 1)
 
     return jax.tree.map(deal, batch)

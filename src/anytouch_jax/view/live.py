@@ -42,7 +42,9 @@ class LoopedFilm:
     """A film in place of a camera, again and again; late frames are lost. Raises UserError for one without frames."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._video, self._due = path.absolute(), open_video(path), 0.0
+        self._path = path.absolute()
+        self._video = open_video(path)
+        self._due = 0.0
         rate = self._video.get(cv2.CAP_PROP_FPS)
         self._period = 1 / rate if 1 <= rate <= 240 else 1 / 30
 
@@ -107,15 +109,27 @@ class Live:
     kind = "live"
 
     def __init__(
-        self, source: str, encoder: Encoder, *, sensor: str | None, head: LinearHead | None = None,
-        space: FeatureMap | None = None, out: Path, camera: CameraSettings | None = None,
+        self,
+        source: str,
+        encoder: Encoder,
+        *,
+        sensor: str | None,
+        head: LinearHead | None = None,
+        space: FeatureMap | None = None,
+        out: Path,
+        camera: CameraSettings | None = None,
         log: Callable[[str], None] = print,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if space is not None:
             space.index.check(encoder.source, encoder.fingerprint)
-        self.name, self.source = f"camera {source}" if source.isdecimal() else Path(source).stem, source
-        self._encoder, self._head, self._space = encoder, head, space
-        self._sensor, self._camera, self._log = sensor, camera, log
+        self.name = f"camera {source}" if source.isdecimal() else Path(source).stem
+        self.source = source
+        self._encoder = encoder
+        self._head = head
+        self._space = space
+        self._sensor = sensor
+        self._camera = camera
+        self._log = log
         self._row = encoder.sensor_row(sensor or UNIVERSAL, log)
         self._looker = ThreadPoolExecutor(1)
         self._looking: Future[None] | None = None
@@ -129,15 +143,24 @@ class Live:
         self._stopped = False
         self._thread: threading.Thread | None = None
         self.recorder = LiveRecorder(out, sensor)
-        self.teacher = Teacher(encoder, self.recorder, "class" if head is None else head.pooling, log)
+        self.teacher = Teacher(
+            encoder, self.recorder, "class" if head is None else head.pooling, log
+        )
 
     def about(self) -> dict[str, Any]:
         """Return what the page can offer."""
         return {
-            "encoder": self._encoder.source, "sensor": self._sensor, "head": self._head and self._head.label,
-            "source": self.source, "table": self._space and self._space.table,
-            "layers": [name for name in tables.LAYERS if self._encoder.measures or name not in tables.MEASURED],
-        }  # fmt: skip
+            "encoder": self._encoder.source,
+            "sensor": self._sensor,
+            "head": self._head and self._head.label,
+            "source": self.source,
+            "table": self._space and self._space.table,
+            "layers": [
+                name
+                for name in tables.LAYERS
+                if self._encoder.measures or name not in tables.MEASURED
+            ],
+        }
 
     def start(self) -> None:
         """Open the source and begin. Raises UserError if it cannot be opened."""
@@ -186,17 +209,22 @@ class Live:
         with self._lock:
             self._setup = self._with_gel(self._setup.rotate, self._setup.flip, picture)
 
-    def _with_gel(self, rotate: int, flip: Flip, gel: Array | None, running: RunningGel | None = None) -> _Setup:
+    def _with_gel(
+        self, rotate: int, flip: Flip, gel: Array | None, running: RunningGel | None = None
+    ) -> _Setup:
         estimate = running or RunningGel() if gel is None or running else None
         small = None if gel is None else (tables.scale_down(gel), UntouchedGel(gel))
         known = self._sensor or UNIVERSAL, gel
-        measure = self._encoder.measure_of(*known, log=lambda _: None) if self._encoder.measures else None
+        measure = (
+            self._encoder.measure_of(*known, log=lambda _: None) if self._encoder.measures else None
+        )
         # Frames are turned before, so the encoder's preprocessing does not.
         return _Setup(rotate, flip, estimate, gel, small, Preprocess(self._encoder, gel), measure)
 
     def _find_gel(self, setup: _Setup, picture: Array) -> _Setup:
         """Look for the untouched gel by the rule of `data.gels`: that of the head's unit, or a running estimate."""
-        running, head = setup.running, self.teacher.head or self._head
+        running = setup.running
+        head = self.teacher.head or self._head
         if running is None:
             return setup
         if not self._count and head is not None and head.gels:
@@ -204,11 +232,15 @@ class Live:
             if known is not None and not why:
                 return self._replace(setup, known, None)
             self._log(other_unit(why))
-        if self._looking is None or self._looking.done():  # an estimate takes longer than a frame may be old
+        if (
+            self._looking is None or self._looking.done()
+        ):  # an estimate takes longer than a frame may be old
             self._looking = self._looker.submit(running.add, picture)
             if running.picture is None:
                 self._looking.result()
-        return setup if running.picture is setup.gel else self._replace(setup, running.picture, running)
+        if running.picture is setup.gel:
+            return setup
+        return self._replace(setup, running.picture, running)
 
     def _replace(self, setup: _Setup, gel: Array | None, running: RunningGel | None) -> _Setup:
         """Return a setup with another untouched gel, and use it if the page has not asked for another meanwhile."""
@@ -235,9 +267,14 @@ class Live:
                 self.set_background(self.gel)
             prepare: Any = self._prepare
             frames = stream(
-                self._encoder, source, prepare, live=True, sensor=self._row, log=self._log,
+                self._encoder,
+                source,
+                prepare,
+                live=True,
+                sensor=self._row,
+                log=self._log,
                 pooling="class" if self._head is None else self._head.pooling,
-            )  # fmt: skip
+            )
             with contextlib.closing(frames):
                 for frame in frames:
                     if self._stopped:
@@ -252,30 +289,44 @@ class Live:
             return
         *_, picture, _, setup = kept[-1]
         threshold = THRESHOLDS.get(self._sensor or UNIVERSAL, DEFAULT_THRESHOLD)
-        score, fields = tables.touch_layer(picture, setup.small, threshold, "frame")[1], None
+        score = tables.touch_layer(picture, setup.small, threshold, "frame")[1]
+        fields = None
         if score == score and setup.measure is not None:
-            like = [one.prepared for one in kept if (one.setup.rotate, one.setup.flip) == (setup.rotate, setup.flip)]
+            like = [
+                one.prepared
+                for one in kept
+                if (one.setup.rotate, one.setup.flip) == (setup.rotate, setup.flip)
+            ]
             fields = self._fields(setup.measure, picture, like)
         measured = {} if fields is None else tables.field_numbers(fields)
         self.recorder.add(picture, score, frame.values)
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
         about: dict[str, Any] = {
-            "frame": frame.number, "grabbed": 1e3 * (frame.started + frame.at), "picture": frame.picture,
-            "contact": None if score != score else bool(score > threshold), "threshold": threshold,
+            "frame": frame.number,
+            "grabbed": 1e3 * (frame.started + frame.at),
+            "picture": frame.picture,
+            "contact": None if score != score else bool(score > threshold),
+            "threshold": threshold,
             "gel": "captured" if setup.running is None else "estimated",
-            "curves": {} if score != score else {"contact": round(score, 2)} | measured.get("curves", {}),
+            "curves": {}
+            if score != score
+            else {"contact": round(score, 2)} | measured.get("curves", {}),
             "fields": measured or None,
-            "encoder": encoder.round(2).tolist(), "age": age.round(2).tolist(), "missed": frame.missed,
-            "recording": self.recorder.state(), "taught": self.teacher.version,
-        }  # fmt: skip
+            "encoder": encoder.round(2).tolist(),
+            "age": age.round(2).tolist(),
+            "missed": frame.missed,
+            "recording": self.recorder.state(),
+            "taught": self.teacher.version,
+        }
         about |= self._classify(frame.values) | self._nearest(frame.values)
         self._newest = _Shown(self._newest.number + 1, about, picture, setup.small, fields)
 
     def _fields(self, measure: Measure, picture: Array, prepared: list[Array]) -> Fields:
         """Measure a picture, the last of some prepared frames."""
         clip = tables.last_clip(prepared, self._encoder.config.model.frames)
-        row, aspect = np.array([self._row], np.int32), np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
+        row = np.array([self._row], np.int32)
+        aspect = np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
         return measure(self._encoder.encode_and_measure(clip[None], row, aspect)[1], [picture])
 
     def _classify(self, values: Array) -> dict[str, Any]:
@@ -286,10 +337,13 @@ class Live:
             return {"label": str(label), "p": round(float(p.max()), 3)}
         one = head.assess(values[None])
         return {
-            "label": str(one.label[0]), "p": round(float(one.p.max()), 3), "novel": bool(one.novel[0]),
-            "set": head.classes[one.in_set[0]].tolist(), "novelty": round(float(one.novelty[0]), 3),
+            "label": str(one.label[0]),
+            "p": round(float(one.p.max()), 3),
+            "novel": bool(one.novel[0]),
+            "set": head.classes[one.in_set[0]].tolist(),
+            "novelty": round(float(one.novelty[0]), 3),
             "limit": round(limit, 3) if (limit := head.calibration.novelty_limit) < 1e9 else None,
-        }  # fmt: skip
+        }
 
     def _nearest(self, values: Array) -> dict[str, Any]:
         """Return the nearest known touches, and the nearest recorded one."""
@@ -297,18 +351,26 @@ class Live:
         if time.perf_counter() - at > _SEARCH:
             unit = unit_rows(values[None])[0]
             near = {"near": self._space, "recorded": self.teacher.space}
-            found = {name: space.near(unit, count=5) for name, space in near.items() if space is not None}
+            found = {
+                name: space.near(unit, count=5) for name, space in near.items() if space is not None
+            }
             self._near = found, time.perf_counter()
         return found
 
 
 def _packet(shown: _Shown, layer: str) -> bytes:
     """Return a frame for the page (see `Live.packets`)."""
-    about, jpeg = {"layer": layer, "sent": 1e3 * time.time(), **shown.about}, b""
+    about = {"layer": layer, "sent": 1e3 * time.time(), **shown.about}
+    jpeg = b""
     if shown.picture is not None:
-        gel = shown.gel if layer != tables.LAYERS[0] else None  # its score is known already
+        # its score is known already
+        gel = shown.gel if layer != tables.LAYERS[0] else None
         view, score = tables.touch_layer(shown.picture, gel, about["threshold"], layer)
-        about["layer"] = "frame" if score != score or (layer in tables.MEASURED and shown.fields is None) else layer
+        about["layer"] = (
+            "frame"
+            if score != score or (layer in tables.MEASURED and shown.fields is None)
+            else layer
+        )
         if shown.fields is not None and about["layer"] in tables.MEASURED:
             view = tables.measured_layer(view, shown.fields, layer)
         jpeg = encode(view, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 85)

@@ -36,21 +36,33 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
 from anytouch_jax.view import tables
-from anytouch_jax.view.tables import LAYERS, SIDE, FeatureMap, Run, Table, open_examples, open_film, scale_down, title
+from anytouch_jax.view.tables import (
+    LAYERS,
+    SIDE,
+    FeatureMap,
+    Run,
+    Table,
+    open_examples,
+    open_film,
+    scale_down,
+    title,
+)
 
 if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
     from anytouch_jax.view.live import Live
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
-HEADER = "x-anytouch"  # of every request that changes something: another site would need CORS to send it
+# of every request that changes something: another site would need CORS to send it
+HEADER = "x-anytouch"
 _SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
 _ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
 _POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob: data:"
 _SAFE = {
     "Content-Security-Policy": f"{_POLICY}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
-}  # fmt: skip
+}
 _LONGEST = 10_000  # bytes of a request body
 _TABLES = (".csv", ".parquet")
 
@@ -60,14 +72,19 @@ Source: TypeAlias = "StartPage | Table | FeatureMap | Run | Live"
 class StartPage:
     """The first page without anything to show: the cameras of this machine, which `open_camera` opens."""
 
-    kind, name = "start", "start"
+    kind = "start"
+    name = "start"
 
     def __init__(self, open_camera: Callable[[str], Live]) -> None:
         self.open_camera = open_camera
 
     def about(self) -> dict[str, Any]:
         """Return the cameras that are connected now."""
-        return {"cameras": {str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()}}
+        return {
+            "cameras": {
+                str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()
+            }
+        }
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
@@ -75,12 +92,16 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
 
     Features show the pictures of a table among the paths, or of the manifest in their folder that they were made from.
     """
-    tables, sources, features = list[Table](), list[Source](), list[Path]()
+    tables = list[Table]()
+    sources = list[Source]()
+    features = list[Path]()
     for path in paths:
         if str(path) == "examples" and not path.exists():
             tables.append(open_examples())
         elif not path.exists():
-            raise UserError(f"There is no {path}. Name a manifest, a folder, a film, features, a run or a camera.")
+            raise UserError(
+                f"There is no {path}. Name a manifest, a folder, a film, features, a run or a camera."
+            )
         elif path.suffix.lower() == ".npz":
             features.append(path)
         elif path.is_dir() and (path / "metrics.jsonl").is_file():
@@ -102,16 +123,26 @@ def _open_table(path: Path) -> Table:
         return Table(manifests.read(path), title(path))
     if not path.is_dir():
         return open_film(path)
-    inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _TABLES and is_manifest(file)]
+    inside = [
+        file
+        for file in sorted(path.iterdir())
+        if file.suffix.lower() in _TABLES and is_manifest(file)
+    ]
     inside.sort(key=lambda file: file.stem != "manifest")
-    return Table(manifests.read(inside[0]), title(inside[0])) if inside else tables.open_folder(path)
+    if inside:
+        return Table(manifests.read(inside[0]), title(inside[0]))
+    return tables.open_folder(path)
 
 
 def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
     """Return the table that features were made from, if it lies in their folder."""
     file = Path(space.index.about.get("input", ""))
-    inside = file.suffix.lower() in _TABLES and file.resolve().is_relative_to(features.resolve().parent)
-    return Table(manifests.read(file), title(file)) if inside and file.is_file() else None
+    inside = file.suffix.lower() in _TABLES and file.resolve().is_relative_to(
+        features.resolve().parent
+    )
+    if inside and file.is_file():
+        return Table(manifests.read(file), title(file))
+    return None
 
 
 def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
@@ -132,10 +163,14 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
 
     def touch(request: Request, table: Table) -> Response:
         filters = parse_json(request.query_params.get("filters", "{}"))
-        if not isinstance(filters, dict) or not all(isinstance(value, str) for value in filters.values()):
+        if not isinstance(filters, dict) or not all(
+            isinstance(value, str) for value in filters.values()
+        ):
             raise UserError("Filters are texts by the name of their column.")
         row = request.query_params.get("row")
-        place = _number(request, "place") if row is None else table.place_of(_number(request, "row"))
+        place = (
+            _number(request, "place") if row is None else table.place_of(_number(request, "row"))
+        )
         return _json(table.touch(place, filters))
 
     def frame(request: Request, table: Table) -> Response:
@@ -161,7 +196,9 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
         return StreamingResponse(blocks, headers=_SAFE, background=BackgroundTask(packed.close))
 
     def of(kind: str, path: str, answer: Callable[[Request, Any], Response]) -> Route:
-        return Route(f"/api/{{source:int}}/{path}", lambda request: answer(request, source(request, kind)))
+        return Route(
+            f"/api/{{source:int}}/{path}", lambda request: answer(request, source(request, kind))
+        )
 
     async def control(request: Request) -> Response:
         if request.headers.get(HEADER) is None:
@@ -171,7 +208,8 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
             body += part
             if len(body) > _LONGEST:
                 return _json({"error": "The request is too long."}, 413)
-        order, number = parse_json(body.decode()), request.path_params["source"]
+        order = parse_json(body.decode())
+        number = request.path_params["source"]
         if number < len(sources) and isinstance(start := sources[number], StartPage):
             return _json({"source": await run_in_threadpool(_open, start, order, sources)})
         await run_in_threadpool(_control, source(request, "live"), order)
@@ -182,29 +220,65 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
         if name not in _ASSETS:
             return Response("not found", 404, _SAFE)
         data = (files("anytouch_jax.view") / (name or "page.html")).read_bytes()
-        return Response(data, media_type=_ASSETS[name], headers=_SAFE | {"Cache-Control": "no-cache"})
+        return Response(
+            data, media_type=_ASSETS[name], headers=_SAFE | {"Cache-Control": "no-cache"}
+        )
 
     routes = [
-        Route("/", page), Route("/{name:str}", page), Route("/api/sources", listed),
-        of("table", "touch", touch), of("table", "frame/{row:int}", frame),
-        of("table", "photo/{row:int}", lambda request, table: _picture(table.photo(request.path_params["row"]))),
+        Route("/", page),
+        Route("/{name:str}", page),
+        Route("/api/sources", listed),
+        of("table", "touch", touch),
+        of("table", "frame/{row:int}", frame),
+        of(
+            "table",
+            "photo/{row:int}",
+            lambda request, table: _picture(table.photo(request.path_params["row"])),
+        ),
         of("space", "map", lambda request, space: _json(space.map(_method(request)))),
-        of("space", "colours", lambda request, space: _json(
-            space.colours(_method(request), request.query_params.get("column", "")))),
-        of("space", "neighbours", lambda request, space: _json(
-            space.neighbours(_number(request, "row"), others=request.query_params.get("others") == "1"))),
+        of(
+            "space",
+            "colours",
+            lambda request, space: _json(
+                space.colours(_method(request), request.query_params.get("column", ""))
+            ),
+        ),
+        of(
+            "space",
+            "neighbours",
+            lambda request, space: _json(
+                space.neighbours(
+                    _number(request, "row"), others=request.query_params.get("others") == "1"
+                )
+            ),
+        ),
         of("run", "losses", lambda request, run: _json(run.losses(_number(request, "after")))),
-        of("run", "figure/{name:str}",
-           lambda request, run: _picture(run.figure(request.path_params["name"]), side=4000)),
-        of("live", "stream",
-           lambda request, live: StreamingResponse(
-               live.packets(_layer(request)), media_type="application/octet-stream", headers=_SAFE)),
+        of(
+            "run",
+            "figure/{name:str}",
+            lambda request, run: _picture(run.figure(request.path_params["name"]), side=4000),
+        ),
+        of(
+            "live",
+            "stream",
+            lambda request, live: StreamingResponse(
+                live.packets(_layer(request)), media_type="application/octet-stream", headers=_SAFE
+            ),
+        ),
         of("live", "taught", lambda _, live: _json(live.teacher.about())),
-        of("live", "recorded/{row:int}", recorded), of("live", "taught/{file:str}", taught),
+        of("live", "recorded/{row:int}", recorded),
+        of("live", "taught/{file:str}", taught),
         Route("/api/{source:int}/control", control, methods=["POST"]),
-    ]  # fmt: skip
-    guards = [Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)), Middleware(_Token, token=token)]
-    return Starlette(routes=routes, middleware=guards, exception_handlers={UserError: _refuse, ValueError: _refuse})
+    ]
+    guards = [
+        Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)),
+        Middleware(_Token, token=token),
+    ]
+    return Starlette(
+        routes=routes,
+        middleware=guards,
+        exception_handlers={UserError: _refuse, ValueError: _refuse},
+    )
 
 
 def serve(sources: list[Source], host: str, port: int, show: Callable[[str], None]) -> None:
@@ -212,13 +286,22 @@ def serve(sources: list[Source], host: str, port: int, show: Callable[[str], Non
     is_local = host in LOCAL
     token = "" if is_local else secrets.token_urlsafe(18)
     config = uvicorn.Config(
-        app(sources, token=token, hosts=[*LOCAL, "[::1]"] if is_local else ["*"]), host=host, port=port,
-        log_level="error", server_header=False, timeout_graceful_shutdown=1, lifespan="off",
-    )  # fmt: skip
+        app(sources, token=token, hosts=[*LOCAL, "[::1]"] if is_local else ["*"]),
+        host=host,
+        port=port,
+        log_level="error",
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        lifespan="off",
+    )
     try:
-        listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        listener = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
     except OSError as error:
-        raise UserError(f"Port {port} of {host} cannot be used: {error.strerror}. Choose another --port.") from None
+        raise UserError(
+            f"Port {port} of {host} cannot be used: {error.strerror}. Choose another --port."
+        ) from None
     shown = f"[{host}]" if ":" in host else host
     show(f"http://{shown}:{listener.getsockname()[1]}/{f'#token={token}' if token else ''}")
     try:
@@ -239,7 +322,8 @@ class _Token:
     """Refuses requests for data without the token."""
 
     def __init__(self, app: ASGIApp, token: str) -> None:
-        self._app, self._token = app, token
+        self._app = app
+        self._token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if self._token and scope["type"] == "http" and scope["path"].startswith("/api"):
@@ -269,7 +353,8 @@ def _control(live: Live, order: Any) -> None:
     """Do what the page asks of a live source. Raises UserError for anything else."""
     order = order if isinstance(order, dict) else {}
     action, name, sequence = (order.get(key) for key in ("do", "object", "sequence"))
-    rotate, flip = order.get("rotate"), order.get("flip")
+    rotate = order.get("rotate")
+    flip = order.get("flip")
     if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
         if live.recorder.state()["on"]:
             raise UserError("A recording is on. Stop it before you turn the picture.")

@@ -33,12 +33,19 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.fields import Fields
 
-UNKNOWN, UNUSED = "unknown", "unused"  # the sensor and the split of a folder or a film, which the page leaves out
-EXAMPLES = Path(encoder.__file__).with_name("examples")  # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg
-LAYERS = ("frame", "difference", "contact", "depth", "surface")  # of a touch, by which the page shows it
+# the sensor and the split of a folder or a film, which the page leaves out
+UNKNOWN = "unknown"
+UNUSED = "unused"
+# PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg
+EXAMPLES = Path(encoder.__file__).with_name("examples")
+# of a touch, by which the page shows it
+LAYERS = ("frame", "difference", "contact", "depth", "surface")
 MEASURED = LAYERS[3:]  # those that an encoder measures
 SIDE = 640  # pixels of the long side of a picture on the page
-_MOST_ROWS, _MOST_CLIPS, _MOST_CHOICES = 5000, 12, 500  # frames of a clip, clips of a touch, values of a filter
+# frames of a clip, clips of a touch, values of a filter
+_MOST_ROWS = 5000
+_MOST_CLIPS = 12
+_MOST_CHOICES = 500
 _CLIP = 3  # frames on which a touch is measured
 _LINES = 2_000  # points of a loss curve on the page
 _SHARP = 480  # pixels of the long side of a picture with arrows, at least
@@ -49,7 +56,8 @@ _NAMES = 20  # values of a column with a colour each
 _NEAR = 40  # frames of a recording that may be nearer than the next recording, on average
 _BLOCK = 1 << 22  # bytes of metrics.jsonl that are read at once
 _FILTERS = ("sensor", "object", "split", "dataset", "unit")
-_TINTED = (np.arange(256)[None, :, None] / 2 + (127, 60, 0)).astype(np.uint8)  # colours of contact
+# colours of contact
+_TINTED = (np.arange(256)[None, :, None] / 2 + (127, 60, 0)).astype(np.uint8)
 
 
 class Table:
@@ -58,9 +66,11 @@ class Table:
     kind = "table"
 
     def __init__(self, manifest: Manifest, name: str, film: Path | None = None) -> None:
-        self.manifest, self.name = manifest, name
+        self.manifest = manifest
+        self.name = name
         self._film = None if film is None else _Film(film)
-        self._chosen, self._measured = lru_cache(8)(self._choose), lru_cache(256)(self._measure)
+        self._chosen = lru_cache(8)(self._choose)
+        self._measured = lru_cache(256)(self._measure)
 
     def about(self) -> dict[str, Any]:
         """Return the number of rows and touches, and the columns that filter them with their values."""
@@ -78,7 +88,9 @@ class Table:
         place = min(max(place, 0), len(touches) - 1)
         recordings = np.flatnonzero((self._touch_of == touches[place]) & self._chosen(chosen))
         clips = [self._clip(int(one)) for one in recordings[:_MOST_CLIPS]]
-        name = self.manifest.value(clips[0]["rows"][0], "touch") or clips[0].get("sequence", self.name)
+        name = self.manifest.value(clips[0]["rows"][0], "touch") or clips[0].get(
+            "sequence", self.name
+        )
         more = max(0, len(recordings) - _MOST_CLIPS)
         return {"count": len(touches), "place": place, "name": name, "clips": clips, "more": more}
 
@@ -101,7 +113,8 @@ class Table:
 
     def layer(self, row: int, name: str) -> tuple[Array, float, Fields | None]:
         """Return a layer of a row (see `touch_layer`), its contact score, and its fields for the layers MEASURED."""
-        frame, gel = self.frame(row), self._untouched(row)
+        frame = self.frame(row)
+        gel = self._untouched(row)
         view, score = touch_layer(frame, gel, self.threshold(row), name)
         if name not in MEASURED or gel is None or score != score:
             return view, score, None
@@ -112,9 +125,11 @@ class Table:
         order, starts = self._order
         end = self._position(row) + 1
         rows = order[max(starts[starts < end][-1], end - _CLIP) : end].tolist()
-        gel, sensor = self._untouched(row), self.manifest.value(row, "sensor")
+        gel = self._untouched(row)
+        sensor = self.manifest.value(row, "sensor")
         frames = [self.frame(one) for one in rows]
-        with _ONE_BY_ONE:  # the first call takes seconds
+        # the first call takes seconds
+        with _ONE_BY_ONE:
             clip = last_clip(frames, _encoder().config.model.frames)[None]
             name = UNIVERSAL if sensor == UNKNOWN else sensor
             return _encoder().measure(clip, gel and gel[0], name, log=lambda _: None)
@@ -143,7 +158,8 @@ class Table:
     @cached_property
     def _order(self) -> tuple[Array, Array]:
         """Row ids by recording and frame, and the first position of each recording."""
-        sequence, frame = self.manifest.codes("sequence", own=True), np.asarray(self.manifest.table["frame_index"])
+        sequence = self.manifest.codes("sequence", own=True)
+        frame = np.asarray(self.manifest.table["frame_index"])
         step = np.diff(sequence)
         if (step >= 0).all() and ((step > 0) | (np.diff(frame) >= 0)).all():  # as readers write
             order = np.arange(len(sequence))
@@ -182,7 +198,9 @@ class Table:
             return np.ones(len(starts), bool)
         passes = np.ones(len(self.manifest), bool)
         for name, value in filters:
-            passes &= np.asarray(pc.fill_null(pc.equal(self.manifest.column(name).cast(pa.string()), value), False))
+            passes &= np.asarray(
+                pc.fill_null(pc.equal(self.manifest.column(name).cast(pa.string()), value), False)
+            )
         return np.logical_or.reduceat(passes[order], starts)
 
     def _touches(self, filters: tuple[tuple[str, str], ...]) -> Array:
@@ -190,7 +208,11 @@ class Table:
 
     @cached_property
     def _filters(self) -> dict[str, list[str]]:
-        names = [name for name in self.manifest.table.column_names if name in _FILTERS or name.startswith("label.")]
+        names = [
+            name
+            for name in self.manifest.table.column_names
+            if name in _FILTERS or name.startswith("label.")
+        ]
         values = {}
         for name in names:
             column = self.manifest.table[name]
@@ -203,31 +225,45 @@ class Table:
     def _clip(self, recording: int) -> dict[str, Any]:
         """Return what the page shows of a recording: its rows, keys, caption, labels and curves."""
         rows = self._rows(recording)
-        whole, rows = len(rows), rows[:_MOST_ROWS]
+        whole = len(rows)
+        rows = rows[:_MOST_ROWS]
         table = self.manifest.table.take(pa.array(rows))
         first = {name: table[name][0].as_py() for name in table.column_names}
-        labels, curves = {}, {}
+        labels = {}
+        curves = {}
         for name in (name for name in table.column_names if name.startswith("label.")):
             column = table[name]
             if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
                 curves[name] = [None if value != value else value for value in column.to_pylist()]
             values = column.unique().drop_null().to_pylist()
-            labels[name] = values[0] if len(values) == 1 else None if not values else f"{len(values)} values"
+            labels[name] = (
+                values[0] if len(values) == 1 else None if not values else f"{len(values)} values"
+            )
         names = ("sensor", "unit", "sequence", "object", "split", "dataset", "text")
-        keys = {name: first[name] for name in names if first.get(name) not in (None, "", UNKNOWN, UNUSED)}
+        keys = {
+            name: first[name]
+            for name in names
+            if first.get(name) not in (None, "", UNKNOWN, UNUSED)
+        }
         return keys | {
-            "rows": rows.tolist(), "frames": table["frame_index"].to_pylist(), "whole": whole, "labels": labels,
+            "rows": rows.tolist(),
+            "frames": table["frame_index"].to_pylist(),
+            "whole": whole,
+            "labels": labels,
             "curves": {name: values for name, values in curves.items() if len(set(values)) > 1},
-            "photo": bool(first.get("image_path")), "background": bool(first.get("background_path")),
+            "photo": bool(first.get("image_path")),
+            "background": bool(first.get("background_path")),
             "threshold": self.threshold(int(rows[0])),
-        }  # fmt: skip
+        }
 
 
 class _Film:
     """Frames of a video by number. The next frame is read without a search."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._lock, self._next = path, threading.Lock(), 0
+        self._path = path
+        self._lock = threading.Lock()
+        self._next = 0
         self._video = open_video(path)
         self.read = lru_cache(256)(self._read)
 
@@ -244,10 +280,14 @@ class _Film:
 
 def scale_down(picture: Array, side: int = SIDE) -> Array:
     """Return a picture whose long side has at most `side` pixels."""
-    return picture if max(picture.shape[:2]) <= side else scale_picture(picture, side)
+    if max(picture.shape[:2]) <= side:
+        return picture
+    return scale_picture(picture, side)
 
 
-def touch_layer(frame: Array, gel: tuple[Array, UntouchedGel] | None, limit: float, name: str) -> tuple[Array, float]:
+def touch_layer(
+    frame: Array, gel: tuple[Array, UntouchedGel] | None, limit: float, name: str
+) -> tuple[Array, float]:
     """Return one of LAYERS as a picture RGB u8 (h, w, 3), and the contact score.
 
     Without a `gel` (scaled down) of the same proportions, it is the frame, and the score is NaN. For MEASURED it is the
@@ -267,7 +307,8 @@ def touch_layer(frame: Array, gel: tuple[Array, UntouchedGel] | None, limit: flo
         background = gel[0] if gel[0].shape == view.shape else cv2.resize(gel[0], (width, height))
         (view,) = subtract_background([view], background)
     elif name == "contact":
-        mask, tinted = (cv2.resize(change, (width, height)) > limit).astype(np.uint8), cv2.LUT(view, _TINTED)
+        mask = (cv2.resize(change, (width, height)) > limit).astype(np.uint8)
+        tinted = cv2.LUT(view, _TINTED)
         view = cv2.convertScaleAbs(view, alpha=1 / 3, beta=40)
         cv2.copyTo(tinted, mask, view)
     return view, contact_score(change)
@@ -276,42 +317,62 @@ def touch_layer(frame: Array, gel: tuple[Array, UntouchedGel] | None, limit: flo
 def open_folder(folder: Path) -> Table:
     """Return the pictures of a folder as one recording. Raises UserError if there are none."""
     frames, named = list_images(folder)
-    return Table(_one_recording(folder, [file.name for file in frames], named.get("background")), title(folder))
+    return Table(
+        _one_recording(folder, [file.name for file in frames], named.get("background")),
+        title(folder),
+    )
 
 
 def open_film(film: Path) -> Table:
     """Return the frames of a film as one recording. Raises UserError if it has none."""
     count = count_frames(film)
     if not count:
-        raise UserError(f"{film} is no film that can be read. Name a manifest, a folder of pictures or a film.")
+        raise UserError(
+            f"{film} is no film that can be read. Name a manifest, a folder of pictures or a film."
+        )
     return Table(_one_recording(film.parent, [film.name] * count, None), film.stem, film)
 
 
 def open_examples() -> Table:
     """Return the example touches of the package: two presses, each by three sensors."""
-    touches = [file.stem.split("-") for file in sorted(EXAMPLES.glob("*.jpg")) if file.stem.count("-") == 1]
+    touches = [
+        file.stem.split("-") for file in sorted(EXAMPLES.glob("*.jpg")) if file.stem.count("-") == 1
+    ]
     names = ["-".join(touch) for touch in touches]
     columns = {
-        "path": [f"{name}.jpg" for name in names], "sensor": [sensor for _, sensor in touches], "sequence": names,
-        "frame_index": [0] * len(names), "split": [UNUSED] * len(names), "touch": [press for press, _ in touches],
+        "path": [f"{name}.jpg" for name in names],
+        "sensor": [sensor for _, sensor in touches],
+        "sequence": names,
+        "frame_index": [0] * len(names),
+        "split": [UNUSED] * len(names),
+        "touch": [press for press, _ in touches],
         "background_path": [f"{name}-background.jpg" for name in names],
-    }  # fmt: skip
+    }
     return Table(manifests.from_columns(columns, EXAMPLES / "manifest.parquet"), "examples")
 
 
 def title(path: Path) -> str:
     """Return the name of a file or folder for people: a manifest or features are called by their folder."""
     path = path.absolute()
-    plain = path.parent.name if path.stem in ("manifest", "features") else path.stem if path.suffix else path.name
+    plain = (
+        path.parent.name
+        if path.stem in ("manifest", "features")
+        else path.stem
+        if path.suffix
+        else path.name
+    )
     return plain or "recordings"
 
 
 def _one_recording(folder: Path, names: list[str], background: Path | None) -> Manifest:
     count = len(names)
     columns: dict[str, Any] = {
-        "path": names, "sensor": [UNKNOWN] * count, "sequence": [UNKNOWN] * count,
-        "frame_index": list(range(count)), "split": [UNUSED] * count,
-    }  # fmt: skip
+        "path": names,
+        "sensor": [UNKNOWN] * count,
+        "sequence": [UNKNOWN] * count,
+        "frame_index": list(range(count)),
+        "split": [UNUSED] * count,
+    }
     if background is not None:
         columns["background_path"] = [background.name] * count
     return manifests.from_columns(columns, folder / "manifest.parquet")
@@ -323,7 +384,8 @@ class Run:
     kind = "run"
 
     def __init__(self, folder: Path) -> None:
-        self.name, self._folder = folder.name, folder.resolve()
+        self.name = folder.name
+        self._folder = folder.resolve()
 
     def about(self) -> dict[str, Any]:
         """Return nothing: all of it may change."""
@@ -345,10 +407,16 @@ class Run:
                 except ValueError:
                     continue
                 if isinstance(row, dict) and _is_number(row.get("step")):
-                    lines.append({str(name)[:60]: value for name, value in row.items() if _is_number(value)})
+                    lines.append(
+                        {str(name)[:60]: value for name, value in row.items() if _is_number(value)}
+                    )
             start += len(whole)
         every = -(-len(lines) // _LINES)
-        return {"lines": lines[:: max(1, every)], "next": start, "figures": sorted(self._figures(), reverse=True)}
+        return {
+            "lines": lines[:: max(1, every)],
+            "next": start,
+            "figures": sorted(self._figures(), reverse=True),
+        }
 
     def figure(self, name: str) -> np.ndarray:
         """Return a figure of the run, RGB u8 (h, w, 3). Raises UserError."""
@@ -363,14 +431,16 @@ class Run:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and abs(value) < 1e300  # not NaN: no comparison with it is true
+    # not NaN: no comparison with it is true
+    return isinstance(value, int | float) and abs(value) < 1e300
 
 
 @cache
 def _encoder() -> Encoder:
     from anytouch_jax.encoder.encoder import load_encoder
 
-    return load_encoder("anytouch-tiny")  # measures recordings, by which no encoder is named
+    # measures recordings, by which no encoder is named
+    return load_encoder("anytouch-tiny")
 
 
 def last_clip(frames: Sequence[Array], length: int) -> Array:
@@ -384,7 +454,8 @@ def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
     from anytouch_jax.encoder.fields import depth_levels, overlay
 
     if name == "depth":
-        larger = max(1.0, _SHARP / max(frame.shape[:2]))  # lines on few pixels would be thick
+        # lines on few pixels would be thick
+        larger = max(1.0, _SHARP / max(frame.shape[:2]))
         return overlay(cv2.resize(frame, None, fx=larger, fy=larger), measured, text=False)
     scale = _SIDE / max(1.0, measured.shape)
     small = cv2.resize(measured.depth[0], (round(scale), round(scale * measured.shape)))
@@ -395,17 +466,23 @@ def field_numbers(measured: Fields) -> dict[str, Any]:
     """Return what the page writes of a frame; `high` is the depth of a white place of the surface, in widths."""
     from anytouch_jax.encoder.fields import depth_levels
 
-    about, unit = measured.summary(), "widths" if measured.width_mm is None else "mm"
+    about = measured.summary()
+    unit = "widths" if measured.width_mm is None else "mm"
     curves = {"force, N": about["force_z"], f"depth, {unit}": about["depth"]}
     curves["slip"] = about["slip"] if measured.area[0] > 0 else 0.0
     _, high = depth_levels(measured.depth[0], measured.width_mm)
     return {
         "curves": {name: round(value, 4) for name, value in curves.items() if value is not None},
         "force": None if measured.force is None else [about[f"force_{axis}"] for axis in "xyz"],
-        "force_std": about["force_z_std"], "sideways_std": about["force_x_std"], "depth": about["depth"],
-        "depth_std": about["depth_std"], "area": about["area"], "unit": unit, "faults": measured.faults,
+        "force_std": about["force_z_std"],
+        "sideways_std": about["force_x_std"],
+        "depth": about["depth"],
+        "depth_std": about["depth_std"],
+        "area": about["area"],
+        "unit": unit,
+        "faults": measured.faults,
         "high": high / (measured.width_mm or 1.0),
-    }  # fmt: skip
+    }
 
 
 class FeatureMap:
@@ -416,9 +493,12 @@ class FeatureMap:
     def __init__(self, path: Path, tables: list[Table]) -> None:
         from anytouch_jax.encoder.embed import load_index
 
-        self.name, self.index = title(path), load_index(path)
+        self.name = title(path)
+        self.index = load_index(path)
         self._rows = self.index.rows
-        self.table = next((number for number, table in enumerate(tables) if self._has_rows_of(table)), None)
+        self.table = next(
+            (number for number, table in enumerate(tables) if self._has_rows_of(table)), None
+        )
         self.map = lru_cache(len(METHODS))(self._map)
 
     def about(self) -> dict[str, Any]:
@@ -431,7 +511,9 @@ class FeatureMap:
         """Return points {x, y, rows} in -1..1 of at most METHODS[method] rows, evenly spread. Raises UserError."""
         if method not in METHODS:
             raise UserError(f"A map is by {' or '.join(METHODS)}, not {method[:20]}.")
-        rows = np.unique(np.linspace(0, len(self._rows) - 1, min(METHODS[method], len(self._rows))).astype(int))
+        rows = np.unique(
+            np.linspace(0, len(self._rows) - 1, min(METHODS[method], len(self._rows))).astype(int)
+        )
         values = self.index.values[rows]
         if method == "tsne":
             from anytouch_jax.evaluate.plots import tsne
@@ -443,7 +525,11 @@ class FeatureMap:
             points = np.pad(points, ((0, 0), (0, 2 - points.shape[1])))
         points = points - (points.max(0) + points.min(0)) / 2
         points = points / max(float(np.abs(points).max()), 1e-9)
-        return {"x": points[:, 0].round(4).tolist(), "y": points[:, 1].round(4).tolist(), "rows": rows.tolist()}
+        return {
+            "x": points[:, 0].round(4).tolist(),
+            "y": points[:, 1].round(4).tolist(),
+            "rows": rows.tolist(),
+        }
 
     def colours(self, method: str, column: str) -> dict[str, Any]:
         """Return {values} of a column of numbers, or {codes, names}, for the points of a map. Raises UserError."""
@@ -451,8 +537,12 @@ class FeatureMap:
             raise UserError(f"The features have no column {column[:50]}.")
         values = self.index.keys[column][self.map(method)["rows"]]
         if values.dtype.kind in "iuf" and len(np.unique(values)) > _NAMES:
-            return {"values": [None if not np.isfinite(value) else float(value) for value in values]}
-        distinct, codes, counts = np.unique(values.astype(str), return_inverse=True, return_counts=True)
+            return {
+                "values": [None if not np.isfinite(value) else float(value) for value in values]
+            }
+        distinct, codes, counts = np.unique(
+            values.astype(str), return_inverse=True, return_counts=True
+        )
         shown = np.sort(np.argsort(-counts, kind="stable")[:_NAMES])
         place = np.full(len(distinct), len(shown))
         place[shown] = np.arange(len(shown))
@@ -471,7 +561,9 @@ class FeatureMap:
         found = self.near(self.index.values[row], np.flatnonzero(allowed))
         return {"row": self._describe(row), "hits": found}
 
-    def near(self, values: Array, among: Array | None = None, count: int = 10) -> list[dict[str, Any]]:
+    def near(
+        self, values: Array, among: Array | None = None, count: int = 10
+    ) -> list[dict[str, Any]]:
         """Return the nearest of `among` rows (m,) to unit features (d,) with cosines, one frame of a recording."""
         from anytouch_jax.encoder.embed import nearest
 
@@ -484,7 +576,9 @@ class FeatureMap:
         if "sequence" in self.index.keys:
             rows = rows[np.sort(np.unique(self.index.keys["sequence"][rows], return_index=True)[1])]
         cosine = dict(zip(among[places[0]].tolist(), cosines[0].tolist(), strict=True))
-        return [self._describe(row) | {"cosine": round(cosine[row], 4)} for row in rows[:count].tolist()]
+        return [
+            self._describe(row) | {"cosine": round(cosine[row], 4)} for row in rows[:count].tolist()
+        ]
 
     def _describe(self, row: int) -> dict[str, Any]:
         return {"row": row, "table_row": int(self._rows[row]), "about": self.index.describe(row)}
@@ -495,6 +589,14 @@ class FeatureMap:
         if few.min() < 0 or self._rows.max() >= len(table.manifest):
             return False
         keys = [name for name in ("path", "frame_index") if name in self.index.keys]
-        ours = {name: self.index.keys[name][[0, len(self._rows) // 2, -1]].astype(str).tolist() for name in keys}
-        there = {name: [str(table.manifest.value(row, name)).rpartition("/")[2] for row in few] for name in keys}
-        return bool(keys) and all([one.rpartition("/")[2] for one in ours[name]] == there[name] for name in keys)
+        ours = {
+            name: self.index.keys[name][[0, len(self._rows) // 2, -1]].astype(str).tolist()
+            for name in keys
+        }
+        there = {
+            name: [str(table.manifest.value(row, name)).rpartition("/")[2] for row in few]
+            for name in keys
+        }
+        return bool(keys) and all(
+            [one.rpartition("/")[2] for one in ours[name]] == there[name] for name in keys
+        )

@@ -38,17 +38,20 @@ from anytouch_jax.weights.tree import flatten, nest
 
 Tree = Any
 
-RECORD, FORMAT = "checkpoint.json", "anytouch_jax.checkpoint.1"
+RECORD = "checkpoint.json"
+FORMAT = "anytouch_jax.checkpoint.1"
 PARTIAL = "partial"  # a metric of checkpoints whose loss covers fewer steps than that of others
 _STEP = re.compile(r"\d{8,}")
-_UNFINISHED = re.compile(r"\d{8,}\.(writing|deleted)(\..+)?")  # being written or removed, by us or by Orbax
+# being written or removed, by us or by Orbax
+_UNFINISHED = re.compile(r"\d{8,}\.(writing|deleted)(\..+)?")
 _AVERAGE = "opt_state/ema/"  # runs of an older version may have an average of the parameters
 _LISTED = 5  # names in one error message
 _LINGER = 5.0  # seconds for threads of a failed save
 _TRIES = 3  # to read the latest checkpoint of a running run
 _PATIENCE = 30.0  # seconds for a save whose other processes may be lost
 _CHUNK = 1 << 22
-_ORBAX = threading.Lock()  # Orbax allows one running operation a process: a load during a save ends the save
+# Orbax allows one running operation a process: a load during a save ends the save
+_ORBAX = threading.Lock()
 
 
 class CheckpointError(UserError):
@@ -77,7 +80,9 @@ class Checkpoints:
     are removed. Every process of a multi-process run makes one; process 0 renames and removes.
     """
 
-    def __init__(self, folder: str | Path, *, keep: int, config_json: str, metadata: dict[str, Any]) -> None:
+    def __init__(
+        self, folder: str | Path, *, keep: int, config_json: str, metadata: dict[str, Any]
+    ) -> None:
         self.folder = Path(folder).absolute()
         self._keep = keep
         self._described = {"config": config_json, "metadata": metadata}
@@ -107,24 +112,35 @@ class Checkpoints:
         self._sweep()  # threads of a failed save may have written on
         target = self.folder / f"{step:08d}"
         # A numpy array may be written to while the save runs.
-        leaves = {n: x if isinstance(x, jax.Array) else np.array(x) for n, x in flatten(state).items()}
+        leaves = {
+            n: x if isinstance(x, jax.Array) else np.array(x) for n, x in flatten(state).items()
+        }
         self.check_space(leaves)
         content = {
             **self._described,
             "step": int(step),
-            "metrics": {name: float(value) if math.isfinite(value) else None for name, value in metrics.items()},
+            "metrics": {
+                name: float(value) if math.isfinite(value) else None
+                for name, value in metrics.items()
+            },
             "arrays": {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in leaves.items()},
         }
-        arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}  # Orbax refuses arrays of size zero
+        # Orbax refuses arrays of size zero
+        arrays = {name: leaf for name, leaf in leaves.items() if leaf.size}
         context = ocp.Context()
-        context.array.saving.use_compression = False  # trained weights do not shrink, and a save takes twice as long
+        # trained weights do not shrink, and a save takes twice as long
+        context.array.saving.use_compression = False
         # Smaller ones are not cut among devices: each cut is a program to compile.
         context.array.saving.min_slice_bytes_for_replica_parallel = 1 << 20
         release = _acquire_orbax()
         try:
             with self._one_sentence(target), context:
                 response = ocp.save_async(_writing(target), nest(arrays))
-            self._pending = target, self._worker.submit(self._finish, target, response, content, release), release
+            self._pending = (
+                target,
+                self._worker.submit(self._finish, target, response, content, release),
+                release,
+            )
         except BaseException:
             release()
             raise
@@ -133,7 +149,8 @@ class Checkpoints:
         """Block until the running save is on disk. Raises CheckpointError if it failed (a full disk)."""
         if self._pending is None:
             return
-        (target, future, _), self._pending = self._pending, None
+        (target, future, _) = self._pending
+        self._pending = None
         with self._one_sentence(target):
             try:
                 future.result()
@@ -158,7 +175,9 @@ class Checkpoints:
         record = checked(folder)
         first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
         wanted = {
-            name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=getattr(leaf, "sharding", None) or first)
+            name: jax.ShapeDtypeStruct(
+                leaf.shape, leaf.dtype, sharding=getattr(leaf, "sharding", None) or first
+            )
             for name, leaf in flatten(abstract_state).items()
         }
         _compare(folder, wanted, _forms(record))
@@ -166,25 +185,37 @@ class Checkpoints:
         arrays = _load(folder, wanted) | {
             n: jax.device_put(np.zeros(x.shape, x.dtype), x.sharding) for n, x in empty.items()
         }
-        return jax.tree.unflatten(jax.tree.structure(abstract_state), [arrays[name] for name in wanted])
+        return jax.tree.unflatten(
+            jax.tree.structure(abstract_state), [arrays[name] for name in wanted]
+        )
 
     def close(self) -> None:
         """Finish the running save and its housekeeping. Raises CheckpointError if the save failed."""
         self.wait()
         self._worker.shutdown()
 
-    def leave(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def leave(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """`close` at the end of a context; after an error in one of several processes, wait at most half a minute."""
         if error is None or jax.process_count() == 1:
             self.close()
             return
         if self._pending is not None:
             with suppress(Exception):
-                self._pending[1].result(0 if isinstance(error, jax.errors.JaxRuntimeError) else _PATIENCE)
-            self._pending[2]()  # a save that never ends, or was cancelled, must not block a load
+                self._pending[1].result(
+                    0 if isinstance(error, jax.errors.JaxRuntimeError) else _PATIENCE
+                )
+            # a save that never ends, or was cancelled, must not block a load
+            self._pending[2]()
         self._worker.shutdown(wait=False, cancel_futures=True)
 
-    def _finish(self, target: Path, response: Any, content: dict[str, Any], release: Callable[[], None]) -> None:
+    def _finish(
+        self, target: Path, response: Any, content: dict[str, Any], release: Callable[[], None]
+    ) -> None:
         """Write the record once the arrays are on disk, rename, and remove old checkpoints (on the worker thread)."""
         try:
             response.result()
@@ -214,13 +245,21 @@ class Checkpoints:
             yield
         except Exception as error:  # Orbax and tensorstore wrap OSError in several types
             for thread in threading.enumerate():
-                if thread.name == "serialize_shardings":  # Orbax's, which would write on into a removed folder
+                if (
+                    thread.name == "serialize_shardings"
+                ):  # Orbax's, which would write on into a removed folder
                     thread.join(_LINGER)
             self._sweep()
             reason = " ".join(str(error).split())[:300]
             full = getattr(error, "errno", None) == errno.ENOSPC or "No space left" in str(error)
-            advice = "the disk is full, free some space and run the same command again" if full else reason
-            raise CheckpointError(f"could not write checkpoint {path}: {advice}; older ones are untouched") from error
+            advice = (
+                "the disk is full, free some space and run the same command again"
+                if full
+                else reason
+            )
+            raise CheckpointError(
+                f"could not write checkpoint {path}: {advice}; older ones are untouched"
+            ) from error
 
 
 def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]:
@@ -228,7 +267,9 @@ def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]
     return _description(read_record(resolve(Path(folder), step)))
 
 
-def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, Any], str, dict[str, Any]]:
+def load_params(
+    folder: str | Path, step: int | None = None
+) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Return (parameters as a nested dict of numpy arrays, config JSON, metadata) of a checkpoint.
 
     `folder` is a run, its checkpoints folder, or one checkpoint. If a running run removes the latest meanwhile, the
@@ -241,17 +282,30 @@ def load_params(folder: str | Path, step: int | None = None) -> tuple[dict[str, 
             parts = ("trainable/", "frozen/", _AVERAGE)
             forms = {name: like for name, like in _forms(record).items() if name.startswith(parts)}
             if not forms:
-                raise CheckpointError(f"checkpoint {target} has no parameters (nothing under trainable/ or frozen/)")
-            wanted = {name: np.broadcast_to(np.zeros((), like.dtype), like.shape) for name, like in forms.items()}
+                raise CheckpointError(
+                    f"checkpoint {target} has no parameters (nothing under trainable/ or frozen/)"
+                )
+            wanted = {
+                name: np.broadcast_to(np.zeros((), like.dtype), like.shape)
+                for name, like in forms.items()
+            }
             arrays = wanted | _load(target, wanted)
         except (CheckpointError, OSError):
             if target.is_dir():
                 raise
         else:
-            params = {n.split("/", 1)[1]: leaf for n, leaf in arrays.items() if not n.startswith(_AVERAGE)}
-            params |= {n.removeprefix(_AVERAGE): leaf for n, leaf in arrays.items() if n.startswith(_AVERAGE)}
+            params = {
+                n.split("/", 1)[1]: leaf for n, leaf in arrays.items() if not n.startswith(_AVERAGE)
+            }
+            params |= {
+                n.removeprefix(_AVERAGE): leaf
+                for n, leaf in arrays.items()
+                if n.startswith(_AVERAGE)
+            }
             return nest(params), record["config"], _description(record)
-    raise CheckpointError(f"checkpoint {target} was removed while it was read; read the latest one, or another step")
+    raise CheckpointError(
+        f"checkpoint {target} was removed while it was read; read the latest one, or another step"
+    )
 
 
 def _acquire_orbax() -> Callable[[], None]:
@@ -276,35 +330,56 @@ def _discard(target: Path) -> None:
 
 def _load(folder: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
     """Return the named arrays that are not empty, of the types of `wanted`. Raises CheckpointError for other shapes."""
-    jax.local_devices()  # a wrong JAX_PLATFORMS is no fault of the checkpoint
+    # a wrong JAX_PLATFORMS is no fault of the checkpoint
+    jax.local_devices()
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     wanted = {name: like for name, like in wanted.items() if math.prod(like.shape)}
     try:
         with _ORBAX, context:
             stored = flatten(ocp.metadata(folder).metadata)
-            for name, like in wanted.items():  # before memory is taken for them
+            # before memory is taken for them
+            for name, like in wanted.items():
                 form = stored.get(name)
-                if form is None or (tuple(form.shape), np.dtype(form.dtype)) != (like.shape, np.dtype(like.dtype)):
+                if form is None or (tuple(form.shape), np.dtype(form.dtype)) != (
+                    like.shape,
+                    np.dtype(like.dtype),
+                ):
                     raise ValueError(f"{name[:200]} is not stored as {like.dtype} {like.shape}")
-            return flatten(ocp.load(folder, nest(wanted))) if wanted else {}
+            if wanted:
+                return flatten(ocp.load(folder, nest(wanted)))
+            return {}
     except Exception as error:  # its files are whole, so this is another Orbax or a lack of memory
         reason = " ".join(str(error).split())[:300]
-        raise CheckpointError(f"could not read checkpoint {folder} ({type(error).__name__}: {reason})") from error
+        raise CheckpointError(
+            f"could not read checkpoint {folder} ({type(error).__name__}: {reason})"
+        ) from error
 
 
 def _forms(record: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
-    return {n: jax.ShapeDtypeStruct(tuple(shape), np.dtype(kind)) for n, (shape, kind) in record["arrays"].items()}
+    return {
+        n: jax.ShapeDtypeStruct(tuple(shape), np.dtype(kind))
+        for n, (shape, kind) in record["arrays"].items()
+    }
 
 
 def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
     """Raise CheckpointError that names up to five entries if a checkpoint does not have the wanted form."""
 
     def form(like: Any) -> str:
-        return "nothing" if like is None else f"{tuple(like.shape)} {np.dtype(like.dtype)}"
+        if like is None:
+            return "nothing"
+        return f"{tuple(like.shape)} {np.dtype(like.dtype)}"
 
-    pairs = {name: (form(stored.get(name)), form(wanted.get(name))) for name in sorted({*wanted, *stored})}
-    differing = [f"{name}: {theirs} stored, {ours} wanted" for name, (theirs, ours) in pairs.items() if theirs != ours]
+    pairs = {
+        name: (form(stored.get(name)), form(wanted.get(name)))
+        for name in sorted({*wanted, *stored})
+    }
+    differing = [
+        f"{name}: {theirs} stored, {ours} wanted"
+        for name, (theirs, ours) in pairs.items()
+        if theirs != ours
+    ]
     if differing:
         raise CheckpointError(
             f"checkpoint {folder} does not fit this configuration, use the preset and settings it was trained with; "
@@ -313,14 +388,20 @@ def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any])
 
 
 def _description(record: Mapping[str, Any]) -> dict[str, Any]:
-    return {**record["metadata"], "step": record["step"], "config": record["config"], "metrics": record["metrics"]}
+    return {
+        **record["metadata"],
+        "step": record["step"],
+        "config": record["config"],
+        "metrics": record["metrics"],
+    }
 
 
 def best_of(folder: Path) -> int | None:
     """Return the step of lowest loss over many steps in a folder, the latest of equals; None if no loss is known."""
     losses: dict[int, float] = {}
     for step in steps(folder):
-        with suppress(CheckpointError):  # `restore` reports a damaged one
+        # `restore` reports a damaged one
+        with suppress(CheckpointError):
             metrics = read_record(folder / f"{step:08d}")["metrics"]
             if metrics.get("loss") is not None and not metrics.get(PARTIAL):
                 losses[step] = metrics["loss"]
@@ -332,12 +413,18 @@ def steps(folder: str | Path) -> list[int]:
     folder = Path(folder)
     if not folder.is_dir():
         return []
-    return sorted(int(entry.name) for entry in folder.iterdir() if _STEP.fullmatch(entry.name) and entry.is_dir())
+    return sorted(
+        int(entry.name)
+        for entry in folder.iterdir()
+        if _STEP.fullmatch(entry.name) and entry.is_dir()
+    )
 
 
 def is_run(folder: Path) -> bool:
     """Return whether a folder is that of a run, of checkpoints or of one checkpoint."""
-    return (folder / "checkpoints").is_dir() or bool(steps(folder) or _STEP.fullmatch(folder.absolute().name))
+    return (folder / "checkpoints").is_dir() or bool(
+        steps(folder) or _STEP.fullmatch(folder.absolute().name)
+    )
 
 
 def resolve(folder: Path, step: int | None) -> Path:
@@ -348,11 +435,17 @@ def resolve(folder: Path, step: int | None) -> Path:
     elif _STEP.fullmatch(folder.name) and folder.is_dir() and not steps(folder):
         if step in (None, int(folder.name)):
             return folder
-        raise CheckpointError(f"{folder} is the checkpoint of step {int(folder.name)}, not of step {step}")
+        raise CheckpointError(
+            f"{folder} is the checkpoint of step {int(folder.name)}, not of step {step}"
+        )
     if folder.is_file():
-        raise CheckpointError(f"{folder} is a file; give the folder of a run, which has checkpoints")
+        raise CheckpointError(
+            f"{folder} is a file; give the folder of a run, which has checkpoints"
+        )
     if not (present := steps(folder)):
-        raise CheckpointError(f"there is no complete checkpoint in {folder}; train first, or give another folder")
+        raise CheckpointError(
+            f"there is no complete checkpoint in {folder}; train first, or give another folder"
+        )
     if step not in (None, *present):
         listed = ", ".join(map(str, present[-10:]))
         raise CheckpointError(f"there is no checkpoint of step {step} in {folder}; it has {listed}")
@@ -383,18 +476,26 @@ def read_record(folder: Path) -> dict[str, Any]:
         outer = parse_json(path.read_bytes())
         record = outer["record"]
         whole = outer["checksum"] == zlib.crc32(json.dumps(record, sort_keys=True).encode())
-    except (ValueError, KeyError, TypeError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+    ):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} cannot be read") from None
     if not whole or not isinstance(record, dict):
         raise CheckpointError(f"checkpoint {folder} is damaged: {RECORD} was altered")
     if record.get("format") != FORMAT:
         stored = repr(record.get("format"))[:100]
-        raise CheckpointError(f"checkpoint {folder} has format {stored}; this program reads {FORMAT!r}")
+        raise CheckpointError(
+            f"checkpoint {folder} has format {stored}; this program reads {FORMAT!r}"
+        )
     for field, (kind, valid) in _FIELDS.items():
         value = record.get(field)
         items: Any = value.items() if isinstance(value, dict) else ()
         if type(value) is not kind or not all(valid(*item) for item in items):
-            raise CheckpointError(f"checkpoint {folder} is damaged: {field} in {RECORD} is missing or of another type")
+            raise CheckpointError(
+                f"checkpoint {folder} is damaged: {field} in {RECORD} is missing or of another type"
+            )
     return record
 
 
@@ -417,10 +518,14 @@ def _is_file(name: str, value: Any) -> bool:
 
 
 # The fields of a record: the type of each, and the check of its values by name.
-_TYPES = re.compile(r"bool|u?int(4|8|16|32|64)|b?float(16|32|64)|float[48]_e\dm\d\w*|complex(64|128)")
+_TYPES = re.compile(
+    r"bool|u?int(4|8|16|32|64)|b?float(16|32|64)|float[48]_e\dm\d\w*|complex(64|128)"
+)
 _METADATA: dict[str, Callable[[Any], bool]] = {  # of a run, that its readers use
     "seen": lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value),
-    "source": lambda value: isinstance(value, dict) and ("sensor" not in value or {"run", "frames"} <= value.keys()),
+    "source": lambda value: (
+        isinstance(value, dict) and ("sensor" not in value or {"run", "frames"} <= value.keys())
+    ),
     "data": lambda value: isinstance(value, str),
 }
 _FIELDS: dict[str, tuple[type, Callable[[str, Any], bool]]] = {
@@ -450,7 +555,8 @@ def _verified(folder: Path) -> dict[str, Any]:
     """Return the record after comparing every file with it. Raises CheckpointError that names the first bad file."""
     record = read_record(folder)
     for name, (size, checksum) in record["files"].items():
-        path, problem = folder / name, None
+        path = folder / name
+        problem = None
         if not path.is_file():
             problem = "is missing"
         elif path.stat().st_size != size:

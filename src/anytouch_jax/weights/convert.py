@@ -37,7 +37,18 @@ from anytouch_jax.weights.tree import flatten, nest
 Params = dict[str, Any]
 
 # Parts that some model of ours has, and the classifier that came with a probe file.
-_OWN_PARTS = ("touch", "decoder", "image", "lora", "text", "logit_scale", "matcher", "fields", "force", "head")
+_OWN_PARTS = (
+    "touch",
+    "decoder",
+    "image",
+    "lora",
+    "text",
+    "logit_scale",
+    "matcher",
+    "fields",
+    "force",
+    "head",
+)
 _LISTED = 6  # names in one error message
 _HEAD = {"head.weight": "head/kernel", "head.bias": "head/bias"}
 
@@ -52,7 +63,9 @@ def detect_layout(weights: Weights) -> str:
         if any(re.fullmatch(keymap.mark, key) for key in weights):
             return keymap.name
     names = ", ".join(list(weights)[:5]) or "no arrays"
-    raise WeightsError(f"these are not weights of AnyTouch, HF CLIP or OpenCLIP: the file has {names}")
+    raise WeightsError(
+        f"these are not weights of AnyTouch, HF CLIP or OpenCLIP: the file has {names}"
+    )
 
 
 def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, int]]:
@@ -63,10 +76,17 @@ def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, 
     """
     layout = detect_layout(weights)
     if layout == "own":
-        raise WeightsError("its metadata lack the model; write the file again by `anytouch export --to safetensors`")
+        raise WeightsError(
+            "its metadata lack the model; write the file again by `anytouch export --to safetensors`"
+        )
     try:
         return KEYMAPS[layout].detect(weights, heads)
-    except (KeyError, IndexError, ValueError, TypeError) as error:  # an array is missing or has an odd shape
+    except (
+        KeyError,
+        IndexError,
+        ValueError,
+        TypeError,
+    ) as error:  # an array is missing or has an odd shape
         raise WeightsError(
             f"the model cannot be detected from these {layout} weights: {error} is missing or of an odd shape"
         ) from None
@@ -85,7 +105,11 @@ def refuse_unknown(stacks: Mapping[str, int]) -> None:
 
 
 def to_params(
-    weights: Weights, model: ModelConfig, *, ignore: Collection[str] = (), optional: Collection[str] = ()
+    weights: Weights,
+    model: ModelConfig,
+    *,
+    ignore: Collection[str] = (),
+    optional: Collection[str] = (),
 ) -> Params:
     """Return the parameters of a file as a nested dict of float32 arrays under our names.
 
@@ -93,16 +117,20 @@ def to_params(
     Position tables are resized. A probe file gives its classifier as `head`. A file may lack those in `optional`.
     Raises WeightsError.
     """
-    layout, shapes = detect_layout(weights), param_shapes(model)
-    keymap, entries = KEYMAPS[layout], KEYMAPS[layout].entries(model)
+    layout = detect_layout(weights)
+    shapes = param_shapes(model)
+    keymap = KEYMAPS[layout]
+    entries = KEYMAPS[layout].entries(model)
     if layout == "own":  # a file of stage 1 has no towers
         parts = {key.split("/")[0] for key in weights}
         entries = [entry for entry in entries if entry.name.split("/")[0] in parts]
     entries = [entry for entry in entries if entry.key in weights or entry.name not in optional]
     head = _HEAD if layout == "probe" and weights.keys() >= _HEAD.keys() else {}
-    first, parts = {entry.key: entry for entry in entries}, {name.split("/")[0] for name in shapes}
+    first = {entry.key: entry for entry in entries}
+    parts = {name.split("/")[0] for name in shapes}
     left_out = [pattern for part, pattern in keymap.towers.items() if part not in parts]
-    left_out += [] if layout == "own" else [r"(.*\.)?(position_ids|attn_mask)"]  # buffers
+    # buffers
+    left_out += [] if layout == "own" else [r"(.*\.)?(position_ids|attn_mask)"]
     unread = {*ignore, *head, *keymap.unused}
     arrays = {
         key: _fit(array, first[key], model) if key in first else array
@@ -116,16 +144,25 @@ def to_params(
     return nest(flat)
 
 
-def fill(entries: Sequence[Entry], arrays: Weights, shapes: Mapping[str, Shape]) -> dict[str, np.ndarray]:
+def fill(
+    entries: Sequence[Entry], arrays: Weights, shapes: Mapping[str, Shape]
+) -> dict[str, np.ndarray]:
     """Return our parameters by name, in float32, from the arrays of a file. Each number is copied once."""
-    flat = {name: np.empty(shapes[name], np.float32) for name in dict.fromkeys(entry.name for entry in entries)}
+    flat = {
+        name: np.empty(shapes[name], np.float32)
+        for name in dict.fromkeys(entry.name for entry in entries)
+    }
     for entry in entries:
-        array = arrays[entry.key] if entry.part is None else np.split(arrays[entry.key], 3)[entry.part]
+        array = (
+            arrays[entry.key] if entry.part is None else np.split(arrays[entry.key], 3)[entry.part]
+        )
         flat[entry.name][... if entry.layer is None else entry.layer] = entry.read(array)
     return flat
 
 
-def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False) -> dict[str, np.ndarray]:
+def to_release(
+    params: Params, model: ModelConfig, *, allow_extra: bool = False
+) -> dict[str, np.ndarray]:
     """Return the parameters under the authors' names: stage 2 if `params` has a tower, else stage 1.
 
     Arrays that the authors' loader expects and never reads are filled in. The matching MLP of the paper has no place
@@ -138,13 +175,20 @@ def to_release(params: Params, model: ModelConfig, *, allow_extra: bool = False)
             "the matching MLP of recipe paper has no counterpart in the authors' files; allow extra keys to store it"
         )
     if model.patch_encoder != "shared":
-        raise WeightsError("the authors' files have one patch projection for all sensors; this model has one for each")
+        raise WeightsError(
+            "the authors' files have one patch projection for all sensors; this model has one for each"
+        )
     if model.sensors[-1] != UNIVERSAL:
         last = model.sensors[-1]
-        raise WeightsError(f"the authors' files keep the universal tokens in the last row; here it is {last!r}")
-    shapes, entries = param_shapes(model), keymap.entries(model)
+        raise WeightsError(
+            f"the authors' files keep the universal tokens in the last row; here it is {last!r}"
+        )
+    shapes = param_shapes(model)
+    entries = keymap.entries(model)
     check_arrays("parameters", flat, {entry.name: shapes[entry.name] for entry in entries})
-    arrays = {e.key: e.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries}
+    arrays = {
+        e.key: e.write(flat[e.name] if e.layer is None else flat[e.name][e.layer]) for e in entries
+    }
     for key, source in keymap.unused.items():
         theirs = arrays[source]
         arrays[key] = theirs.mean(axis=1, dtype=np.float64) if theirs.ndim == 5 else theirs
@@ -162,8 +206,15 @@ def check_arrays(title: str, arrays: Mapping[str, Any], wanted: Mapping[str, Sha
             if key in arrays and tuple(arrays[key].shape) != shape
         ],
     }
-    more = {name: f" and {len(rows) - _LISTED} more" * (len(rows) > _LISTED) for name, rows in lists.items()}
-    problems = [f"{n} ({len(rows)}): {', '.join(rows[:_LISTED])}{more[n]}" for n, rows in lists.items() if rows]
+    more = {
+        name: f" and {len(rows) - _LISTED} more" * (len(rows) > _LISTED)
+        for name, rows in lists.items()
+    }
+    problems = [
+        f"{n} ({len(rows)}): {', '.join(rows[:_LISTED])}{more[n]}"
+        for n, rows in lists.items()
+        if rows
+    ]
     if problems:
         hint = _hint((*lists["unknown keys"], *lists["missing keys"]))
         raise WeightsError(f"the {title} do not fit this model; {'; '.join(problems)}{hint}")
@@ -176,7 +227,9 @@ def _fit(array: np.ndarray, entry: Entry, model: ModelConfig) -> np.ndarray:
         table = array[0] if array.ndim == 3 and len(array) == 1 else array
         square = table.ndim == 2 and round((len(table) - 1) ** 0.5) ** 2 == len(table) - 1 > 0
         if square and len(table) != model.patches + 1:
-            return resize_position(table, model.patches + 1).reshape(*array.shape[:-2], model.patches + 1, -1)
+            return resize_position(table, model.patches + 1).reshape(
+                *array.shape[:-2], model.patches + 1, -1
+            )
     return array
 
 
@@ -198,13 +251,19 @@ def _hint(keys: Sequence[str]) -> str:
         r"cross_sensor_(head|mlp)\..*": "model.match_head",
         r".*\.(layers|resblocks|touch_decoder_blocks)\.\d+\..*": "the depths of the model (or another preset)",
     }
-    matching = (setting for pattern, setting in hints.items() if any(re.fullmatch(pattern, key) for key in keys))
+    matching = (
+        setting
+        for pattern, setting in hints.items()
+        if any(re.fullmatch(pattern, key) for key in keys)
+    )
     return next((f"; look at {setting}" for setting in matching), "")
 
 
 # Settings that must be equal: some leave no trace in shapes.
 _FORM: tuple[str, ...] = ("patch", "patch_encoder", "embed", "frames", "sensor_tokens")
-_FORM += tuple(f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp"))
+_FORM += tuple(
+    f"{tower}.{size}" for tower in ("touch", "decoder") for size in ("width", "depth", "mlp")
+)
 _FORM += ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps", "pre_norm")
 
 
@@ -219,30 +278,47 @@ def check_activation(path: Path, trained: str | None, config: Config) -> None:
 
 def check_form(path: Path, before: ModelConfig, config: Config, preset: str = "custom") -> None:
     """Raise UserError with the missing options if weights, of this preset, belong to another network than the run's."""
-    pairs = {name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in _FORM}
+    pairs = {
+        name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in _FORM
+    }
     differing = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
     if not differing:
         return
     trained = ", ".join(f"{name} {theirs}" for name, (theirs, _) in differing.items())
     used = ", ".join(str(ours) for _, ours in differing.values())
-    options = " ".join(_option(name.replace("_", "-"), theirs) for name, (theirs, _) in differing.items())
-    if differing.keys() & {"touch.width", "touch.depth"} and preset not in (config.preset, "custom"):
-        trained, used, options = f"preset {preset}", f"preset {config.preset}", f"--preset {preset}"
+    options = " ".join(
+        _option(name.replace("_", "-"), theirs) for name, (theirs, _) in differing.items()
+    )
+    if differing.keys() & {"touch.width", "touch.depth"} and preset not in (
+        config.preset,
+        "custom",
+    ):
+        trained = f"preset {preset}"
+        used = f"preset {config.preset}"
+        options = f"--preset {preset}"
     raise UserError(f"{path} was trained with {trained}, this run would use {used}: add {options}")
 
 
 def _option(name: str, value: Any) -> str:
     """Return the option that gives a setting of the model a value."""
-    return f"--model.{name} {value}" if type(value) is not bool else f"--model.{'' if value else 'no-'}{name}"
+    if type(value) is not bool:
+        return f"--model.{name} {value}"
+    return f"--model.{'' if value else 'no-'}{name}"
 
 
 def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) -> None:
     """Raise UserError if CLIP's image tower has another size than the run's image tower or, with `touch`, encoder."""
     theirs = (clip.touch.width, clip.touch.depth, clip.patch)
-    for name, stack in (("image tower", config.model.image), ("touch encoder", config.model.touch if touch else None)):
+    for name, stack in (
+        ("image tower", config.model.image),
+        ("touch encoder", config.model.touch if touch else None),
+    ):
         if stack is None or (ours := (stack.width, stack.depth, config.model.patch)) == theirs:
             continue
-        sizes = [f"width {width}, depth {depth} and patches of {patch}" for width, depth, patch in (theirs, ours)]
+        sizes = [
+            f"width {width}, depth {depth} and patches of {patch}"
+            for width, depth, patch in (theirs, ours)
+        ]
         raise UserError(
             f"the image tower in {path} has {sizes[0]}, this run's {name} {sizes[1]}: --preset large fits ViT-L/14, "
             "--preset base fits ViT-B/16; add the one that fits, or give other --clip-weights"
@@ -254,7 +330,9 @@ def match_sensors(table: np.ndarray, stored: Sequence[str], wanted: Sequence[str
     return np.stack([table[stored.index(name if name in stored else UNIVERSAL)] for name in wanted])
 
 
-def map_sensors(touch: Params, model: ModelConfig, change: Callable[[np.ndarray], np.ndarray]) -> Params:
+def map_sensors(
+    touch: Params, model: ModelConfig, change: Callable[[np.ndarray], np.ndarray]
+) -> Params:
     """Return a touch encoder with its tables of sensors changed: the tokens, and the patch kernels if each has one."""
     changed: Params = {"sensor_tokens": change(np.asarray(touch["sensor_tokens"]))}
     if model.patch_encoder == "sensor":
@@ -262,7 +340,9 @@ def map_sensors(touch: Params, model: ModelConfig, change: Callable[[np.ndarray]
     return touch | changed
 
 
-def serve_unseen(touch: Params, model: ModelConfig, trained: Sequence[str], *, universal_drawn: bool) -> Params:
+def serve_unseen(
+    touch: Params, model: ModelConfig, trained: Sequence[str], *, universal_drawn: bool
+) -> Params:
     """Return a touch encoder whose untrained sensors have the universal row (Sec. 3.5), or the mean if never drawn."""
     rows = [row for row, name in enumerate(model.sensors) if name in trained and name != UNIVERSAL]
     unseen = [row for row in range(len(model.sensors)) if row not in rows]
@@ -283,9 +363,12 @@ def resize_position(table: np.ndarray, rows: int) -> np.ndarray:
     Equal to torch's `interpolate(mode="bicubic", align_corners=False, antialias=False)`, computed in float64.
     Raises ValueError if either grid is not square.
     """
-    old, new = math.isqrt(len(table) - 1), math.isqrt(rows - 1)
+    old = math.isqrt(len(table) - 1)
+    new = math.isqrt(rows - 1)
     if old**2 != len(table) - 1 or new**2 != rows - 1 or not old or not new:
-        raise ValueError(f"a position table of {len(table)} rows cannot become {rows}: the grids must be square")
+        raise ValueError(
+            f"a position table of {len(table)} rows cannot become {rows}: the grids must be square"
+        )
     weights = cubic(old, new)
     grid = table[1:].astype(np.float64).reshape(old, old, -1)
     grid = np.einsum("ij,jkd->ikd", weights, grid)

@@ -12,7 +12,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, UNIVERSAL, Config, ModelConfig, Stack
+from anytouch_jax.config import (
+    CLIP_MEAN,
+    CLIP_STD,
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    UNIVERSAL,
+    Config,
+    ModelConfig,
+    Stack,
+)
 from anytouch_jax.config.parsing import Above0, Count, check, read_value
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part
@@ -41,11 +50,13 @@ class Preparation:
     difference: Literal["none", "levels", "offset", "plain"] = "none"
     portrait: bool = False  # Rotate a frame that is wider than high by 90 degrees clockwise.
     crop: Literal["none", "rows", "centre", "square"] = "none"
-    shorter: Count[int] | None = None  # Shorter side before a centre crop. None: 8/7 of the image size.
+    # Shorter side before a centre crop. None: 8/7 of the image size.
+    shorter: Count[int] | None = None
     filter: Literal["nearest", "lanczos", "bilinear", "bicubic", "box", "hamming"] = "bilinear"
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: Above0[tuple[float, float, float]] = (1.0, 1.0, 1.0)
-    newest_first: bool = False  # The order of the frames for the network. Clips are given oldest first.
+    # The order of the frames for the network. Clips are given oldest first.
+    newest_first: bool = False
     stride: Count[int] = 1  # Distance of the frames of a clip.
 
     def __post_init__(self) -> None:
@@ -80,7 +91,8 @@ class Family:
     names: tuple[str, ...] = ()  # Sensors of the rows of tokens.
     feature: Literal["class", "mean", "projected", "unit", "pooled"] = "class"
     tokens: Literal["normed", "patches", "hidden"] = "normed"
-    renamed: tuple[tuple[str, str], ...] = ()  # Other spellings of keys: a regex, and the key of the table.
+    # Other spellings of keys: a regex, and the key of the table.
+    renamed: tuple[tuple[str, str], ...] = ()
     activation: str = "gelu"
     bare_class: bool = False  # The stored positions have none of the class token.
 
@@ -89,7 +101,9 @@ class Family:
         if self.beside is not None and self.beside not in weights:
             return None
         for prefix in self.prefixes:
-            own = {key.removeprefix(prefix): x for key, x in weights.items() if key.startswith(prefix)}
+            own = {
+                key.removeprefix(prefix): x for key, x in weights.items() if key.startswith(prefix)
+            }
             for spelling, ours in self.renamed:
                 own = {re.sub(spelling, ours, key): x for key, x in own.items()}
             if not own.keys() >= {*self.needs} or own.keys() & {*self.lacks}:
@@ -100,7 +114,9 @@ class Family:
 
 
 # fmt: off
-_APACHE, _NON_COMMERCIAL, _IMAGES = "Apache-2.0", "CC BY-NC 4.0: non-commercial", "photographs, no touch"
+_APACHE = "Apache-2.0"
+_NON_COMMERCIAL = "CC BY-NC 4.0: non-commercial"
+_IMAGES = "photographs, no touch"
 _TIMM_NEEDS = ("patch_embed.proj.weight", "cls_token", "pos_embed", "blocks.0.attn.qkv.weight")
 _HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_token")
 _PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"
@@ -216,19 +232,32 @@ _UNREAD = {  # an array of a relative of these families: why it is not read
     "fc_norm.weight": "classifies by the mean of its patches (fc_norm) and has no norm of its tokens, as a fine-tuned "
     "MAE does; give weights from before the fine-tuning",
     **dict.fromkeys(
-        ("blocks.0.mlp.w1.weight", "blocks.0.mlp.w12.weight", "blocks.0.mlp.fc1_g.weight",
-         "layer.0.mlp.gate_proj.weight", "model.layer.0.mlp.gate_proj.weight", "encoder.layer.0.mlp.weights_in.weight"),
+        (
+            "blocks.0.mlp.w1.weight",
+            "blocks.0.mlp.w12.weight",
+            "blocks.0.mlp.fc1_g.weight",
+            "layer.0.mlp.gate_proj.weight",
+            "model.layer.0.mlp.gate_proj.weight",
+            "encoder.layer.0.mlp.weights_in.weight",
+        ),
         "has gated MLPs (SwiGLU), as the largest DINOv2 and DINOv3 have; give a smaller one",
     ),
-}  # fmt: skip
+}
 
 
 def _refuse_relatives(path: Path, weights: Weights) -> None:
     """Raise WeightsError for the file of a ViT whose form is not computed here."""
-    timm, patch = weights.get("patch_embed.proj.weight"), "vision_model.embeddings.patch_embedding.weight"
-    reasons = [_UNREAD[key] for key in _UNREAD if key in weights and (key[0] != "f" or "norm.weight" not in weights)]
+    timm = weights.get("patch_embed.proj.weight")
+    patch = "vision_model.embeddings.patch_embedding.weight"
+    reasons = [
+        _UNREAD[key]
+        for key in _UNREAD
+        if key in weights and (key[0] != "f" or "norm.weight" not in weights)
+    ]
     if any(key.endswith(patch) and x.ndim == 2 for key, x in weights.items()):
-        reasons = ["is the NaFlex form of SigLIP 2, for pictures of any shape; give one of a fixed size"]
+        reasons = [
+            "is the NaFlex form of SigLIP 2, for pictures of any shape; give one of a fixed size"
+        ]
     elif timm is None and not any("patch_embeddings." in key for key in weights):
         reasons = []
     elif timm is not None and timm.ndim == 4 and timm.shape[1] == 3 and "cls_token" not in weights:
@@ -243,37 +272,68 @@ def load_family(
     """Return the encoder of a family's file or folder, or None, and the arrays that were read. Raises WeightsError."""
     if not path.exists() or path.suffix.lower() == ".npz" or load.is_run_folder(path):
         return None, None
-    trunks = (path / "trunk.pth",) if path.is_dir() else (path.parent / "trunk.pth", path.parent.parent / "trunk.pth")
-    trunk, sensors = next((file for file in trunks if file.is_file()), None), dict[str, Path]()
+    trunks = (
+        (path / "trunk.pth",)
+        if path.is_dir()
+        else (path.parent / "trunk.pth", path.parent.parent / "trunk.pth")
+    )
+    trunk = next((file for file in trunks if file.is_file()), None)
+    sensors = dict[str, Path]()
     if path.is_dir() and trunk is not None:
-        sensors = {ALIASES.get(file.stem, file.stem): file for file in sorted(path.glob("encoders/*.pth"))}
+        sensors = {
+            ALIASES.get(file.stem, file.stem): file for file in sorted(path.glob("encoders/*.pth"))
+        }
     file = next(iter(sensors.values())) if sensors else load.find_weights_file(path)
     weights = load.read_weights(file)
     _refuse_relatives(file, weights)
-    if not weights.keys() >= {*_TIMM_NEEDS} or weights.keys() & {"norm.weight", "blocks.0.ls1.gamma"}:
+    if not weights.keys() >= {*_TIMM_NEEDS} or weights.keys() & {
+        "norm.weight",
+        "blocks.0.ls1.gamma",
+    }:
         if file.name == "trunk.pth":
-            raise WeightsError(f"{file} is the trunk of T3 alone; give its folder, or encoders/SENSOR.pth")
-        return read_family(file, weights, _folder(file), heads=heads, image_size=image_size), weights
+            raise WeightsError(
+                f"{file} is the trunk of T3 alone; give its folder, or encoders/SENSOR.pth"
+            )
+        return read_family(
+            file, weights, _folder(file), heads=heads, image_size=image_size
+        ), weights
     if trunk is None:
-        raise WeightsError(f"{file} has no final norm; if it is an encoder of T3, put its trunk.pth into its folder")
+        raise WeightsError(
+            f"{file} has no final norm; if it is an encoder of T3, put its trunk.pth into its folder"
+        )
     rest = {f"trunk.{key}": array for key, array in load.read_weights(trunk).items()}
     sensors = sensors or {ALIASES.get(file.stem, file.stem): file}
-    names, models = (*sensors, UNIVERSAL), []
+    names = (*sensors, UNIVERSAL)
+    models = []
     for one in sensors.values():
         content = weights if one == file else load.read_weights(one)
         whole = {**content, **rest}
-        models.append(read_family(one, whole, _folder(trunk), heads=heads, image_size=image_size, sensors=names))
+        models.append(
+            read_family(
+                one, whole, _folder(trunk), heads=heads, image_size=image_size, sensors=names
+            )
+        )
     first = models[0]
     if first is None or any(model is None or model.form != first.form for model in models):
-        raise WeightsError(f"the encoders {', '.join(sensors)} of {path} have different forms; load one file at a time")
-    several = [] if len(models) == 1 else [name for name in first.params if name.split("/")[0] not in SHARED]
-    params = first.params | {name: np.stack([m.params[name] for m in models if m]) for name in several}
+        raise WeightsError(
+            f"the encoders {', '.join(sensors)} of {path} have different forms; load one file at a time"
+        )
+    several = (
+        []
+        if len(models) == 1
+        else [name for name in first.params if name.split("/")[0] not in SHARED]
+    )
+    params = first.params | {
+        name: np.stack([m.params[name] for m in models if m]) for name in several
+    }
     return replace(first, params=params), None
 
 
 def _folder(file: Path) -> dict[str, Any]:
     """Return the config.json beside a file, with what it and a preprocessor_config.json state as `stated`."""
-    config, theirs = (load.read_settings(file.with_name(f"{name}config.json")) for name in ("", "preprocessor_"))
+    config, theirs = (
+        load.read_settings(file.with_name(f"{name}config.json")) for name in ("", "preprocessor_")
+    )
     return config | {"stated": stated_steps(config, theirs)}
 
 
@@ -284,9 +344,14 @@ def find_family(weights: Weights) -> tuple[Family, dict[str, np.ndarray]] | None
 
 
 def read_family(
-    path: Path, weights: Weights, folder: Mapping[str, Any], *, heads: int | None = None, image_size: Any = None,
+    path: Path,
+    weights: Weights,
+    folder: Mapping[str, Any],
+    *,
+    heads: int | None = None,
+    image_size: Any = None,
     sensors: tuple[str, ...] = (),
-) -> FamilyModel | None:  # fmt: skip
+) -> FamilyModel | None:
     """Return the encoder of a file, None for a file of no family.
 
     `folder` is the config.json: heads, epsilon, changes of the preparation. `image_size` is a side or (height, width).
@@ -295,23 +360,39 @@ def read_family(
     if (found := find_family(weights)) is None:
         return None
     family, own = found
-    vision = folder.get("vision_config")  # of Hugging Face's models with a text tower
+    # of Hugging Face's models with a text tower
+    vision = folder.get("vision_config")
     folder = {**folder, **vision} if isinstance(vision, dict) else folder
     try:
         own = _completed(family, own, folder, heads)
-        size = image_size if image_size is None else (image_size,) * 2 if isinstance(image_size, int) else image_size
+        size = (
+            image_size
+            if image_size is None
+            else (image_size,) * 2
+            if isinstance(image_size, int)
+            else image_size
+        )
         changes, wanted, ignored = folder.get("stated", ({}, None, []))
-        if family.sensors != _IMAGES:  # they have steps of their authors; only the statistics may be others
-            changes, wanted, ignored = {key: x for key, x in changes.items() if key in ("mean", "std")}, None, []
+        if (
+            family.sensors != _IMAGES
+        ):  # they have steps of their authors; only the statistics may be others
+            changes = {key: x for key, x in changes.items() if key in ("mean", "std")}
+            wanted = None
+            ignored = []
         try:
-            form, size = form_of(family, own, folder, heads, tuple(size) if size else wanted, sensors)
+            form, size = form_of(
+                family, own, folder, heads, tuple(size) if size else wanted, sensors
+            )
         except WeightsError:
             if size or wanted is None:
                 raise
             ignored = [*ignored, f"an input of {wanted[0]} x {wanted[1]} pixels"]
             form, size = form_of(family, own, folder, heads, None, sensors)
         if ignored:
-            warnings.warn(f"the files beside {path} ask for what is not computed: {', '.join(ignored)}", stacklevel=2)
+            warnings.warn(
+                f"the files beside {path} ask for what is not computed: {', '.join(ignored)}",
+                stacklevel=2,
+            )
         settings = {**asdict(family.preparation), **changes, **folder.get("preparation", {})}
         preparation = read_value(Preparation, settings, "preparation")
         entries, shapes = entries_of(family, form)
@@ -334,7 +415,9 @@ def _completed(
     """Return a file's arrays with those left out: biases and periods of DINOv3, the position of a class token."""
     own = dict(weights)
     if family.bare_class:
-        own["pos_embed"] = np.concatenate([np.zeros_like(own["pos_embed"][:, :1]), own["pos_embed"]], axis=1)
+        own["pos_embed"] = np.concatenate(
+            [np.zeros_like(own["pos_embed"][:, :1]), own["pos_embed"]], axis=1
+        )
     if family.name == "siglip" and "head.attention.in_proj_weight" not in own:
         own = {key: x for key, x in own.items() if not key.startswith("head.")}
     if family.name != "dinov3":
@@ -342,12 +425,19 @@ def _completed(
     first = own[family.needs[0]]
     width = len(first)
     quarter = width // _heads(width, heads, folder) // 4
-    own.setdefault("periods", float(folder.get("rope_theta", 100)) ** (np.arange(quarter) / quarter))
+    own.setdefault(
+        "periods", float(folder.get("rope_theta", 100)) ** (np.arange(quarter) / quarter)
+    )
     for key in [key for key in own if key.endswith("attn.qkv.weight")]:
         stem = key.removesuffix("qkv.weight")
         bias = own.get(f"{stem}qkv.bias", np.zeros(3 * width))
-        parts = own.pop(f"{stem}q_bias", bias[:width]), np.zeros(width), own.pop(f"{stem}v_bias", bias[2 * width :])
-        own[f"{stem}qkv.bias"] = np.concatenate(parts)  # the authors mask the bias of keys
+        parts = (
+            own.pop(f"{stem}q_bias", bias[:width]),
+            np.zeros(width),
+            own.pop(f"{stem}v_bias", bias[2 * width :]),
+        )
+        # the authors mask the bias of keys
+        own[f"{stem}qkv.bias"] = np.concatenate(parts)
     known = {re.sub(r"\d", "", key) for key in own}
     for key in [key for key in own if re.fullmatch(r"layer\.\d+\.\w+\.\w+_proj\.weight", key)]:
         other = key.removesuffix("weight") + "bias"
@@ -357,7 +447,11 @@ def _completed(
 
 
 def load_start(
-    fresh: dict[str, Any], config: Config, *, init: str | Path | None = None, clip: str | Path | None = None
+    fresh: dict[str, Any],
+    config: Config,
+    *,
+    init: str | Path | None = None,
+    clip: str | Path | None = None,
 ) -> load.Start:
     """Return the first parameters of a run, as `load.load_init`, where `init` may also be an encoder of photographs.
 
@@ -365,11 +459,17 @@ def load_start(
     """
     model, weights = (None, None) if init is None else load_family(registry.locate(init))
     if model is None:
-        towers = any(re.fullmatch(KEYMAPS[name].mark, key) for name in ("clip", "openclip") for key in weights or ())
+        towers = any(
+            re.fullmatch(KEYMAPS[name].mark, key)
+            for name in ("clip", "openclip")
+            for key in weights or ()
+        )
         if towers and clip is None and config.stage == 1:
             return load.load_init(fresh, config, clip=init)
         return load.load_init(fresh, config, init=init, clip=clip)
-    start = load.load_init(fresh, config, clip=clip) if clip is not None else load.Start(fresh, [], ())
+    start = (
+        load.load_init(fresh, config, clip=clip) if clip is not None else load.Start(fresh, [], ())
+    )
     touch, notes = touch_of_photographs(model, str(init), config, start.params["touch"])
     return start._replace(params={**start.params, "touch": touch}, notes=[*start.notes, *notes])
 
@@ -382,19 +482,31 @@ def touch_of_photographs(
     The patch kernel is divided among the frames. Its bias goes into the resized positions, and layer scales into the
     layers before them. Raises UserError for another family, and for a network of another form.
     """
-    form, ours = model.form, config.model
+    form = model.form
+    ours = config.model
     has_tokens = {"position", "class_token"} <= model.params.keys() and not form.tanh
     if model.family.sensors != _IMAGES or form.model.touch.depth == 0 or not has_tokens:
         raise UserError(
             f"{source} is an encoder of {model.family.title}; a run starts from weights of AnyTouch, DINOv2, ViT-MAE, "
             "ViT, DeiT or CLIP"
         )
-    kept = {name: getattr(ours, name) for name in ("embed", "frames", "sensor_tokens", "patch_encoder", "decoder")}
-    theirs = replace(form.model, **kept, decoder_norm_eps=ours.decoder_norm_eps, pre_norm=form.pre_norm)
+    kept = {
+        name: getattr(ours, name)
+        for name in ("embed", "frames", "sensor_tokens", "patch_encoder", "decoder")
+    }
+    theirs = replace(
+        form.model, **kept, decoder_norm_eps=ours.decoder_norm_eps, pre_norm=form.pre_norm
+    )
     convert.check_form(Path(source), theirs, config)
     if ours.activation != "gelu":
-        raise UserError(f"{source} was trained with gelu; leave out --model.activation {ours.activation}")
-    own = {name: array for name, array in model.params.items() if name.startswith(("blocks/", "post_norm/", "pre_"))}
+        raise UserError(
+            f"{source} was trained with gelu; leave out --model.activation {ours.activation}"
+        )
+    own = {
+        name: array
+        for name, array in model.params.items()
+        if name.startswith(("blocks/", "post_norm/", "pre_"))
+    }
     for scale, branch in (("scale1", "attention/out"), ("scale2", "mlp/down")):
         if (factor := own.pop(f"blocks/{scale}/scale", None)) is not None:
             own[f"blocks/{branch}/kernel"] = own[f"blocks/{branch}/kernel"] * factor[:, None]
@@ -402,10 +514,14 @@ def touch_of_photographs(
     position = convert.resize_position(model.params["position"], ours.patches + 1)
     position[1:] += model.params.get("patch/bias", np.float32(0))
     shape = fresh["patch"]["kernel"].shape
-    own["patch/kernel"] = np.broadcast_to(model.params["patch/kernel"][0], shape) / np.float32(shape[-3])
+    own["patch/kernel"] = np.broadcast_to(model.params["patch/kernel"][0], shape) / np.float32(
+        shape[-3]
+    )
     touch = {name: fresh[name] for name in ("sensor_tokens", "projection")}
     touch |= nest({**own, "position": position, "class_token": model.params["class_token"]})
-    notes = [f"{source} gives the touch encoder; its projection, the sensor tokens and the decoder start untrained"]
+    notes = [
+        f"{source} gives the touch encoder; its projection, the sensor tokens and the decoder start untrained"
+    ]
     if form.registers:
         notes.append(f"the {form.registers} register tokens of {source} are left out")
     return touch, notes
@@ -418,9 +534,13 @@ def entries_of(family: Family, form: VitConfig) -> tuple[list[Entry], dict[str, 
 
 
 def form_of(
-    family: Family, weights: Weights, folder: Mapping[str, Any], heads: int | None, image_size: Size | None,
+    family: Family,
+    weights: Weights,
+    folder: Mapping[str, Any],
+    heads: int | None,
+    image_size: Size | None,
     sensors: tuple[str, ...],
-) -> tuple[VitConfig, Size]:  # fmt: skip
+) -> tuple[VitConfig, Size]:
     """Return the form of the network that made a file, and the size of its images, from the shapes of its arrays."""
     rows = {row.name: row for row in family.table}
 
@@ -433,16 +553,23 @@ def form_of(
         return rows[name].read(array).shape
 
     tubelet, pixels, width = shape("patch/kernel")
-    patch, mlp = math.isqrt(pixels // 3), shape("blocks/mlp/up/kernel")[1]
-    frames, size = max(family.frames, tubelet), image_size or family.image_size
+    patch = math.isqrt(pixels // 3)
+    mlp = shape("blocks/mlp/up/kernel")[1]
+    frames = max(family.frames, tubelet)
+    size = image_size or family.image_size
     grid: tuple[int, int, int] | None = None
     if not has("frequency") and not has("periods"):
-        grid = _grid(shape("position")[0] - has("class_token"), family, frames // tubelet, image_size, patch)
-        frames, native = grid[0] * tubelet, (grid[1] * patch, grid[2] * patch)
+        grid = _grid(
+            shape("position")[0] - has("class_token"), family, frames // tubelet, image_size, patch
+        )
+        frames = grid[0] * tubelet
+        native = (grid[1] * patch, grid[2] * patch)
         size = (image_size if family.resample == "none" else size) or native
     assert size is not None
     if size[0] % patch or size[1] % patch or min(size) < patch:
-        raise WeightsError(f"image_size {size[0]} x {size[1]} is no multiple of the patches of {patch} pixels")
+        raise WeightsError(
+            f"image_size {size[0]} x {size[1]} is no multiple of the patches of {patch} pixels"
+        )
     outputs = shape("projection/kernel")[1] if has("projection/kernel") else 0
     own = shape("sensor_tokens") if has("sensor_tokens") else (0, 0)
     if own[0]:
@@ -453,38 +580,70 @@ def form_of(
         raise WeightsError(f"layer_norm_eps of the config.json is {str(eps)[:40]}; correct it")
     if (stated := folder.get("hidden_act", family.activation)) != family.activation:
         ours = family.activation
-        raise WeightsError(f"hidden_act of the config.json is {str(stated)[:40]}; only {ours} is computed here")
-    touch = Stack(width, find_depth(rows["blocks/norm1/scale"].key, weights), _heads(width, heads, folder), mlp)
+        raise WeightsError(
+            f"hidden_act of the config.json is {str(stated)[:40]}; only {ours} is computed here"
+        )
+    touch = Stack(
+        width,
+        find_depth(rows["blocks/norm1/scale"].key, weights),
+        _heads(width, heads, folder),
+        mlp,
+    )
     model = ModelConfig(
-        max(size), patch, outputs or width, touch, keymaps.DECODER, frames=frames, sensors=sensors or (UNIVERSAL,),
-        sensor_tokens=own[1], norm_eps=float(eps),
-    )  # fmt: skip
+        max(size),
+        patch,
+        outputs or width,
+        touch,
+        keymaps.DECODER,
+        frames=frames,
+        sensors=sensors or (UNIVERSAL,),
+        sensor_tokens=own[1],
+        norm_eps=float(eps),
+    )
     return VitConfig(
-        model, tubelet, grid, outputs=outputs, tanh=family.activation != "gelu",
+        model,
+        tubelet,
+        grid,
+        outputs=outputs,
+        tanh=family.activation != "gelu",
         resample="antialias" if family.name == "dinov2" and has("registers") else family.resample,
         axes=shape("frequency")[0] if has("frequency") else 2,
         registers=shape("registers")[0] if has("registers") else 0,
         trunk=find_depth(rows["trunk/norm1/scale"].key, weights) if has("trunk/norm1/scale") else 0,
         calibration=shape("calibration/kernel")[0] if has("calibration/kernel") else 0,
-        class_token=has("class_token"), patch_bias=has("patch/bias"), layer_scale=has("blocks/scale1/scale"),
-        pre_norm=has("pre_norm/scale"), output_bias=has("projection/bias"), rotary=has("periods"),
+        class_token=has("class_token"),
+        patch_bias=has("patch/bias"),
+        layer_scale=has("blocks/scale1/scale"),
+        pre_norm=has("pre_norm/scale"),
+        output_bias=has("projection/bias"),
+        rotary=has("periods"),
         pool=has("pool/probe"),
-    ), size  # fmt: skip
+    ), size
 
 
-def _grid(places: int, family: Family, time: int, size: Size | None, patch: int) -> tuple[int, int, int]:
+def _grid(
+    places: int, family: Family, time: int, size: Size | None, patch: int
+) -> tuple[int, int, int]:
     """Return (time, rows, columns) of stored positions: of `size` if not resized, 4:3 (Sparsh), or square."""
     rows, columns = (0, 0) if size is None else (size[0] // patch, size[1] // patch)
     given = (places // max(rows * columns, 1) if family.video else 1, rows, columns)
     grids = [given]
     if size is None or family.resample != "none":
         for steps in (1, time):
-            side, third = math.isqrt(places // steps), math.isqrt(places // steps // 12)
-            grids += [(steps, side, side), *([(steps, 4 * third, 3 * third)] if family.name == "sparsh" else [])]
+            side = math.isqrt(places // steps)
+            third = math.isqrt(places // steps // 12)
+            grids += [
+                (steps, side, side),
+                *([(steps, 4 * third, 3 * third)] if family.name == "sparsh" else []),
+            ]
     found = next((grid for grid in reversed(grids) if math.prod(grid) == places > 0), None)
     if found is None:
-        asked = "no grid of patches" if size is None else f"not those of {size[0]} x {size[1]} pixels"
-        raise WeightsError(f"its {places} positions are {asked}; give the image_size of its training")
+        asked = (
+            "no grid of patches" if size is None else f"not those of {size[0]} x {size[1]} pixels"
+        )
+        raise WeightsError(
+            f"its {places} positions are {asked}; give the image_size of its training"
+        )
     return found
 
 
@@ -497,32 +656,55 @@ def _heads(width: int, heads: int | None, folder: Mapping[str, Any]) -> int:
     if count is None:
         refuse_unknown({"touch": width})
     if type(count) is not int or not 0 < count <= 1024 or width % count:
-        raise WeightsError(f"a width of {width} cannot have {str(count)[:40]} heads; correct the number of heads")
+        raise WeightsError(
+            f"a width of {width} cannot have {str(count)[:40]} heads; correct the number of heads"
+        )
     return count
 
 
 # Preprocessing that timm (config.json) or Hugging Face (preprocessor_config.json) states in a file next to weights.
 _FILTERS = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
 _HF_STEPS = {"do_resize", "do_center_crop", "do_rescale", "do_normalize", "do_convert_rgb"}
-_HF_VALUES = {"size", "crop_size", "resample", "rescale_factor", "image_mean", "image_std", "image_processor_type",
-              "feature_extractor_type", "processor_class", "_valid_processor_keys", "data_format", "input_data_format",
-              "return_tensors", "device", "default_to_square", "disable_grouping"}  # fmt: skip
+_HF_VALUES = {
+    "size",
+    "crop_size",
+    "resample",
+    "rescale_factor",
+    "image_mean",
+    "image_std",
+    "image_processor_type",
+    "feature_extractor_type",
+    "processor_class",
+    "_valid_processor_keys",
+    "data_format",
+    "input_data_format",
+    "return_tensors",
+    "device",
+    "default_to_square",
+    "disable_grouping",
+}
 _TIMM = ("mean", "std", "interpolation", "crop_pct", "crop_mode", "input_size")
 
 
-def stated_steps(config: Mapping[str, Any], theirs: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
+def stated_steps(
+    config: Mapping[str, Any], theirs: Mapping[str, Any]
+) -> tuple[dict[str, Any], Any, list[str]]:
     """Return changes of a Preparation, the (height, width) of the input or None, and what of both files is ignored."""
     if theirs:
         return _hugging_face(theirs)
     timm = config.get("pretrained_cfg", config if "architecture" in config else None)
-    return _timm(timm) if isinstance(timm, Mapping) and timm.keys() & {*_TIMM} else ({}, None, [])
+    if isinstance(timm, Mapping) and timm.keys() & {*_TIMM}:
+        return _timm(timm)
+    return ({}, None, [])
 
 
 def _timm(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
     changes: dict[str, Any] = {key: stated[key] for key in ("mean", "std") if key in stated}
-    size, ignored = _size(list(stated.get("input_size", ()))[1:]), list[str]()
+    size = _size(list(stated.get("input_size", ()))[1:])
+    ignored = list[str]()
     _add_filter(changes, stated.get("interpolation"), ignored)
-    share, mode = stated.get("crop_pct", 1.0), stated.get("crop_mode", "center")
+    share = stated.get("crop_pct", 1.0)
+    mode = stated.get("crop_mode", "center")
     if size is not None and isinstance(share, int | float) and 0 < share <= 1:
         if mode == "center":
             changes |= {"crop": "centre", "shorter": int(max(size) / share)}
@@ -538,11 +720,18 @@ def _timm(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
 def _hugging_face(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
     changes: dict[str, Any] = {}
     known = {*_HF_STEPS, *_HF_VALUES}
-    ignored = [f"{name} {str(value)[:40]}" for name, value in stated.items()
-               if name not in known and value not in (None, False)]  # fmt: skip
-    does = {name: stated.get(name, name != "do_center_crop" or "crop_size" in stated) for name in _HF_STEPS}
+    ignored = [
+        f"{name} {str(value)[:40]}"
+        for name, value in stated.items()
+        if name not in known and value not in (None, False)
+    ]
+    does = {
+        name: stated.get(name, name != "do_center_crop" or "crop_size" in stated)
+        for name in _HF_STEPS
+    }
     _add_filter(changes, stated.get("resample"), ignored)
-    resized, cropped = stated.get("size"), _size(stated.get("crop_size"))
+    resized = stated.get("size")
+    cropped = _size(stated.get("crop_size"))
     edge = resized.get("shortest_edge") if isinstance(resized, Mapping) else None
     if edge is None and type(resized) is int and does["do_center_crop"]:
         edge = resized
@@ -567,8 +756,16 @@ def _hugging_face(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[
     if not does["do_normalize"]:
         given = {"mean": [0.0] * 3, "std": [1.0] * 3}
     if abs(scale - 1) > 1e-6 and all(_numbers(value) for value in given.values()):
-        given = {name: [number / scale for number in value] for name, value in given.items() if value is not None}
-    return changes | {name: value for name, value in given.items() if value is not None}, size, ignored
+        given = {
+            name: [number / scale for number in value]
+            for name, value in given.items()
+            if value is not None
+        }
+    return (
+        changes | {name: value for name, value in given.items() if value is not None},
+        size,
+        ignored,
+    )
 
 
 def _add_filter(changes: dict[str, Any], stated: Any, ignored: list[str]) -> None:
@@ -588,5 +785,11 @@ def _size(value: Any) -> tuple[int, int] | None:
     if isinstance(value, Mapping):
         value = [value.get("height"), value.get("width")]
     sides = [value] * 2 if type(value) is int else value
-    fits = isinstance(sides, list) and len(sides) == 2 and all(type(side) is int and side > 0 for side in sides)
-    return (sides[0], sides[1]) if fits else None
+    fits = (
+        isinstance(sides, list)
+        and len(sides) == 2
+        and all(type(side) is int and side > 0 for side in sides)
+    )
+    if fits:
+        return (sides[0], sides[1])
+    return None

@@ -43,7 +43,9 @@ def _write_patch(kernel: np.ndarray) -> np.ndarray:  # (..., P*P*3, D) -> (D, ..
     return np.moveaxis(kernel.reshape(*kernel.shape[:-2], side, side, 3, -1), (-1, -2), (0, -3))
 
 
-def _read_patch(weight: np.ndarray) -> np.ndarray:  # golden Q1: (D, frame, colour, row, col) -> (frames, P*P*3, D)
+def _read_patch(
+    weight: np.ndarray,
+) -> np.ndarray:  # golden Q1: (D, frame, colour, row, col) -> (frames, P*P*3, D)
     return np.moveaxis(weight, (0, -3), (-1, -2)).reshape(*weight.shape[1:-3], -1, len(weight))
 
 
@@ -84,7 +86,10 @@ _KINDS: dict[str, list[tuple[Any, ...]]] = {
     "kernel": [(".weight", "/kernel", *_TURNED)],
     "linear": [(".weight", "/kernel", *_TURNED), (".bias", "/bias", *SAME)],
     "norm": [(".weight", "/scale", *SAME), (".bias", "/bias", *SAME)],
-    "lora": [(".lora_A.default.weight", "/a", *_TURNED), (".lora_B.default.weight", "/b", *_TURNED)],
+    "lora": [
+        (".lora_A.default.weight", "/a", *_TURNED),
+        (".lora_B.default.weight", "/b", *_TURNED),
+    ],
     **{
         kind: [
             (f"{dot}{theirs}", f"/{name}/{ours}", *conversions, None, part)
@@ -128,7 +133,9 @@ def find_depth(key: str, keys: Iterable[str]) -> int:
 @lru_cache(maxsize=8)
 def param_shapes(model: ModelConfig) -> Mapping[str, Shape]:
     """Return name -> shape of every parameter of a model."""
-    return MappingProxyType({name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()})
+    return MappingProxyType(
+        {name: tuple(leaf.shape) for name, leaf in flatten(build(model).abstract()).items()}
+    )
 
 
 # Heads of the published towers by width: OpenAI's CLIP and the authors (width / 64), OpenCLIP's larger towers (16).
@@ -170,7 +177,8 @@ class KeyMap:
         A head count is that of `heads`, else that of a published tower of this width. Odd files raise KeyError,
         IndexError, ValueError or TypeError.
         """
-        table, unknown = self._rows(any(".lora_A." in key for key in weights)), dict[str, int]()
+        table = self._rows(any(".lora_A." in key for key in weights))
+        unknown = dict[str, int]()
 
         def has(name: str) -> bool:
             return name in table and table[name].key.format(0) in weights
@@ -188,20 +196,30 @@ class KeyMap:
             return Stack(width, depth, count or 1, mlp)
 
         main = "touch" if "touch/patch/kernel" in table else "image"
-        kernel, tower = shape(f"{main}/patch/kernel"), stack(main)
-        patch, projection = math.isqrt(kernel[-2] // 3), f"{main}/projection/kernel"
+        kernel = shape(f"{main}/patch/kernel")
+        tower = stack(main)
+        patch = math.isqrt(kernel[-2] // 3)
+        projection = f"{main}/projection/kernel"
         sizes: dict[str, Any] = {"touch": tower, "decoder": DECODER, "match_head": "none"}
         if main == "touch":
             count, each, _ = shape("touch/sensor_tokens")
             numbered = (*(f"sensor{row}" for row in range(count - 1)), UNIVERSAL)
-            sizes |= {"sensors": SENSORS if count == len(SENSORS) else numbered, "sensor_tokens": each}
-            sizes |= {"frames": kernel[0], "decoder_sensor_tokens": has("decoder/sensor_projection/kernel")}
+            sizes |= {
+                "sensors": SENSORS if count == len(SENSORS) else numbered,
+                "sensor_tokens": each,
+            }
+            sizes |= {
+                "frames": kernel[0],
+                "decoder_sensor_tokens": has("decoder/sensor_projection/kernel"),
+            }
         if "decoder/mask_token" in table:
             sizes["decoder"] = stack("decoder")
         if has("image/patch/kernel"):
             sizes["image"] = stack("image")
         if has("text/token"):
-            sizes["text"] = TextTower(stack("text"), vocab=shape("text/token")[0], length=shape("text/position")[0])
+            sizes["text"] = TextTower(
+                stack("text"), vocab=shape("text/token")[0], length=shape("text/position")[0]
+            )
         if has("lora/query/a"):
             sizes["lora_rank"] = shape("lora/query/a")[-1]
         if has("matcher/kernel") or has("matcher/up/kernel"):
@@ -209,7 +227,9 @@ class KeyMap:
         return ModelConfig(
             image_size=round((shape(f"{main}/position")[0] - 1) ** 0.5) * patch,
             patch=patch,
-            embed=shape(projection)[-1] if has(projection) else tower.width,  # a vision tower alone has none
+            embed=shape(projection)[-1]
+            if has(projection)
+            else tower.width,  # a vision tower alone has none
             **sizes,
         ), unknown
 
@@ -225,13 +245,14 @@ BLOCKS = """
     linear  encoder.layers.{}.mlp.fc1             blocks/mlp/up
     linear  encoder.layers.{}.mlp.fc2             blocks/mlp/down
 """
+# "pre_layrnorm" is the library's spelling
 VISION = f"""
     same    embeddings.class_embedding            class_token
     same    embeddings.position_embedding.weight  position
     norm    pre_layrnorm                          pre_norm
     {BLOCKS.strip()}
     norm    post_layernorm                        post_norm
-"""  # "pre_layrnorm" is the library's spelling
+"""
 _TEXT = f"""
     same    embeddings.token_embedding.weight     token
     same    embeddings.position_embedding.weight  position
@@ -241,10 +262,15 @@ _TEXT = f"""
 TABLE = (
     *rows("patch vision_model.embeddings.patch_embedding image/patch"),
     *rows(VISION, "vision_model.", "image/"),
-    *rows("kernel visual_projection image/projection"), *rows(_TEXT, "text_model.", "text/"),
-    *rows("kernel text_projection text/projection"), *rows("same logit_scale logit_scale"),
-)  # fmt: skip
-TOWERS = {"image": r"vision_model\..*|visual_projection\..*", "text": r"text_model\..*|text_projection\..*"}
+    *rows("kernel visual_projection image/projection"),
+    *rows(_TEXT, "text_model.", "text/"),
+    *rows("kernel text_projection text/projection"),
+    *rows("same logit_scale logit_scale"),
+)
+TOWERS = {
+    "image": r"vision_model\..*|visual_projection\..*",
+    "text": r"text_model\..*|text_projection\..*",
+}
 TOWERS |= {"logit_scale": r"logit_scale"}
 HF_CLIP = KeyMap("clip", r"vision_model\.embeddings\.patch_embedding\.weight", TABLE, towers=TOWERS)
 
@@ -256,6 +282,7 @@ _OPEN_BLOCKS = """
     linear  transformer.resblocks.{}.mlp.c_proj     blocks/mlp/down
     qkv     transformer.resblocks.{}.attn.in_proj   blocks/attention
 """
+# the projections are stored as (in, out), unlike a torch Linear
 _OPEN_VISION = f"""
     same    class_embedding                         class_token
     same    positional_embedding                    position
@@ -264,7 +291,7 @@ _OPEN_VISION = f"""
     {_OPEN_BLOCKS.strip()}
     norm    ln_post                                 post_norm
     same    proj                                    projection/kernel
-"""  # the projections are stored as (in, out), unlike a torch Linear
+"""
 _OPEN_TEXT = f"""
     same    token_embedding.weight                  token
     same    positional_embedding                    position
@@ -273,14 +300,19 @@ _OPEN_TEXT = f"""
     same    text_projection                         projection/kernel
 """
 OPENCLIP = KeyMap(
-    "openclip", r"visual\.conv1\.weight",
-    (*rows(_OPEN_VISION, "visual.", "image/"), *rows(_OPEN_TEXT, "", "text/"), *rows("same logit_scale logit_scale")),
+    "openclip",
+    r"visual\.conv1\.weight",
+    (
+        *rows(_OPEN_VISION, "visual.", "image/"),
+        *rows(_OPEN_TEXT, "", "text/"),
+        *rows("same logit_scale logit_scale"),
+    ),
     towers={
         "image": r"visual\..*",
         "text": r"text_projection|token_embedding\..*|positional_embedding|transformer\..*|ln_final\..*",
         "logit_scale": r"logit_scale",
     },
-)  # fmt: skip
+)
 
 # AnyTouch of the authors: stage 1, stage 2 (with towers), and probes (with a classifier).
 _DECODER = """
@@ -300,23 +332,28 @@ _DECODER = """
     linear  decoder_pred                                       still_head
     linear  decoder_pred_video                                 clip_head
 """
+# the MLP only in our files: the authors' head is linear
 _MATCHER = """
     linear  cross_sensor_head      matcher
     linear  cross_sensor_mlp.up    matcher/up
     linear  cross_sensor_mlp.down  matcher/down
-"""  # the MLP only in our files: the authors' head is linear
+"""
 _LORA = """
     lora    layers.{}.self_attn.q_proj    query
     lora    layers.{}.self_attn.k_proj    key
     lora    layers.{}.self_attn.v_proj    value
     lora    layers.{}.self_attn.out_proj  out
 """
-_CLIP_PATCH, _PROBE_PATCH = "video_patch_embedding", "touch_model.embeddings.patch_embedding"
-_PEFT = "vision_model.encoder.base_model.model."  # the library of LoRA puts the tower into a wrapper
+_CLIP_PATCH = "video_patch_embedding"
+_PROBE_PATCH = "touch_model.embeddings.patch_embedding"
+# the library of LoRA puts the tower into a wrapper
+_PEFT = "vision_model.encoder.base_model.model."
 
 
 def _touch(prefix: str = "", patch: str = _CLIP_PATCH) -> tuple[Entry, ...]:
-    own = f"same sensor_token sensor_tokens\npatch {patch} patch\nkernel touch_projection projection"
+    own = (
+        f"same sensor_token sensor_tokens\npatch {patch} patch\nkernel touch_projection projection"
+    )
     return (*rows(own, prefix, "touch/"), *rows(VISION, f"{prefix}touch_model.", "touch/"))
 
 
@@ -331,14 +368,26 @@ def _unused(prefix: str = "") -> dict[str, str]:
 _STAGE2 = "touch_mae_model."
 _TOWERS = TOWERS | {"matcher": r"cross_sensor_.*"}
 _FIRST = (*_touch(), *rows(_DECODER, "", "decoder/"))
-STAGE1 = KeyMap("stage1", r"video_patch_embedding\.weight", _FIRST, unused=_unused(), towers=_TOWERS)
-_WRAPPED = rows(BLOCKS.replace("encoder.", "").replace("_proj", "_proj.base_layer"), _PEFT, "image/")
+STAGE1 = KeyMap(
+    "stage1", r"video_patch_embedding\.weight", _FIRST, unused=_unused(), towers=_TOWERS
+)
+_WRAPPED = rows(
+    BLOCKS.replace("encoder.", "").replace("_proj", "_proj.base_layer"), _PEFT, "image/"
+)
 STAGE2 = KeyMap(
-    "stage2", r"touch_mae_model\..*",
+    "stage2",
+    r"touch_mae_model\..*",
     (*_touch(_STAGE2), *rows(_DECODER, _STAGE2, "decoder/"), *TABLE, *rows(_MATCHER)),
-    lora=(*_WRAPPED, *rows(_LORA, _PEFT, "lora/")), unused=_unused(_STAGE2), towers=_TOWERS,
-)  # fmt: skip
-PROBE = KeyMap("probe", r"touch_model\.embeddings\.patch_embedding\.weight", _touch(patch=_PROBE_PATCH), towers=_TOWERS)
+    lora=(*_WRAPPED, *rows(_LORA, _PEFT, "lora/")),
+    unused=_unused(_STAGE2),
+    towers=_TOWERS,
+)
+PROBE = KeyMap(
+    "probe",
+    r"touch_model\.embeddings\.patch_embedding\.weight",
+    _touch(patch=_PROBE_PATCH),
+    towers=_TOWERS,
+)
 
 # Plain ViTs: the layouts of timm (Sparsh, T3, SITR, DINOv2's authors), of Hugging Face, and of AnyTouch 2.
 _BLOCKS = """
@@ -420,7 +469,10 @@ SIGLIP = rows(_SIGLIP)
 HF_VIT = (*rows(_HUGGING_FACE), *rows(_HF_VIT))
 HF_DINOV2 = (*rows(_HUGGING_FACE), *rows(_HF_DINOV2))
 SPARSH = (*TIMM, *rows("same pos_embed.frequency_bands frequency"))
-SPARSH_VIDEO = (*rows(_TIMM.replace("frames ", "video ")), *rows("same pos_embed.frequency_bands frequency"))
+SPARSH_VIDEO = (
+    *rows(_TIMM.replace("frames ", "video ")),
+    *rows("same pos_embed.frequency_bands frequency"),
+)
 SITR = (
     *TIMM,
     *rows("frames c_patch_embed.proj calibration\nrow c_pos_embed calibration_position"),

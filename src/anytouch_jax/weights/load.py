@@ -30,12 +30,22 @@ from anytouch_jax.weights.tree import flatten
 
 Params = dict[str, Any]
 
-_RELEASE_SENSORS = SENSORS[:5]  # the authors' weights were trained on these, and on the universal tokens
+# the authors' weights were trained on these, and on the universal tokens
+_RELEASE_SENSORS = SENSORS[:5]
 _TORCH = (".pth", ".pt", ".ckpt", ".bin")
 _INDEX = ".index.json"  # of weights in several files
-_PATTERNS = ("*.safetensors", f"*.safetensors{_INDEX}", "*.bin", f"*.bin{_INDEX}", "*.pth", "*.pt", "*.ckpt")
+_PATTERNS = (
+    "*.safetensors",
+    f"*.safetensors{_INDEX}",
+    "*.bin",
+    f"*.bin{_INDEX}",
+    "*.pth",
+    "*.pt",
+    "*.ckpt",
+)
 _SHARD = re.compile(r"(.+)-\d{5}-of-(\d{5})(\.\w+)")
-_PREFIX = re.compile(r"(module|_orig_mod|model)\.")  # DistributedDataParallel, torch.compile, Lightning
+# DistributedDataParallel, torch.compile, Lightning
+_PREFIX = re.compile(r"(module|_orig_mod|model)\.")
 _INNER = re.compile(r"(^|\.)(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
 
 
@@ -48,7 +58,11 @@ class Start(NamedTuple):
 
 
 def load_model(
-    path: str | Path, *, step: int | None = None, stored_rows: bool = False, weights: Weights | None = None
+    path: str | Path,
+    *,
+    step: int | None = None,
+    stored_rows: bool = False,
+    weights: Weights | None = None,
 ) -> Loaded:
     """Load an encoder by name, a run folder, a checkpoint folder, a weights file or a folder with a .pth file.
 
@@ -65,26 +79,44 @@ def load_model(
     if is_run_folder(path):
         params, text, metadata = checkpoint.load_params(path, step)
         config: Config = from_json(text)
-        wanted = {name: form for name, form in param_shapes(config.model).items() if name.split("/")[0] in params}
+        wanted = {
+            name: form
+            for name, form in param_shapes(config.model).items()
+            if name.split("/")[0] in params
+        }
         arrays = flatten(params)  # runs of version 0.1 have more
-        check_arrays(f"arrays of {path}", {name: x for name, x in arrays.items() if name in wanted}, wanted)
+        check_arrays(
+            f"arrays of {path}", {name: x for name, x in arrays.items() if name in wanted}, wanted
+        )
         trained = metadata.get("seen")
-        drawn, from_run = config.objective.universal_start + config.objective.universal_end > 0, True
+        drawn = config.objective.universal_start + config.objective.universal_end > 0
+        from_run = True
     else:
         path = find_weights_file(path)
         weights = read_weights(path) if weights is None else weights
-        model, file_metadata = model_of_file(path, weights), safetensors.read_file_metadata(path)
+        model = model_of_file(path, weights)
+        file_metadata = safetensors.read_file_metadata(path)
         background: Any = file_metadata.get(safetensors.BACKGROUND_KEY, "keep")
         with _naming(path):
-            params, config = to_params(weights, model), Config(model, data=DataConfig(background=background))
+            params = to_params(weights, model)
+            config = Config(model, data=DataConfig(background=background))
         # A run without universal tokens was exported with the mean of its sensors in their place.
-        trained, drawn, from_run = trained_sensors(file_metadata, model), True, False
+        trained = trained_sensors(file_metadata, model)
+        drawn = True
+        from_run = False
         metadata = dict(file_metadata)
     check_finite(path, flatten(params))
-    check_finite(path, weights or {})  # an array that nobody reads shows a damaged file, too
+    # an array that nobody reads shows a damaged file, too
+    check_finite(path, weights or {})
     if trained is not None and "touch" in params and (from_run or not stored_rows):
-        params |= {"touch": convert.serve_unseen(params["touch"], config.model, trained, universal_drawn=drawn)}
-    return Loaded(path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run)
+        params |= {
+            "touch": convert.serve_unseen(
+                params["touch"], config.model, trained, universal_drawn=drawn
+            )
+        }
+    return Loaded(
+        path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run
+    )
 
 
 @contextmanager
@@ -101,7 +133,9 @@ def trained_sensors(metadata: Mapping[str, str], model: ModelConfig) -> tuple[st
     """Return the sensors that a file was trained on: as its metadata says, or the authors' for a file of theirs."""
     if safetensors.SEEN_KEY in metadata:
         return tuple(metadata[safetensors.SEEN_KEY].split(","))
-    return _RELEASE_SENSORS if safetensors.MODEL_KEY not in metadata and model.sensors == SENSORS else None
+    if safetensors.MODEL_KEY not in metadata and model.sensors == SENSORS:
+        return _RELEASE_SENSORS
+    return None
 
 
 def load_init(
@@ -114,7 +148,8 @@ def load_init(
     """
     notes: list[str] = []
     trained: tuple[str, ...] = ()
-    stage1, towers = None, None
+    stage1 = None
+    towers = None
     if init is not None:
         loaded = load_model(init)
         _check_init(loaded, config)
@@ -123,7 +158,9 @@ def load_init(
         stage1 = _fit(loaded, config)
         trained = loaded.trained_sensors or (() if loaded.from_run else _RELEASE_SENSORS)
     elif config.stage == 2:
-        notes.append("stage 2 starts without --init: its touch encoder has not been trained on touch yet")
+        notes.append(
+            "stage 2 starts without --init: its touch encoder has not been trained on touch yet"
+        )
     if clip is not None:
         file = find_weights_file(clip)
         trained_by = clip_activation(file)
@@ -140,43 +177,64 @@ def load_init(
                     f"--model.activation {other}"
                 )
             if init is None and not towers.keys() & {"visual_projection.weight", "visual.proj"}:
-                notes.append(f"{file} has no projection: that of the touch encoder starts untrained")
+                notes.append(
+                    f"{file} has no projection: that of the touch encoder starts untrained"
+                )
     return Start(first_params(fresh, config.model, stage1=stage1, clip=towers), notes, trained)
 
 
 def _check_init(loaded: Loaded, config: Config) -> None:
     """Raise UserError if a run or a file cannot start this run."""
-    path, model = loaded.path, loaded.config.model
-    convert.check_activation(path, model.activation if loaded.from_run else clip_activation(path), config)
+    path = loaded.path
+    model = loaded.config.model
+    convert.check_activation(
+        path, model.activation if loaded.from_run else clip_activation(path), config
+    )
     if "touch" not in loaded.params:
-        raise UserError(f"{path} has no touch encoder; give a run, an encoder by name, or the authors' weights")
+        raise UserError(
+            f"{path} has no touch encoder; give a run, an encoder by name, or the authors' weights"
+        )
     if "decoder" not in loaded.params:  # an encoder of the package: the decoder starts untrained
         ours = config.model
         model = replace(model, decoder=ours.decoder, decoder_norm_eps=ours.decoder_norm_eps)
-    convert.check_form(path, model, config, preset=loaded.config.preset if loaded.from_run else "custom")
+    convert.check_form(
+        path, model, config, preset=loaded.config.preset if loaded.from_run else "custom"
+    )
 
 
 def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[str]:
     """Return a sentence for everything of `loaded` that this run changes or leaves out."""
-    path, background, notes = loaded.path, loaded.config.data.background, []
+    path = loaded.path
+    background = loaded.config.data.background
+    notes = []
     if background != config.data.background:
         notes.append(
             f"{path} was trained with --data.background {background}, this run with {config.data.background}: its "
             "encoder was never trained on such touches"
         )
     ours = config.model.sensors
-    lost = [name for name in loaded.config.model.sensors if name in (loaded.trained_sensors or ()) and name not in ours]
+    lost = [
+        name
+        for name in loaded.config.model.sensors
+        if name in (loaded.trained_sensors or ()) and name not in ours
+    ]
     if lost:
         option = " ".join((*ours, *lost))
-        notes.append(f"the tokens of {', '.join(lost)} in {path} are left out; --model.sensors {option} keeps them")
+        notes.append(
+            f"the tokens of {', '.join(lost)} in {path} are left out; --model.sensors {option} keeps them"
+        )
     has_decoder = "decoder" in loaded.params
     if config.reconstructs and not has_decoder:
         notes.append(f"{path} has no decoder, so the decoder starts untrained")
     if dropped := sorted((fresh_parts & set(loaded.params)) - {*_STARTS}):
         decoder = " and the decoder" * has_decoder
-        notes.append(f"{path} gives the touch encoder{decoder}; {', '.join(dropped)} start untrained")
+        notes.append(
+            f"{path} gives the touch encoder{decoder}; {', '.join(dropped)} start untrained"
+        )
     if loaded.config.model.patches != config.model.patches:
-        notes.append(f"the positions of {path} are resized for images of {config.model.image_size} pixels")
+        notes.append(
+            f"the positions of {path} are resized for images of {config.model.image_size} pixels"
+        )
     return notes
 
 
@@ -200,13 +258,18 @@ def _fit(loaded: Loaded, config: Config) -> Params:
     rows = config.model.patches + 1
     if loaded.config.model.patches + 1 != rows:
         parts |= {
-            name: parts[name] | {"position": resize_position(np.asarray(parts[name]["position"]), rows)}
-            for name in ("touch", "decoder") if name in parts
-        }  # fmt: skip
+            name: parts[name]
+            | {"position": resize_position(np.asarray(parts[name]["position"]), rows)}
+            for name in ("touch", "decoder")
+            if name in parts
+        }
     if loaded.config.model.fields != config.model.fields:
         parts.pop("fields", None)
-    stored, wanted = loaded.config.model.sensors, config.model.sensors
-    touch = map_sensors(parts["touch"], config.model, lambda table: convert.match_sensors(table, stored, wanted))
+    stored = loaded.config.model.sensors
+    wanted = config.model.sensors
+    touch = map_sensors(
+        parts["touch"], config.model, lambda table: convert.match_sensors(table, stored, wanted)
+    )
     return parts | {"touch": touch}
 
 
@@ -226,30 +289,48 @@ def first_params(
         merged = inflate(merged, {"projection": params["touch"]["projection"], **image})
     if clip is not None and (model.image or model.text):
         towers = to_params(clip, model)
-        merged = _replace(merged, {part: towers[part] for part in ("image", "text", "logit_scale") if part in towers})
+        merged = _replace(
+            merged,
+            {part: towers[part] for part in ("image", "text", "logit_scale") if part in towers},
+        )
     if stage1 is not None:
-        merged = _replace(merged, {part: stage1[part] for part in _STARTS if part in stage1 and part in merged})
+        merged = _replace(
+            merged, {part: stage1[part] for part in _STARTS if part in stage1 and part in merged}
+        )
     return merged
 
 
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
     """Return `params` with the touch encoder of an image tower; with `divide` a still's response equals the tower's."""
-    shape = params["touch"]["patch"]["kernel"].shape  # (T, ...), or (R, T, ...) with one kernel a sensor
-    kernel = np.broadcast_to(np.asarray(image["patch"]["kernel"]), shape) / np.float32(shape[-3] if divide else 1)
-    touch = {**image, "patch": {"kernel": kernel}, "sensor_tokens": params["touch"]["sensor_tokens"]}
+    # (T, ...), or (R, T, ...) with one kernel a sensor
+    shape = params["touch"]["patch"]["kernel"].shape
+    kernel = np.broadcast_to(np.asarray(image["patch"]["kernel"]), shape) / np.float32(
+        shape[-3] if divide else 1
+    )
+    touch = {
+        **image,
+        "patch": {"kernel": kernel},
+        "sensor_tokens": params["touch"]["sensor_tokens"],
+    }
     return _replace(params, {"touch": touch})
 
 
 def _replace(params: Params, parts: Params) -> Params:
     """Return `params` with whole parts replaced by others of the same names and shapes."""
     before = flatten({part: params[part] for part in parts if part in params})
-    check_arrays("weights", flatten(parts), {name: tuple(leaf.shape) for name, leaf in before.items()})
+    check_arrays(
+        "weights", flatten(parts), {name: tuple(leaf.shape) for name, leaf in before.items()}
+    )
     return {**params, **parts}
 
 
 def is_run_folder(path: Path) -> bool:
     """Return whether a folder is that of a run or of a checkpoint, and not of weights files."""
-    return path.is_dir() and not any(path.glob("*.pth")) and (checkpoint.is_run(path) or not _weights_files(path))
+    return (
+        path.is_dir()
+        and not any(path.glob("*.pth"))
+        and (checkpoint.is_run(path) or not _weights_files(path))
+    )
 
 
 def find_weights_file(path: str | Path) -> Path:
@@ -259,7 +340,9 @@ def find_weights_file(path: str | Path) -> Path:
         return path
     if files := _weights_files(path):
         return files[0]
-    raise UserError(f"there are no weights (*.safetensors, *.bin, *.pth, *.ckpt) in {path}; give another path")
+    raise UserError(
+        f"there are no weights (*.safetensors, *.bin, *.pth, *.ckpt) in {path}; give another path"
+    )
 
 
 def _weights_files(folder: Path) -> list[Path]:
@@ -277,15 +360,21 @@ def read_weights(path: str | Path) -> dict[str, np.ndarray]:
     if shard := _SHARD.fullmatch(path.name):
         index = path.with_name(f"{shard[1]}{shard[3]}{_INDEX}")
         if not index.is_file():
-            raise WeightsError(f"{path} is one of {int(shard[2])} parts; put them and {index.name} into one folder")
+            raise WeightsError(
+                f"{path} is one of {int(shard[2])} parts; put them and {index.name} into one folder"
+            )
         path = index
     arrays = _strip_prefixes(_read_parts(path) if path.name.endswith(_INDEX) else _read_file(path))
     for name, array in arrays.items():
         # numpy calls bfloat16 and float8 a "V" too, as it does records.
         if array.dtype.kind in "USOMmc" or array.dtype.type is np.void:
             raise WeightsError(f"{path} has no weights: {name} is {array.dtype}, not real numbers")
-    with np.errstate(over="ignore"):  # what is too large becomes infinite, which is refused by its name
-        return {name: one if one.dtype.kind in "iub" else one.astype(np.float32) for name, one in arrays.items()}
+    # what is too large becomes infinite, which is refused by its name
+    with np.errstate(over="ignore"):
+        return {
+            name: one if one.dtype.kind in "iub" else one.astype(np.float32)
+            for name, one in arrays.items()
+        }
 
 
 def _read_file(path: Path) -> dict[str, np.ndarray]:
@@ -295,7 +384,9 @@ def _read_file(path: Path) -> dict[str, np.ndarray]:
     if suffix in _TORCH:
         return read_torch(path)
     if suffix != ".npz":
-        raise WeightsError(f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt, .ckpt or .bin file")
+        raise WeightsError(
+            f"{path} is of unknown type; give a .safetensors, .npz, .pth, .pt, .ckpt or .bin file"
+        )
     try:
         return read_arrays(safetensors.existing_file(path))
     except (OSError, ValueError) as error:
@@ -305,24 +396,37 @@ def _read_file(path: Path) -> dict[str, np.ndarray]:
 def _strip_prefixes(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the arrays without prefixes that all names share, nor wrappers inside a name, if names stay different."""
     names = {name: _INNER.sub(r"\1", name) for name in weights}
-    while len(shared := {(_PREFIX.match(name) or [""])[0] for name in names.values()}) == 1 and "" not in shared:
+    while (
+        len(shared := {(_PREFIX.match(name) or [""])[0] for name in names.values()}) == 1
+        and "" not in shared
+    ):
         names = {old: _INNER.sub(r"\1", new.removeprefix(*shared)) for old, new in names.items()}
-    return {names[old]: value for old, value in weights.items()} if len(set(names.values())) == len(names) else weights
+    if len(set(names.values())) == len(names):
+        return {names[old]: value for old, value in weights.items()}
+    return weights
 
 
 def _read_parts(index: Path) -> dict[str, np.ndarray]:
     """Return the arrays of all files that an index names. Raises WeightsError for missing files and arrays."""
     homes = _object(read_settings(index), "weight_map")
-    if not homes or not all(isinstance(part, str) and Path(part).name == part for part in homes.values()):
-        raise WeightsError(f"{index} is no index of weights: it needs weight_map, the file of each array")
+    if not homes or not all(
+        isinstance(part, str) and Path(part).name == part for part in homes.values()
+    ):
+        raise WeightsError(
+            f"{index} is no index of weights: it needs weight_map, the file of each array"
+        )
     arrays: dict[str, np.ndarray] = {}
     for part in sorted(set(homes.values())):
         if not (index.parent / part).is_file():
-            raise WeightsError(f"{index} names the file {part}, which is not there; download all parts")
+            raise WeightsError(
+                f"{index} names the file {part}, which is not there; download all parts"
+            )
         content = _read_file(index.parent / part)
         arrays |= {name: array for name, array in content.items() if homes.get(name) == part}
     if missing := sorted(homes.keys() - arrays.keys()):
-        raise WeightsError(f"{index} names {missing[0]} in {homes[missing[0]]}, which lacks it; download it again")
+        raise WeightsError(
+            f"{index} names {missing[0]} in {homes[missing[0]]}, which lacks it; download it again"
+        )
     return arrays
 
 
@@ -342,7 +446,10 @@ def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[
     with _naming(path):
         model, unknown = detect_form(weights, _stored_heads(path, config, openclip))
     activation: Any = _object(config, "model").get("activation")
-    if detect_layout(weights) in ("clip", "openclip"):  # CLIP's configuration says nothing of the authors' weights
+    if detect_layout(weights) in (
+        "clip",
+        "openclip",
+    ):  # CLIP's configuration says nothing of the authors' weights
         activation = clip_activation(path)
     return (model if activation is None else replace(model, activation=activation)), unknown
 
@@ -352,13 +459,23 @@ def _folder_config(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     config = read_settings(Path(path).with_name("config.json"))
     if config.get("model_type") == "clip_vision_model":  # of the vision tower alone
         config = {"vision_config": config} | config
-    return config, _object(read_settings(Path(path).with_name("open_clip_config.json")), "model_cfg")
+    return config, _object(
+        read_settings(Path(path).with_name("open_clip_config.json")), "model_cfg"
+    )
 
 
-def _stored_heads(path: str | Path, config: dict[str, Any], openclip: dict[str, Any]) -> dict[str, int]:
+def _stored_heads(
+    path: str | Path, config: dict[str, Any], openclip: dict[str, Any]
+) -> dict[str, int]:
     """Return the head counts of stacks. Raises WeightsError for a count that is no positive integer."""
-    tower, ours, heads = _object(openclip, "vision_cfg"), _object(config, "model"), dict[str, Any]()
-    if isinstance(tower.get("width"), int) and isinstance(size := tower.get("head_width", 64), int) and size > 0:
+    tower = _object(openclip, "vision_cfg")
+    ours = _object(config, "model")
+    heads = dict[str, Any]()
+    if (
+        isinstance(tower.get("width"), int)
+        and isinstance(size := tower.get("head_width", 64), int)
+        and size > 0
+    ):
         heads["image"] = tower["width"] // size
     heads["text"] = _object(openclip, "text_cfg").get("heads")
     for name, theirs in (("image", "vision_config"), ("text", "text_config")):
@@ -377,7 +494,9 @@ def _stored_heads(path: str | Path, config: dict[str, Any], openclip: dict[str, 
 def _object(value: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return an object in a JSON object, {} for another value."""
     inner = value.get(name)
-    return inner if isinstance(inner, dict) else {}
+    if isinstance(inner, dict):
+        return inner
+    return {}
 
 
 def clip_activation(path: str | Path) -> str | None:
@@ -385,8 +504,13 @@ def clip_activation(path: str | Path) -> str | None:
     if (text := safetensors.read_file_metadata(path).get(safetensors.MODEL_KEY)) is not None:
         return str(from_json(text, ModelConfig).activation)
     config, openclip = _folder_config(path)
-    towers = [tower for name in ("text_config", "vision_config") if isinstance(tower := config.get(name), dict)]
-    names = {str(tower.get("hidden_act", "quick_gelu")) for tower in towers}  # HF's default
+    towers = [
+        tower
+        for name in ("text_config", "vision_config")
+        if isinstance(tower := config.get(name), dict)
+    ]
+    # HF's default
+    names = {str(tower.get("hidden_act", "quick_gelu")) for tower in towers}
     names |= {str(name) for key, name in _object(config, "model").items() if key == "activation"}
     if not names and openclip:
         names.add("quick_gelu" if openclip.get("quick_gelu") else "gelu")
@@ -405,7 +529,11 @@ def read_settings(path: Path) -> dict[str, Any]:
     try:
         value = parse_json(path.read_bytes())
     except ValueError as error:
-        raise WeightsError(f"{path} {error}; correct it, or move the weights to a folder without it") from None
+        raise WeightsError(
+            f"{path} {error}; correct it, or move the weights to a folder without it"
+        ) from None
     if not isinstance(value, dict):
-        raise WeightsError(f"{path} is no JSON object; correct it, or move the weights to a folder without it")
+        raise WeightsError(
+            f"{path} is no JSON object; correct it, or move the weights to a folder without it"
+        )
     return value

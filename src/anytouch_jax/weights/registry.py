@@ -29,9 +29,12 @@ if TYPE_CHECKING:
 
 DEFAULT = "anytouch-tiny"
 FORMER = "anytouch-tiny-conv"  # of earlier versions: the default has replaced it
-FOLDER = Path(__file__).parent / "encoders"  # a folder for each: config.json, model.safetensors, README.md
-WEIGHTS, CARD = "model.safetensors", "config.json"
-PARTS = ("touch", "fields", "text", "logit_scale")  # for features, depth and force, zero-shot questions
+# a folder for each: config.json, model.safetensors, README.md
+FOLDER = Path(__file__).parent / "encoders"
+WEIGHTS = "model.safetensors"
+CARD = "config.json"
+# for features, depth and force, zero-shot questions
+PARTS = ("touch", "fields", "text", "logit_scale")
 _HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
 _FILES = ["*.safetensors", "*.pth", "*.pt", "*.bin", "*.ckpt", "*.json", "calibration/*.png"]
 
@@ -54,23 +57,33 @@ def locate(model: str | Path) -> Path:
     hf://user/repo@revision. Raises UserError for a damaged package, and for a repository that cannot be read.
     """
     if str(model) == FORMER and not Path(model).exists():
-        warnings.warn(f"{FORMER} has left the package: {DEFAULT} is used, which is better", stacklevel=2)
+        warnings.warn(
+            f"{FORMER} has left the package: {DEFAULT} is used, which is better", stacklevel=2
+        )
         model = DEFAULT
     if str(model) in list_encoders():
         return _packaged(str(model))
     if address := _HUB.fullmatch(str(model)):
         return _download(address[1], address[2])
     if str(model).startswith("hf:"):
-        raise UserError(f"{model} is not an address on the hub. Write hf://user/repo or hf://user/repo@revision.")
+        raise UserError(
+            f"{model} is not an address on the hub. Write hf://user/repo or hf://user/repo@revision."
+        )
     path = Path(model)
-    return path.absolute() if str(path) in list_encoders() else path  # a Path drops ./
+    # a Path drops ./
+    if str(path) in list_encoders():
+        return path.absolute()
+    return path
 
 
 @lru_cache
 def _packaged(name: str) -> Path:
-    file, expected = FOLDER / name / WEIGHTS, read_card(name).get("sha256")
+    file = FOLDER / name / WEIGHTS
+    expected = read_card(name).get("sha256")
     if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != expected:
-        raise UserError(f"The weights of {name} in the package are damaged or missing. Install anytouch_jax again.")
+        raise UserError(
+            f"The weights of {name} in the package are damaged or missing. Install anytouch_jax again."
+        )
     return file
 
 
@@ -81,49 +94,80 @@ def _download(repository: str, revision: str | None) -> Path:
         raise UserError("An address hf://... needs huggingface_hub. Install it with pip.") from None
     try:
         return Path(snapshot_download(repository, revision=revision, allow_patterns=_FILES))
-    except Exception as error:  # the client raises many types, and each of its messages fills a screen
-        reason = str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
-        raise UserError(f"Cannot get hf://{repository}{f'@{revision}' if revision else ''}: {reason}") from None
+    except (
+        Exception
+    ) as error:  # the client raises many types, and each of its messages fills a screen
+        reason = (
+            str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
+        )
+        raise UserError(
+            f"Cannot get hf://{repository}{f'@{revision}' if revision else ''}: {reason}"
+        ) from None
 
 
 def write_encoder(
-    folder: str | Path, loaded: Loaded, notes: str = "", *, parts: tuple[str, ...] = PARTS,
+    folder: str | Path,
+    loaded: Loaded,
+    notes: str = "",
+    *,
+    parts: tuple[str, ...] = PARTS,
     tokenizer: Path | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16, config.json, README.md.
 
     The copy computes in float32. `parts` of the model are kept. `notes` is Markdown for the card. Raises WeightsError
     for values that float16 cannot hold.
     """
-    from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors  # imports jax
+    # imports jax
+    from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors
     from anytouch_jax.weights.tree import flatten
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     params = {name: loaded.params[name] for name in parts if name in loaded.params}
-    with np.errstate(over="ignore"):  # reported below, by name
-        arrays = {name: np.asarray(leaf, np.float32).astype(np.float16) for name, leaf in flatten(params).items()}
+    # reported below, by name
+    with np.errstate(over="ignore"):
+        arrays = {
+            name: np.asarray(leaf, np.float32).astype(np.float16)
+            for name, leaf in flatten(params).items()
+        }
     if wrong := [name for name, array in arrays.items() if not np.isfinite(array).all()]:
-        raise WeightsError(f"{wrong[0]} has values above 65504, which float16 cannot hold; use --to safetensors")
+        raise WeightsError(
+            f"{wrong[0]} has values above 65504, which float16 cannot hold; use --to safetensors"
+        )
     model = loaded.config.model
     model = replace(
-        model, image=model.image if "image" in params else None, text=model.text if "text" in params else None,
-        match_head=model.match_head if "matcher" in params else "none", lora_rank=0,
-        fields=model.fields if "fields" in params else 0, dtype="float32",
-    )  # fmt: skip
-    write_safetensors(folder / WEIGHTS, arrays, loaded.export_metadata() | {MODEL_KEY: to_json(model), "source": ""})
+        model,
+        image=model.image if "image" in params else None,
+        text=model.text if "text" in params else None,
+        match_head=model.match_head if "matcher" in params else "none",
+        lora_rank=0,
+        fields=model.fields if "fields" in params else 0,
+        dtype="float32",
+    )
+    write_safetensors(
+        folder / WEIGHTS,
+        arrays,
+        loaded.export_metadata() | {MODEL_KEY: to_json(model), "source": ""},
+    )
     if tokenizer is not None and "text" in params:
         shutil.copyfile(tokenizer, folder / "tokenizer.json")
     card = {
         "name": folder.name,
         "parameters": {
-            part: int(sum(np.size(leaf) for leaf in flatten(tree).values())) for part, tree in params.items()
+            part: int(sum(np.size(leaf) for leaf in flatten(tree).values()))
+            for part, tree in params.items()
         },
-        "image_size": model.image_size, "frames": model.frames, "features": model.embed,
-        "background": loaded.config.data.background, "trained_sensors": loaded.trained_sensors,
-        "stage": loaded.config.stage, "steps": loaded.metadata.get("step", loaded.config.run.steps),
-        "recipe": loaded.config.recipe, "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
-    }  # fmt: skip
+        "image_size": model.image_size,
+        "frames": model.frames,
+        "features": model.embed,
+        "background": loaded.config.data.background,
+        "trained_sensors": loaded.trained_sensors,
+        "stage": loaded.config.stage,
+        "steps": loaded.metadata.get("step", loaded.config.run.steps),
+        "recipe": loaded.config.recipe,
+        "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
+    }
     atomic_write(folder / CARD, json.dumps(card, indent=2) + "\n")
     atomic_write(folder / "README.md", _page(card, notes))
     return folder
@@ -131,7 +175,8 @@ def write_encoder(
 
 def _page(card: Mapping[str, Any], notes: str) -> str:
     """Return the model card in the form of the hub: a header that machines read, then Markdown."""
-    count, sensors = sum(card["parameters"].values()), card["trained_sensors"]
+    count = sum(card["parameters"].values())
+    sensors = card["trained_sensors"]
     subtracted = {
         "subtract": "It needs the picture of the untouched gel, which is subtracted.",
         "either": "A picture of the untouched gel is subtracted if you give one. It also works without.",

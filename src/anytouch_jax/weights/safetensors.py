@@ -59,7 +59,9 @@ class Loaded:
         return metadata
 
 
-def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+def write_safetensors(
+    path: str | Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
+) -> None:
     """Write arrays to one safetensors file, whole or not at all; `metadata` is text by name. Raises WeightsError."""
     from safetensors.numpy import save_file
 
@@ -67,11 +69,16 @@ def write_safetensors(path: str | Path, arrays: Mapping[str, np.ndarray], metada
     try:
         with atomic_path(path) as part:
             # the library ignores strides: a transposed view would be written in the wrong order
-            save_file({n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()}, part, dict(metadata))
+            save_file(
+                {n: np.ascontiguousarray(a).reshape(a.shape) for n, a in arrays.items()},
+                part,
+                dict(metadata),
+            )
             _sort_metadata(part)
             umask = os.umask(0)
             os.umask(umask)
-            os.chmod(part, 0o666 & ~umask)  # the library writes a file that only its owner may read
+            # the library writes a file that only its owner may read
+            os.chmod(part, 0o666 & ~umask)
     except Exception as error:  # the library wraps OSError in its own type
         advice = "; free some space" if "No space left" in str(error) else ""
         raise WeightsError(f"could not write {path}: {error}{advice}") from error
@@ -91,7 +98,9 @@ def _sort_metadata(file: Path) -> None:
 
 def export_safetensors(path: str | Path, params: Any, metadata: Mapping[str, str]) -> None:
     """Write a parameter tree to one safetensors file, names joined with "/". Raises WeightsError."""
-    write_safetensors(path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata)
+    write_safetensors(
+        path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata
+    )
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -26,14 +26,25 @@ import numpy as np
 from anytouch_jax.weights.safetensors import WeightsError, existing_file
 
 _STORAGES = {
-    "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "BFloat16Storage": "bfloat16", "BoolStorage": "?",
-    "LongStorage": "i8", "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1",
-}  # fmt: skip
+    "DoubleStorage": "f8",
+    "FloatStorage": "f4",
+    "HalfStorage": "f2",
+    "BFloat16Storage": "bfloat16",
+    "BoolStorage": "?",
+    "LongStorage": "i8",
+    "IntStorage": "i4",
+    "ShortStorage": "i2",
+    "CharStorage": "i1",
+    "ByteStorage": "u1",
+}
 _REPEATS = 1 << 20  # a tensor larger than its storage (stride 0) may have this many elements
-_GROWTH, _SPARE = 3, 1 << 26  # the tensors of a file may take 3 times its bytes, and 64 MiB more
+# the tensors of a file may take 3 times its bytes, and 64 MiB more
+_GROWTH = 3
+_SPARE = 1 << 26
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _WRAPPERS = ("model", "state_dict", "model_state_dict", "module", "student")
-_AVERAGES = ("state_dict_ema", "model_ema", "ema", "teacher")  # read only where no plain weights are
+# read only where no plain weights are
+_AVERAGES = ("state_dict_ema", "model_ema", "ema", "teacher")
 _DEPTH = 4  # of wrappings in each other
 
 
@@ -46,20 +57,31 @@ def read_torch(path: str | Path) -> dict[str, np.ndarray]:
     path = existing_file(path)
     try:
         with open(path, "rb") as file:
-            zipped, size = zipfile.is_zipfile(file), os.fstat(file.fileno()).st_size
+            zipped = zipfile.is_zipfile(file)
+            size = os.fstat(file.fileno()).st_size
             file.seek(0)
             if not zipped and file.read(2) == b"PK":
-                raise WeightsError("it is cut short (its zip directory is missing); download it again")
+                raise WeightsError(
+                    "it is cut short (its zip directory is missing); download it again"
+                )
             file.seek(0)
             reader = _Zip(file, size) if zipped else _Legacy(file)
             tensors = _state(_unwrap(reader.content, path))
-            if sum(math.prod(t.shape) * t.storage.dtype.itemsize for t in tensors.values()) > _GROWTH * size + _SPARE:
+            if (
+                sum(math.prod(t.shape) * t.storage.dtype.itemsize for t in tensors.values())
+                > _GROWTH * size + _SPARE
+            ):
                 raise ValueError("its tensors are many times larger than the file")
-            return {name: tensor.read(reader.load(tensor.storage), big=reader.big) for name, tensor in tensors.items()}
+            return {
+                name: tensor.read(reader.load(tensor.storage), big=reader.big)
+                for name, tensor in tensors.items()
+            }
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
     except Exception as error:  # damaged bytes raise any type of error
-        raise WeightsError(f"{path} is damaged or not a torch file ({type(error).__name__}: {error})") from error
+        raise WeightsError(
+            f"{path} is damaged or not a torch file ({type(error).__name__}: {error})"
+        ) from error
 
 
 class _Name(str):
@@ -92,16 +114,26 @@ class _Tensor:
         """Return the values, given the bytes of the storage. Raises ValueError if the view leaves its storage."""
         flat = np.frombuffer(data, self.storage.dtype)
         if len(flat) != self.storage.length:
-            raise ValueError(f"storage {self.storage.key} has {len(data)} bytes, not those it announces")
+            raise ValueError(
+                f"storage {self.storage.key} has {len(data)} bytes, not those it announces"
+            )
         if 0 in self.shape:
             return np.empty(self.shape, flat.dtype)
-        last = self.offset + sum((size - 1) * step for size, step in zip(self.shape, self.stride, strict=True))
+        last = self.offset + sum(
+            (size - 1) * step for size, step in zip(self.shape, self.stride, strict=True)
+        )
         if last >= len(flat):
-            raise ValueError(f"a tensor of shape {self.shape} reaches beyond its storage of {len(flat)} elements")
+            raise ValueError(
+                f"a tensor of shape {self.shape} reaches beyond its storage of {len(flat)} elements"
+            )
         steps = tuple(step * flat.itemsize for step in self.stride)
-        values = np.lib.stride_tricks.as_strided(flat[self.offset :], self.shape, steps, writeable=False)
+        values = np.lib.stride_tricks.as_strided(
+            flat[self.offset :], self.shape, steps, writeable=False
+        )
         values = values.byteswap() if big else np.array(values, order="C")
-        return values.astype(np.float32) if values.dtype == ml_dtypes.bfloat16 else values
+        if values.dtype == ml_dtypes.bfloat16:
+            return values.astype(np.float32)
+        return values
 
 
 class _Zip:
@@ -113,10 +145,14 @@ class _Zip:
         names = self.archive.namelist()
         pickles = [name for name in names if name == "data.pkl" or name.endswith("/data.pkl")]
         if len(pickles) != 1:
-            raise WeightsError("a zip file without the data.pkl of torch.save; give a state_dict or safetensors")
+            raise WeightsError(
+                "a zip file without the data.pkl of torch.save; give a state_dict or safetensors"
+            )
         self.root = pickles[0].removesuffix("data.pkl")
         if f"{self.root}constants.pkl" in names:
-            raise WeightsError("a TorchScript program, not plain weights; save its state_dict() instead")
+            raise WeightsError(
+                "a TorchScript program, not plain weights; save its state_dict() instead"
+            )
         self.big = f"{self.root}byteorder" in names and self._read("byteorder").strip() == b"big"
         self.content = _Unpickler(io.BytesIO(self._read("data.pkl"))).load()
 
@@ -125,8 +161,12 @@ class _Zip:
 
     def _read(self, name: str) -> bytes:
         info = self.archive.getinfo(self.root + name)
-        if info.file_size > self.size:  # torch stores without compression: anything larger is a zip bomb
-            raise ValueError(f"record {name} claims {info.file_size} bytes in a file of {self.size}")
+        if (
+            info.file_size > self.size
+        ):  # torch stores without compression: anything larger is a zip bomb
+            raise ValueError(
+                f"record {name} claims {info.file_size} bytes in a file of {self.size}"
+            )
         return self.archive.read(info)
 
 
@@ -158,11 +198,15 @@ def _unwrap(content: Any, path: Path) -> Any:
     """Return the state dict inside the usual wrappings, plain weights before averaged ones, which give a warning."""
     for _ in range(_DEPTH):
         inner = content if isinstance(content, dict) else {}
-        name = next((name for name in _WRAPPERS + _AVERAGES if isinstance(inner.get(name), dict)), None)
+        name = next(
+            (name for name in _WRAPPERS + _AVERAGES if isinstance(inner.get(name), dict)), None
+        )
         if name is None:
             break
         if name in _AVERAGES:
-            warnings.warn(f"{path} has no plain weights; the averaged ones in {name!r} are read", stacklevel=4)
+            warnings.warn(
+                f"{path} has no plain weights; the averaged ones in {name!r} are read", stacklevel=4
+            )
         content = inner[name]
     return content
 
@@ -171,9 +215,15 @@ def _state(content: Any) -> dict[str, _Tensor]:
     """Return the tensors by name. Raises WeightsError for an object that is no state_dict."""
     if not isinstance(content, dict) or not content:
         raise WeightsError(f"it has no state_dict, but {type(content).__name__}")
-    others = [str(name) for name, value in content.items() if not (type(name) is str and isinstance(value, _Tensor))]
+    others = [
+        str(name)
+        for name, value in content.items()
+        if not (type(name) is str and isinstance(value, _Tensor))
+    ]
     if others:
-        raise WeightsError(f"it has no state_dict: {', '.join(others[:5])} {'are' if others[1:] else 'is'} no tensor")
+        raise WeightsError(
+            f"it has no state_dict: {', '.join(others[:5])} {'are' if others[1:] else 'is'} no tensor"
+        )
     return content
 
 
@@ -184,9 +234,14 @@ def _size(value: Any) -> int:
 
 
 def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> _Tensor:
-    if not isinstance(storage, _Storage) or not isinstance(shape, tuple) or not isinstance(stride, tuple):
+    if (
+        not isinstance(storage, _Storage)
+        or not isinstance(shape, tuple)
+        or not isinstance(stride, tuple)
+    ):
         raise ValueError("a tensor without storage, shape or stride")
-    shape, stride = tuple(map(_size, shape)), tuple(map(_size, stride))
+    shape = tuple(map(_size, shape))
+    stride = tuple(map(_size, stride))
     if len(shape) != len(stride) or len(shape) > 32:
         raise ValueError(f"a tensor with shape {shape} and stride {stride}")
     if math.prod(shape) > max(storage.length, _REPEATS):
@@ -201,15 +256,22 @@ def _key(key: Any) -> Any:
 
 
 _BUILDERS: dict[str, Callable[..., Any]] = {
-    "torch._utils._rebuild_tensor": _tensor, "torch._utils._rebuild_tensor_v2": _tensor,
-    "torch._utils._rebuild_parameter": lambda data, *_: data, "torch.Size": lambda values=(): tuple(values),
+    "torch._utils._rebuild_tensor": _tensor,
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_parameter": lambda data, *_: data,
+    "torch.Size": lambda values=(): tuple(values),
     "torch.device": lambda *_: _Other(),
     "collections.OrderedDict": lambda pairs=(): {_key(key): value for key, value in pairs},
-    "collections.defaultdict": lambda *_: {}, "argparse.Namespace": _Other,
-}  # fmt: skip
-_STATES = ("torch.optim.", "tactile_ssl.model.custom_scheduler.")  # classes of a training state, which is not read
+    "collections.defaultdict": lambda *_: {},
+    "argparse.Namespace": _Other,
+}
+# classes of a training state, which is not read
+_STATES = ("torch.optim.", "tactile_ssl.model.custom_scheduler.")
 _INERT = {f"torch.{kind}" for kind in _STORAGES}
-_INERT |= {f"torch.{n}" for n in ("float16", "float32", "float64", "bfloat16", "int32", "int64", "uint8", "bool")}
+_INERT |= {
+    f"torch.{n}"
+    for n in ("float16", "float32", "float64", "bfloat16", "int32", "int64", "uint8", "bool")
+}
 _INERT |= {"builtins.dict", "__builtin__.dict"}
 # Operations that only make data. BYTEARRAY8 is left out: it allocates whatever size it is given.
 _DATA = """PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4
@@ -222,7 +284,8 @@ _GUARDED = "DICT SETITEM SETITEMS ADDITEMS REDUCE NEWOBJ BUILD INST"
 
 class _Dispatch(dict[int, Any]):
     def __missing__(self, code: int) -> Any:
-        known = vars(pickletools)["code2op"].get(chr(code))  # absent from typeshed
+        # absent from typeshed
+        known = vars(pickletools)["code2op"].get(chr(code))
         raise _refused(known.name if known else f"operation {code}")
 
 
@@ -265,7 +328,10 @@ class _Unpickler(pickle._Unpickler):
 
     def persistent_load(self, pid: Any) -> _Storage:
         match pid:
-            case ("storage", _Name() as name, str(key), str(), int(length), *rest) if rest in ([], [None]):
+            case ("storage", _Name() as name, str(key), str(), int(length), *rest) if rest in (
+                [],
+                [None],
+            ):
                 kind = _STORAGES.get(name.removeprefix("torch."))
                 if kind is None:
                     raise ValueError(f"a storage of kind {name}")
@@ -276,16 +342,22 @@ class _Unpickler(pickle._Unpickler):
         raise _refused(" ".join(self.readline()[:-1].decode() for _ in range(2)))
 
     def load_reduce(self) -> None:
-        args, function = self.stack.pop(), self.stack.pop()
+        args = self.stack.pop()
+        function = self.stack.pop()
         is_state = isinstance(function, _Name) and function.startswith(_STATES)
-        if not isinstance(function, _Name) or not (is_state or function in _BUILDERS) or not isinstance(args, tuple):
+        if (
+            not isinstance(function, _Name)
+            or not (is_state or function in _BUILDERS)
+            or not isinstance(args, tuple)
+        ):
             raise ValueError(f"the pickle calls {reprlib.repr(function)}")
         self.stack.append(_Other() if is_state else _BUILDERS[function](*args))
 
     load_newobj = load_reduce
 
     def load_build(self) -> None:
-        self.stack.pop()  # the attributes of a Namespace, or of an OrderedDict (_metadata)
+        # the attributes of a Namespace, or of an OrderedDict (_metadata)
+        self.stack.pop()
         if not isinstance(self.stack[-1], _Other | dict):
             raise ValueError(f"the pickle sets the state of {type(self.stack[-1]).__name__}")
 
@@ -301,7 +373,8 @@ class _Unpickler(pickle._Unpickler):
         self._fill(items)
 
     def load_setitem(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
+        value = self.stack.pop()
+        key = self.stack.pop()
         self._fill([key, value])
 
     def load_setitems(self) -> None:
@@ -313,7 +386,9 @@ class _Unpickler(pickle._Unpickler):
             raise ValueError("the pickle adds to something that is no set")
         self.stack[-1].update(map(_key, items))
 
-    dispatch = _Dispatch((_code(name), pickle._Unpickler.dispatch[_code(name)]) for name in _DATA.split())
+    dispatch = _Dispatch(
+        (_code(name), pickle._Unpickler.dispatch[_code(name)]) for name in _DATA.split()
+    )
 
 
 for _operation in _GUARDED.split():

@@ -33,17 +33,22 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
             if not isinstance(node, dict):
                 break
         if not isinstance(node, dict) or last in node:
-            raise UserError(f"the name {name!r} is also the beginning of another array's name; rename one of them")
+            raise UserError(
+                f"the name {name!r} is also the beginning of another array's name; rename one of them"
+            )
         node[last] = leaf
     return tree
 
 
-def interpolate(first: Mapping[str, Any], second: Mapping[str, Any], share: float) -> dict[str, Any]:
+def interpolate(
+    first: Mapping[str, Any], second: Mapping[str, Any], share: float
+) -> dict[str, Any]:
     """Return parameters `share` of the way from `first` to `second` (WiSE-FT, Wortsman et al. 2022).
 
     Arrays that `first` lacks are those of `second`. Raises UserError for arrays of different shapes.
     """
-    start, end = flatten(first), flatten(second)
+    start = flatten(first)
+    end = flatten(second)
     for name in start.keys() & end.keys():
         if np.shape(start[name]) != np.shape(end[name]):
             raise UserError(

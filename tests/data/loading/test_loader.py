@@ -15,11 +15,17 @@ from anytouch_jax.errors import UserError
 
 
 def _clips(sequences=3, length=7):
-    return [{"sequence": f"s{i}", "frame_index": k} for i in range(sequences) for k in range(length)]
+    return [
+        {"sequence": f"s{i}", "frame_index": k} for i in range(sequences) for k in range(length)
+    ]
 
 
-@pytest.mark.parametrize(("stage", "recipe"), [(1, "paper"), (1, "release"), (2, "paper"), (2, "release")])
-def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(make, settings, rich, stage, recipe):
+@pytest.mark.parametrize(
+    ("stage", "recipe"), [(1, "paper"), (1, "release"), (2, "paper"), (2, "release")]
+)
+def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(
+    make, settings, rich, stage, recipe
+):
     manifest = make(rich)
     config = settings(stage, recipe, plain=False, threads=1)
     loader = Loader(manifest, config)
@@ -35,19 +41,31 @@ def test_the_same_bytes_for_any_number_of_threads_and_from_any_start(make, setti
         assert_same(a, b)
         assert_same(a, Loader(manifest, config).batch(step))
         assert info == info_b
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("anytouch-data")]
+    assert not [
+        thread for thread in threading.enumerate() if thread.name.startswith("anytouch-data")
+    ]
     changed = Loader(manifest, replace(config, run=replace(config.run, seed=1)))
-    assert any(not np.array_equal(a, b) for a, b in zip(leaves(changed.batch(0)), leaves(first[0][1]), strict=False))
+    assert any(
+        not np.array_equal(a, b)
+        for a, b in zip(leaves(changed.batch(0)), leaves(first[0][1]), strict=False)
+    )
 
 
 def test_contrast_reads_no_third_touch_and_knows_which_pairs_are_of_one_place(make, settings, rich):
     config = settings(2, plain=True)
     config = replace(config, model=replace(config.model, match_head="cosine"))
-    manifest, places = make(rich), set()
+    manifest = make(rich)
+    places = set()
     for step in range(4):
         match = Loader(manifest, config).batch(step).match
-        assert match.clip.any() and match.positive.any() and match.negative is match.negative_sensor is None
-        result = [manifest.codes("touch", own=True)[int(clip[-1, 0, 0, 0]) - 1] for clip in match.clip]
+        assert (
+            match.clip.any()
+            and match.positive.any()
+            and match.negative is match.negative_sensor is None
+        )
+        result = [
+            manifest.codes("touch", own=True)[int(clip[-1, 0, 0, 0]) - 1] for clip in match.clip
+        ]
         np.testing.assert_array_equal(match.place, result)
         places |= set(result)
     assert len(places) > 1
@@ -62,11 +80,13 @@ def test_an_epoch_of_stills_and_of_clips_holds_every_row_once(make, settings, re
     stills = [(row,) for row in range(27) if row % 9 != 7]
     counts = {"still": dict.fromkeys(stills, 0), "clip": dict.fromkeys(windows, 0)}
     for step in range(2 * 24):
-        count, clips = counts[loader.kind(step)], loader.batch(step).clip
+        count = counts[loader.kind(step)]
+        clips = loader.batch(step).clip
         assert clips.shape[2:] == (28, 28, 3) and clips.dtype == np.uint8
         for clip in read_back(clips).tolist():
             count[tuple(clip)] += 1
-        assert max(count.values()) - min(count.values()) <= 1  # all of one epoch come before any of the next
+        # all of one epoch come before any of the next
+        assert max(count.values()) - min(count.values()) <= 1
     assert min(counts["still"].values()) >= 1 and min(counts["clip"].values()) >= 1
     assert loader.steps_per_epoch == -(-24 // batch) + -(-12 // batch)
 
@@ -78,18 +98,25 @@ def test_the_paper_takes_turns_and_the_release_draws(make, settings):
         loader = Loader(manifest, settings(**options))
         return [loader.kind(step) for step in range(count)]
 
-    assert kinds(4) == ["still", "clip"] * 2 and kinds(8, clip_share=0.25) == (["still"] * 3 + ["clip"]) * 2
+    assert (
+        kinds(4) == ["still", "clip"] * 2
+        and kinds(8, clip_share=0.25) == (["still"] * 3 + ["clip"]) * 2
+    )
     drawn = kinds(400, recipe="release", clip_share=0.25)
     assert 70 < drawn.count("clip") < 130
     assert drawn != kinds(400, recipe="release", clip_share=0.25, order="alternate")
     for share, kind in ((0.0, "still"), (1.0, "clip")):
         for recipe in ("paper", "release"):
             assert kinds(8, recipe=recipe, clip_share=share)[7] == kind
-    assert Loader(manifest, settings(clip_share=0.0)).steps_per_epoch == 6  # clips make no epoch longer
+    # clips make no epoch longer
+    assert Loader(manifest, settings(clip_share=0.0)).steps_per_epoch == 6
 
 
-def test_rows_of_the_split_and_of_known_sensors_are_drawn_and_others_are_noted(make, settings, read_back):
-    names, splits = ["digit", "gelslim", "9dtact", "tac3d"], ["train", "val"]
+def test_rows_of_the_split_and_of_known_sensors_are_drawn_and_others_are_noted(
+    make, settings, read_back
+):
+    names = ["digit", "gelslim", "9dtact", "tac3d"]
+    splits = ["train", "val"]
     manifest = make([{"sensor": names[i % 4], "split": splits[i // 16]} for i in range(20)])
     loader = Loader(manifest, settings())
     for step in range(9):
@@ -102,7 +129,8 @@ def test_rows_of_the_split_and_of_known_sensors_are_drawn_and_others_are_noted(m
     rows = _clips(1, 12)
     rows[5]["sensor"] = "tac3d"
     loader = Loader(make(rows), settings())
-    assert not any(5 in read_back(loader.batch(step).clip) for step in range(1, 20, 2))  # no clip spans it
+    # no clip spans it
+    assert not any(5 in read_back(loader.batch(step).clip) for step in range(1, 20, 2))
 
 
 @pytest.mark.parametrize(
@@ -112,8 +140,18 @@ def test_rows_of_the_split_and_of_known_sensors_are_drawn_and_others_are_noted(m
         ({}, {"split": "test"}, {}, r"manifest\.csv: column 'split' has no row 'test'"),
         ({}, {"batch_size": 0}, {}, r"--(loader|data)\.batch-size must be 1 or more, not 0"),
         ({}, {}, {"devices": 0}, "devices must be 1 or more, not 0"),
-        ({}, {"batch_size": 6}, {"devices": 4, "shard": (0, 4)}, "batch_size 6 cannot be shared by 4 processes"),
-        ({}, {"batch_size": 8}, {"devices": 3, "shard": (0, 2)}, "devices 3 cannot be shared by 2 processes"),
+        (
+            {},
+            {"batch_size": 6},
+            {"devices": 4, "shard": (0, 4)},
+            "batch_size 6 cannot be shared by 4 processes",
+        ),
+        (
+            {},
+            {"batch_size": 8},
+            {"devices": 3, "shard": (0, 2)},
+            "devices 3 cannot be shared by 2 processes",
+        ),
         ({}, {}, {"devices": 2, "shard": (2, 2)}, "there is no shard 2 of 2"),
         ({}, {}, {"devices": 2, "shard": (0, 0)}, "there is no shard 0 of 0"),
     ],
@@ -135,11 +173,17 @@ def _check_align(batch, rows, read_back, tokenizer):
     assert used == with_text and (batch.text_row[len(used) :] == size).all()
     if len(batch.text):
         want, mask = tokenizer.encode(
-            [rows[drawn[slot]]["text"] for slot in used] + [""] * (len(batch.text) - len(used)), batch.text.shape[1]
+            [rows[drawn[slot]]["text"] for slot in used] + [""] * (len(batch.text) - len(used)),
+            batch.text.shape[1],
         )
         np.testing.assert_array_equal(batch.text, want)
         np.testing.assert_array_equal(batch.text_mask, mask)
-    for name, kind in (("image_row", np.int32), ("text", np.int32), ("text_mask", bool), ("text_row", np.int32)):
+    for name, kind in (
+        ("image_row", np.int32),
+        ("text", np.int32),
+        ("text_mask", bool),
+        ("text_row", np.int32),
+    ):
         assert getattr(batch, name).dtype == kind
     return len(with_image), len(with_text)
 
@@ -147,10 +191,13 @@ def _check_align(batch, rows, read_back, tokenizer):
 @pytest.mark.parametrize("recipe", ["paper", "release"])
 @pytest.mark.parametrize("devices", [1, 4])
 def test_images_and_texts_sit_in_their_slots(make, settings, read_back, rich, recipe, devices):
-    manifest, config = make(rich), settings(2, recipe, batch_size=8)
-    loader, lock = Loader(manifest, config, devices=devices), Loader(manifest, config)
+    manifest = make(rich)
+    config = settings(2, recipe, batch_size=8)
+    loader = Loader(manifest, config, devices=devices)
+    lock = Loader(manifest, config)
     frames = {"still": 1, "clip": 4 if recipe == "release" else 3}
-    shapes, steps = {}, 0
+    shapes = {}
+    steps = 0
     for step, batch, info in loader.stream(0, 24):
         if batch.align is None:
             assert info == {"skipped_samples": 0, "images": 0, "texts": 0}
@@ -161,11 +208,14 @@ def test_images_and_texts_sit_in_their_slots(make, settings, read_back, rich, re
         images, texts = _check_align(batch.align, rich, read_back, loader.tokenizer)
         assert info == {"skipped_samples": 0, "images": images, "texts": texts}
         shape = (len(batch.align.image), len(batch.align.text))
-        assert shapes.setdefault(loader.kind(step), shape) == shape  # fixed for a run
+        # fixed for a run
+        assert shapes.setdefault(loader.kind(step), shape) == shape
         assert all(slots % devices == 0 for slots in shape)
-        same = lock.batch(step).align  # the devices add unused slots, and nothing else
+        # the devices add unused slots, and nothing else
+        same = lock.batch(step).align
         np.testing.assert_array_equal(same.clip, batch.align.clip)
-        assert (images, texts) == (len(same.image), len(same.text))  # without them the slots are full
+        # without them the slots are full
+        assert (images, texts) == (len(same.image), len(same.text))
     assert steps >= 5 and set(shapes) == {"still", "clip"}
 
 
@@ -173,16 +223,24 @@ def test_pictures_lie_anywhere_in_the_batch(make, settings):
     rows = [{"image_path": f"v{i}.png"} if i % 4 == 0 else {} for i in range(16)]
     loader = Loader(make(rows), settings(2, batch_size=8))
     places = [tuple(loader.batch(step).align.image_row) for step in range(12)]
-    assert len(set(places)) > 5 and {slot for pair in places for slot in pair} >= {0, 7}  # not the first rows only
+    # not the first rows only
+    assert len(set(places)) > 5 and {slot for pair in places for slot in pair} >= {0, 7}
 
 
 def test_what_has_no_tower_is_not_read(make, settings):
-    rows = [{"image_path": f"v{i}.png", "text": "words", "touch": f"p{i // 2}", "unit": f"u{i % 2}"} for i in range(8)]
+    rows = [
+        {"image_path": f"v{i}.png", "text": "words", "touch": f"p{i // 2}", "unit": f"u{i % 2}"}
+        for i in range(8)
+    ]
     config = settings(2)
     towerless = replace(config, model=replace(config.model, image=None, text=None))
     loader = Loader(make(rows), towerless)
     batch = loader.batch(0).align
-    assert batch.image.shape == (0, 28, 28, 3) and batch.image_row.shape == (0,) and loader.tokenizer is None
+    assert (
+        batch.image.shape == (0, 28, 28, 3)
+        and batch.image_row.shape == (0,)
+        and loader.tokenizer is None
+    )
     assert batch.text.shape == batch.text_mask.shape == (0, 0) and batch.text_row.shape == (0,)
 
 
@@ -193,7 +251,9 @@ def test_captions_are_padded_to_the_longest_in_eights_and_never_beyond_the_tower
         loader = Loader(manifest, settings(2))  # its tower has 12 positions
         batch = loader.batch(0).align
         assert batch.text.shape[1] == length
-        np.testing.assert_array_equal(batch.text[0], loader.tokenizer.encode(words[:1], length)[0][0])
+        np.testing.assert_array_equal(
+            batch.text[0], loader.tokenizer.encode(words[:1], length)[0][0]
+        )
         assert loader.tokenizer.end_id in batch.text[0]
     assert loader.tokenizer.longest([]) == 2
     assert loader.tokenizer.longest(["", "one two three four five six seven eight"]) > 9
@@ -201,7 +261,8 @@ def test_captions_are_padded_to_the_longest_in_eights_and_never_beyond_the_tower
 
 def test_tokenizers(make, settings, tmp_path):
     rows = [{"text": f"a rough caption number {i}"} for i in range(8)]
-    manifest, config = make(rows), settings(2)
+    manifest = make(rows)
+    config = settings(2)
     loader = Loader(manifest, config)
     assert any("trained on the captions" in note for note in loader.notes)
     given = text.train_tokenizer([row["text"] for row in rows], 300)
@@ -210,16 +271,31 @@ def test_tokenizers(make, settings, tmp_path):
     assert first.tokenizer is given and first.notes != loader.notes
     second = Loader(manifest, settings(2, tokenizer=str(tmp_path)))
     assert_same(first.batch(0), second.batch(0))
-    silent = Loader(make([{"image_path": f"v{i}.png"} for i in range(4)], "silent"), config, tokenizer=given)
-    assert not len(silent.batch(0).align.text)  # a manifest without captions, as CLIP's tokenizer meets it
+    silent = Loader(
+        make([{"image_path": f"v{i}.png"} for i in range(4)], "silent"), config, tokenizer=given
+    )
+    # a manifest without captions, as CLIP's tokenizer meets it
+    assert not len(silent.batch(0).align.text)
     small = replace(config, model=replace(config.model, text=replace(config.model.text, vocab=280)))
-    refused(f"{given.vocab_size} tokens but the text tower only 280", Loader, manifest, small, tokenizer=given)
+    refused(
+        f"{given.vocab_size} tokens but the text tower only 280",
+        Loader,
+        manifest,
+        small,
+        tokenizer=given,
+    )
 
 
 def _check_match(match, rows, read_back, size, frames, other_object=False):
-    anchor, positive, negative = (read_back(clip) for clip in (match.clip, match.positive, match.negative))
+    anchor, positive, negative = (
+        read_back(clip) for clip in (match.clip, match.positive, match.negative)
+    )
     ids = {"digit": 1, "gelslim": 2}
-    for clip, sensor in ((anchor, match.sensor), (positive, match.positive_sensor), (negative, match.negative_sensor)):
+    for clip, sensor in (
+        (anchor, match.sensor),
+        (positive, match.positive_sensor),
+        (negative, match.negative_sensor),
+    ):
         assert clip.shape == (size, frames)
         assert (np.diff(clip, axis=1) == 1).all()
         assert sensor.tolist() == [ids[rows[r]["sensor"]] for r in clip[:, -1]]
@@ -242,10 +318,18 @@ def test_matching_triples_in_both_recipes(make, settings, read_back, rich):
     release = Loader(manifest, settings(2, "release", batch_size=6))
     parts = []
     for step, batch, _ in release.stream(0, 60):
-        assert (batch.align is None) != (batch.match is None)  # never both in a step
+        # never both in a step
+        assert (batch.align is None) != (batch.match is None)
         parts.append(batch.match is not None)
         if batch.match is not None:
-            _check_match(batch.match, rich, read_back, 3, 1 if release.kind(step) == "still" else 3, other_object=True)
+            _check_match(
+                batch.match,
+                rich,
+                read_back,
+                3,
+                1 if release.kind(step) == "still" else 3,
+                other_object=True,
+            )
     # align: 48/6 + 24/6 = 12 batches, match: 48/3 + 32/3 = 26.7 batches of half the size
     assert 0.5 < np.mean(parts) < 0.85
     assert release.steps_per_epoch == 8 + 4 + 16 + 11
@@ -258,7 +342,8 @@ def test_without_pairs_there_is_no_matching_but_a_note(make, settings, recipe):
     two = make([{"touch": "1", "sensor": "gelslim"} | caption, {"touch": "2"}], "two")
     for manifest in (one, two):
         write(manifest, manifest.files[0])
-    loader = Loader(read([one.files[0], two.files[0]]), settings(2, recipe))  # touches of two manifests are two
+    # touches of two manifests are two
+    loader = Loader(read([one.files[0], two.files[0]]), settings(2, recipe))
     assert any("no cross-sensor matching" in note for note in loader.notes)
     for _, batch, _ in loader.stream(0, 6):
         assert batch.match is None and batch.align is not None
@@ -266,14 +351,28 @@ def test_without_pairs_there_is_no_matching_but_a_note(make, settings, recipe):
 
 def test_stage_two_with_nothing_to_learn_is_refused(make, settings):
     """Its loss would be 0 at every step, and the run would end well."""
-    bare, pictured = [{"touch": f"p{i}"} for i in range(8)], [{"image_path": f"v{i}.png"} for i in range(8)]
+    bare = [{"touch": f"p{i}"} for i in range(8)]
+    pictured = [{"image_path": f"v{i}.png"} for i in range(8)]
     twice = [{"touch": f"p{i // 2}", "unit": f"u{i % 2}"} for i in range(8)]
-    captioned, config = [{"text": "words"} for _ in range(8)], settings(2)
+    captioned = [{"text": "words"} for _ in range(8)]
+    config = settings(2)
     changes = {"match_head": "none"}, {"image": None}, {"text": None}
-    no_matching, no_vision, no_text = (replace(config, model=replace(config.model, **one)) for one in changes)
-    for rows, one in ((bare, config), (twice, no_matching), (pictured, no_vision), (captioned, no_text)):
+    no_matching, no_vision, no_text = (
+        replace(config, model=replace(config.model, **one)) for one in changes
+    )
+    for rows, one in (
+        (bare, config),
+        (twice, no_matching),
+        (pictured, no_vision),
+        (captioned, no_text),
+    ):
         refused("stage 2 has nothing to learn from split 'train'", Loader, make(rows), one)
-    for rows, one in ((twice, config), (pictured, no_matching), (captioned, no_vision), (bare, settings(2, "release"))):
+    for rows, one in (
+        (twice, config),
+        (pictured, no_matching),
+        (captioned, no_vision),
+        (bare, settings(2, "release")),
+    ):
         assert Loader(make(rows), one).steps_per_epoch
     assert Loader(make(bare), settings(1)).steps_per_epoch
 
@@ -282,20 +381,26 @@ def test_pairs_of_stills_only_match_stills_in_clip_steps(make, settings, read_ba
     rows = _clips(3, 6)
     for i, row in enumerate(rows[6:]):
         row["sequence"] += f"x{i // 2}"  # two frames a sequence: no clips
-        row |= {"touch": f"p{i // 2}", "sensor": ["digit", "gelslim"][i % 2], "object": f"o{i // 2}"}
+        row |= {
+            "touch": f"p{i // 2}",
+            "sensor": ["digit", "gelslim"][i % 2],
+            "object": f"o{i // 2}",
+        }
     loader = Loader(make(rows), settings(2))
     assert any("matching uses stills only" in note for note in loader.notes)
     collected = []
     for step, batch, _ in loader.stream(0, 6):
         assert batch.align.clip.shape[1] == (1 if loader.kind(step) == "still" else 3)
         collected += _check_match(batch.match, rows, read_back, 4, 1)
-    assert sorted(collected[:12]) == list(range(6, 18))  # its own epoch goes on through both kinds
+    # its own epoch goes on through both kinds
+    assert sorted(collected[:12]) == list(range(6, 18))
 
 
 def test_a_bad_partner_replaces_the_triple(make, settings, read_back, rich):
     manifest = make(rich)
     manifest.file(7).unlink()
-    loader, skipped = Loader(manifest, settings(2, batch_size=6, on_bad_sample="skip")), 0
+    loader = Loader(manifest, settings(2, batch_size=6, on_bad_sample="skip"))
+    skipped = 0
     for _, batch, info in loader.stream(0, 40):
         frames = batch.match.clip.shape[1]
         _check_match(batch.match, rich, read_back, 6, frames)
@@ -308,12 +413,19 @@ def test_batches_that_groups_or_processes_cannot_share_are_refused(make, setting
 
     def load(groups, head="mlp", recipe="paper", **data):
         config = settings(2, recipe, **data)
-        model, objective = replace(config.model, match_head=head), replace(config.objective, groups=groups)
+        model = replace(config.model, match_head=head)
+        objective = replace(config.objective, groups=groups)
         return Loader(manifest, replace(config, model=model, objective=objective))
 
     refused(r"a batch of 6 touches does not divide by --objective\.groups 4", load, 4, batch_size=6)
     # Of the release a batch to match has half the rows; only where these are each other's negatives must they divide.
-    refused(r"a batch of 2 touches does not divide by --objective\.groups 4", load, 4, "cosine", "release")
+    refused(
+        r"a batch of 2 touches does not divide by --objective\.groups 4",
+        load,
+        4,
+        "cosine",
+        "release",
+    )
     for head, recipe in (("cosine", "paper"), ("linear", "release")):
         assert load(4, head, recipe)
     loader = Loader(manifest, settings(2, "release", batch_size=2), devices=2, shard=(0, 2))
@@ -335,9 +447,11 @@ def _parts(batch):
 
 # What the loader draws where nothing is asked for; other draws make old runs end in other places.
 BEFORE = {
-    (1, "paper"): "ed7e482b46094897", (1, "release"): "9e58a1ad76f48577",
-    (2, "paper"): "e30fc1d2cabfdc00", (2, "release"): "141d221a227066ce",
-}  # fmt: skip
+    (1, "paper"): "ed7e482b46094897",
+    (1, "release"): "9e58a1ad76f48577",
+    (2, "paper"): "e30fc1d2cabfdc00",
+    (2, "release"): "141d221a227066ce",
+}
 
 
 @pytest.mark.parametrize(("stage", "recipe"), list(BEFORE))
@@ -362,8 +476,13 @@ def test_the_parts_joined_are_the_whole(make, settings, stage, recipe, count, ba
     whole = Loader(manifest, config, devices=4)
     parts = [Loader(manifest, config, devices=4, shard=(i, count)) for i in range(count)]
     skipped = 0
-    for (step, batch, info), *rest in zip(*(one.stream(0, 8) for one in (whole, *parts)), strict=True):
-        joined = [np.concatenate(arrays) for arrays in zip(*(leaves(one) for _, one, _ in rest), strict=True)]
+    for (step, batch, info), *rest in zip(
+        *(one.stream(0, 8) for one in (whole, *parts)), strict=True
+    ):
+        joined = [
+            np.concatenate(arrays)
+            for arrays in zip(*(leaves(one) for _, one, _ in rest), strict=True)
+        ]
         wanted = leaves(batch)
         assert len(joined) == len(wanted) and step == rest[0][0]
         for got, want in zip(joined, wanted, strict=True):
@@ -375,7 +494,8 @@ def test_the_parts_joined_are_the_whole(make, settings, stage, recipe, count, ba
 
 
 def test_a_shard_reads_only_the_files_of_its_part(make, settings, monkeypatch, rich):
-    manifest, read = make(rich), []
+    manifest = make(rich)
+    read = []
     decode = samples.decode
     monkeypatch.setattr(samples, "decode", lambda path: read.append(path) or decode(path))
     counts = {}

@@ -18,10 +18,12 @@ def test_64_hosts_share_a_corpus():
     """640 shards of uneven size: each host reads its tenth of a hundredth, and an epoch draws each row once."""
     rng = np.random.default_rng(0)
     shard = rng.permutation(np.repeat(np.arange(640), rng.integers(20, 40, 640)))
-    sampler, batch = PartSampler(shard, 256, 64, 7, 1), 256
+    sampler = PartSampler(shard, 256, 64, 7, 1)
+    batch = 256
     draws = sampler.take(0, batch * (len(shard) // batch * 2))
     again = PartSampler(shard, 256, 64, 7, 1)
-    assert again.take(batch * 50, batch) == draws[batch * 50 : batch * 51]  # no need to walk there
+    # no need to walk there
+    assert again.take(batch * 50, batch) == draws[batch * 50 : batch * 51]
     assert PartSampler(shard, 256, 64, 8, 1).take(0, batch) != draws[:batch]
     first = Counter(item for item, epoch in draws if epoch == 0)
     assert len(first) == len(shard) and set(first.values()) == {1}
@@ -31,7 +33,14 @@ def test_64_hosts_share_a_corpus():
     assert max(map(len, homes)) <= 12
     four = [set(shard[Shard(host, 4).cut(slots.T).ravel()]) for host in range(4)]
     assert sum(map(len, four)) == 640  # the same batches on fewer hosts
-    sizes = np.bincount([host for host, home in enumerate(homes) for one in home for _ in range((shard == one).sum())])
+    sizes = np.bincount(
+        [
+            host
+            for host, home in enumerate(homes)
+            for one in home
+            for _ in range((shard == one).sum())
+        ]
+    )
     assert sizes.max() - sizes.min() <= 40  # at most a shard
     own = slots[:, 0]  # one part: few shards at a time
     windows = [len(set(shard[own[at : at + 20]])) for at in range(0, 100, 20)]
@@ -61,7 +70,9 @@ def config(**data) -> Config:
     plain = {"batch_size": 8, "jitter": (0, 0, 0, 0), "flip": 0.0, "cache": 0}
     return replace(
         Config(touch_model()),
-        data=replace(Config(touch_model()).data, **(plain | {"parts": 4, "clip_share": 0.0} | data)),
+        data=replace(
+            Config(touch_model()).data, **(plain | {"parts": 4, "clip_share": 0.0} | data)
+        ),
     )
 
 
@@ -70,14 +81,17 @@ def test_hosts_read_their_own_shards_and_together_the_batch_of_one(corpus, monke
     batches = [whole.batch(step) for step in range(6)]
     seen = {}
     for host in range(4):
-        loader, read = Loader(corpus, config(), shard=(host, 4), devices=4), set()
+        loader = Loader(corpus, config(), shard=(host, 4), devices=4)
+        read = set()
         touch = SampleReader.touch
         monkeypatch.setattr(
-            SampleReader, "touch",
+            SampleReader,
+            "touch",
             lambda self, rows, *rest, read=read, touch=touch: (
-                read.update(corpus.value(row, "path").split("/")[0] for row in rows), touch(self, rows, *rest)
+                read.update(corpus.value(row, "path").split("/")[0] for row in rows),
+                touch(self, rows, *rest),
             )[1],
-        )  # fmt: skip
+        )
         for step, batch in enumerate(batches):
             np.testing.assert_array_equal(loader.batch(step).clip, Shard(host, 4).cut(batch.clip))
         monkeypatch.setattr(SampleReader, "touch", touch)

@@ -24,17 +24,27 @@ def _drawn(loader, manifest, read_back, draws):
 def test_an_epoch_of_the_loader_draws_datasets_by_weight(make, settings, read_back):
     manifest = make(_sets({"a": 6, "b": 4, None: 2}))
     loader = Loader(manifest, settings(weights=(("a", 3.0), ("b", 0.5))))
-    assert loader.steps_per_epoch == 6 and "an epoch draws a 3 times, b 0.5 times, other datasets once" in loader.notes
+    assert (
+        loader.steps_per_epoch == 6
+        and "an epoch draws a 3 times, b 0.5 times, other datasets once" in loader.notes
+    )
     counts, rows = _drawn(loader, manifest, read_back, 24)
     assert counts == {"a": 18, "b": 2, None: 2} | ({} if sum(counts.values()) == 22 else counts)
     assert Counter(rows[:22])[0] == 3
 
 
-def test_weight_zero_leaves_a_dataset_out_of_stills_clips_and_matching(make, settings, read_back, rich):
+def test_weight_zero_leaves_a_dataset_out_of_stills_clips_and_matching(
+    make, settings, read_back, rich
+):
     rows = [row | {"dataset": "a" if i < 24 else "b"} for i, row in enumerate(rich)]
     loader = Loader(make(rows), settings(2, weights=(("b", 0.0),)))
     for _, batch, _ in loader.stream(0, 20):
-        for clip in (batch.align.clip, batch.match.clip, batch.match.positive, batch.match.negative):
+        for clip in (
+            batch.align.clip,
+            batch.match.clip,
+            batch.match.positive,
+            batch.match.negative,
+        ):
             assert read_back(clip).max() < 24
 
 
@@ -72,27 +82,42 @@ def test_weights_that_make_no_sense_are_errors(make, settings, weights, message)
 
 
 def test_where_the_batch_is_the_negatives_they_are_of_one_sensor(make, settings, rich):
-    manifest, config = make(rich), settings(2, negatives="same_sensor")
+    manifest = make(rich)
+    config = settings(2, negatives="same_sensor")
     config = replace(config, model=replace(config.model, match_head="cosine"))
     loader = Loader(manifest, config)
     batches = [loader.batch(step).match for step in range(12)]
     looked_for = [set(batch.positive_sensor.tolist()) for batch in batches]
     assert all(len(sensors) == 1 for sensors in looked_for) and len(set.union(*looked_for)) > 1
     assert all((batch.sensor != batch.positive_sensor).all() for batch in batches)
-    assert all(np.array_equal(a, b) for a, b in zip(batches[3], Loader(manifest, config).batch(3).match, strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(batches[3], Loader(manifest, config).batch(3).match, strict=True)
+    )
 
 
 def test_without_negatives_of_the_same_sensor_there_is_no_matching_and_a_note(make, settings):
     caption = {"text": "words"}
-    rows = [{"touch": "p", "sensor": name, "object": "o", **caption} for name in ("digit", "gelslim")]
-    loader = Loader(make([*rows, {"touch": "q", "object": "r", "sensor": "duragel"}] * 2), settings(2))
+    rows = [
+        {"touch": "p", "sensor": name, "object": "o", **caption} for name in ("digit", "gelslim")
+    ]
+    loader = Loader(
+        make([*rows, {"touch": "q", "object": "r", "sensor": "duragel"}] * 2), settings(2)
+    )
     assert loader.batch(0).match is not None
     loader = Loader(loader.manifest, settings(2, negatives="same_sensor"))
-    assert loader.batch(0).match is None and any("data.negatives=same_sensor" in note for note in loader.notes)
+    assert loader.batch(0).match is None and any(
+        "data.negatives=same_sensor" in note for note in loader.notes
+    )
 
 
 def test_text_of_downstream_test_frames_is_withheld_and_counted(make, settings):
-    manifest = make([{"text": f"caption {i}", "downstream_test": "material" if i < 3 else None} for i in range(8)])
+    manifest = make(
+        [
+            {"text": f"caption {i}", "downstream_test": "material" if i < 3 else None}
+            for i in range(8)
+        ]
+    )
     loader = Loader(manifest, settings(2))
     assert any(note.startswith("the text of 3 rows is withheld") for note in loader.notes)
     assert captions_drawn(loader) == [3, 4, 5, 6, 7]
@@ -102,9 +127,14 @@ def test_text_of_downstream_test_frames_is_withheld_and_counted(make, settings):
 
 @pytest.mark.parametrize(
     ("values", "set_"),
-    [([True, False, None], [1, 0, 0]), ([1, 0, None], [1, 0, 0]), (["1", "0", "False"], [1, 0, 0]),
-     (["rough", "", "NO"], [1, 0, 0]), ([0.0, 1.0, None], [0, 1, 0])],
-)  # fmt: skip
+    [
+        ([True, False, None], [1, 0, 0]),
+        ([1, 0, None], [1, 0, 0]),
+        (["1", "0", "False"], [1, 0, 0]),
+        (["rough", "", "NO"], [1, 0, 0]),
+        ([0.0, 1.0, None], [0, 1, 0]),
+    ],
+)
 def test_what_counts_as_set(make, values, set_):
     manifest = make([{"downstream_test": value} for value in values])
     assert pools.withheld_text(manifest).tolist() == [bool(one) for one in set_]
@@ -137,13 +167,18 @@ def changed(config, name):
 @pytest.mark.parametrize(
     ("name", "recordings", "images", "texts", "matches"),
     [
-        ("tlv_link", {2, 4, 5, 7}, 4, 4, False), ("unitouch", {0, 2, 4, 5, 7}, 4, 0, False),
-        ("no_text", set(range(8)), None, 0, True), ("no_vision", set(range(8)), 0, None, True),
+        ("tlv_link", {2, 4, 5, 7}, 4, 4, False),
+        ("unitouch", {0, 2, 4, 5, 7}, 4, 0, False),
+        ("no_text", set(range(8)), None, 0, True),
+        ("no_vision", set(range(8)), 0, None, True),
         ("no_matching", set(range(8)), None, None, False),
     ],
-)  # fmt: skip
-def test_a_baseline_draws_what_it_needs(make, settings, read_back, name, recordings, images, texts, matches):
-    loader, collected = Loader(make(world()), changed(settings(2), name)), set()
+)
+def test_a_baseline_draws_what_it_needs(
+    make, settings, read_back, name, recordings, images, texts, matches
+):
+    loader = Loader(make(world()), changed(settings(2), name))
+    collected = set()
     for batch in batches(loader):
         align = batch.align
         for rows, count in ((align.image_row, images), (align.text_row, texts)):
@@ -151,7 +186,9 @@ def test_a_baseline_draws_what_it_needs(make, settings, read_back, name, recordi
         assert (batch.match is not None) == matches
         collected |= set((read_back(align.clip)[:, -1] // 6).tolist())
     assert collected == recordings and (loader.tokenizer is None) == (texts == 0)
-    assert any("24 of 48 rows have image and text" in note for note in loader.notes) == (name == "tlv_link")
+    assert any("24 of 48 rows have image and text" in note for note in loader.notes) == (
+        name == "tlv_link"
+    )
 
 
 @pytest.mark.parametrize(
@@ -163,7 +200,11 @@ def test_a_baseline_draws_what_it_needs(make, settings, read_back, name, recordi
             r"data\.require: no row of split 'train' has image and text",
         ),
         ({}, {"contact_only": True}, r"--data\.contact-only needs the column 'label\.contact'"),
-        ({"label.contact": "0"}, {"contact_only": True}, r"data\.contact_only: no row of split 'train' has contact"),
+        (
+            {"label.contact": "0"},
+            {"contact_only": True},
+            r"data\.contact_only: no row of split 'train' has contact",
+        ),
     ],
 )
 def test_no_row_that_may_be_drawn_is_an_error(make, settings, change, data, message):
@@ -171,24 +212,39 @@ def test_no_row_that_may_be_drawn_is_an_error(make, settings, change, data, mess
 
 
 def test_only_frames_in_contact_are_drawn_in_alignment_and_in_matching(make, settings, read_back):
+    # "": not known
     rows = [
-        row | {"label.contact": {0: "0", 1: "", 3: "0"}.get(row["frame_index"], "1")} for row in world()
-    ]  # "": not known
+        row | {"label.contact": {0: "0", 1: "", 3: "0"}.get(row["frame_index"], "1")}
+        for row in world()
+    ]
     loader = Loader(make(rows), settings(2, contact_only=True))
     drawn = []
     for batch in batches(loader):
         drawn.append(batch.align.clip)
-        drawn += (batch.match.clip, batch.match.positive, batch.match.negative) if batch.match else ()
+        drawn += (
+            (batch.match.clip, batch.match.positive, batch.match.negative) if batch.match else ()
+        )
     ends = {(clip.shape[1], int(end) % 6) for clip in drawn for end in read_back(clip)[:, -1]}
     assert ends == {(1, 1)} | {(frames, end) for frames in (1, 3) for end in (2, 4, 5)}
-    assert any("32 of 48 rows have contact; only they are drawn (data.contact_only)" in note for note in loader.notes)
+    assert any(
+        "32 of 48 rows have contact; only they are drawn (data.contact_only)" in note
+        for note in loader.notes
+    )
     both = Loader(make(rows), settings(2, contact_only=True, require=("text",)))
     assert any("20 of 48 rows have text and contact" in note for note in both.notes)
 
 
 def captions_drawn(loader):
-    drawn = {tuple(ids) for one in batches(loader) for ids in one.align.text[one.align.text_row < SIZE].tolist()}
-    return [i for i in range(8) if tuple(loader.tokenizer.encode([f"caption {i}"], 8)[0][0].tolist()) in drawn]
+    drawn = {
+        tuple(ids)
+        for one in batches(loader)
+        for ids in one.align.text[one.align.text_row < SIZE].tolist()
+    }
+    return [
+        i
+        for i in range(8)
+        if tuple(loader.tokenizer.encode([f"caption {i}"], 8)[0][0].tolist()) in drawn
+    ]
 
 
 def test_the_text_of_shared_touches_never_reaches_a_batch(make, settings):
@@ -197,25 +253,39 @@ def test_the_text_of_shared_touches_never_reaches_a_batch(make, settings):
     loader = Loader(manifest, changed(settings(2), "no_text_aligned"))
     assert captions_drawn(loader) == [4, 5, 7]
     assert any("the text of 12 of 30 rows is withheld" in note for note in loader.notes)
-    assert any(batch.match is not None for batch in batches(loader, 4))  # their touches still match
-    assert pools.training_captions(manifest, np.arange(48), aligned_text=False) == [f"caption {i}" for i in (4, 5, 7)]
+    # their touches still match
+    assert any(batch.match is not None for batch in batches(loader, 4))
+    assert pools.training_captions(manifest, np.arange(48), aligned_text=False) == [
+        f"caption {i}" for i in (4, 5, 7)
+    ]
 
 
 def test_a_touch_is_aligned_by_another_sensor_or_another_unit(make):
-    manifest = make([
-        {"touch": "a", "sensor": "digit"}, {"touch": "a", "sensor": "gelslim"},  # two sensors
-        {"touch": "b", "unit": "1"}, {"touch": "b", "unit": "2"},  # two units
-        {"touch": "c", "unit": "1"}, {"touch": "c", "unit": "1"},  # one device twice
-        {"touch": None, "sensor": "digit"}, {"touch": None, "sensor": "gelslim"},
-    ])  # fmt: skip
+    manifest = make(
+        [
+            {"touch": "a", "sensor": "digit"},
+            {"touch": "a", "sensor": "gelslim"},  # two sensors
+            {"touch": "b", "unit": "1"},
+            {"touch": "b", "unit": "2"},  # two units
+            {"touch": "c", "unit": "1"},
+            {"touch": "c", "unit": "1"},  # one device twice
+            {"touch": None, "sensor": "digit"},
+            {"touch": None, "sensor": "gelslim"},
+        ]
+    )
     assert pools.withheld_text(manifest, aligned_text=False).tolist() == [True] * 4 + [False] * 4
     assert not pools.withheld_text(manifest).any()
 
 
 def test_the_trained_sensors_are_those_drawn_from(make, settings):
-    rows = [*world(), {"sensor": "duragel", "split": "val"}, {"sensor": "gelsight", "image_path": "w.png"}]
+    rows = [
+        *world(),
+        {"sensor": "duragel", "split": "val"},
+        {"sensor": "gelsight", "image_path": "w.png"},
+    ]
     for stage, data, sensors in (
-        (1, {}, ["gelsight", "digit", "gelslim"]), (1, {"clip_share": 1.0}, ["digit", "gelslim"]),
+        (1, {}, ["gelsight", "digit", "gelslim"]),
+        (1, {"clip_share": 1.0}, ["digit", "gelslim"]),
         (2, {"require": ("text",)}, ["digit", "gelslim"]),
-    ):  # fmt: skip
+    ):
         assert Loader(make(rows), settings(stage, **data)).trained_sensors == sensors

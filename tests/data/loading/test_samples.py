@@ -10,19 +10,31 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading import samples
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError, evaluation, fill_slot
-from anytouch_jax.data.transforms import TOUCH, augmentation_rng, subtract_background, touch_transform
+from anytouch_jax.data.transforms import (
+    TOUCH,
+    augmentation_rng,
+    subtract_background,
+    touch_transform,
+)
 from anytouch_jax.errors import UserError
 
 
 def test_cached_frames_change_no_byte_and_are_read_once(make, settings, monkeypatch):
-    rows = [{"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"} for i in range(8)]
-    manifest, noise = make(rows), np.random.default_rng(0)
+    rows = [
+        {"sequence": f"s{i // 4}", "frame_index": i % 4, "background_path": f"gel{i // 4}.png"}
+        for i in range(8)
+    ]
+    manifest = make(rows)
+    noise = np.random.default_rng(0)
     for name in (*(f"f{i}" for i in range(8)), "gel0", "gel1"):
         path = Path(manifest.file(0)).with_name(f"{name}.png")
         assert cv2.imwrite(str(path), noise.integers(0, 255, (45, 60, 3), np.uint8))
     read: list[str] = []
-    monkeypatch.setattr(samples, "decode", lambda path: (read.append(Path(path).name), decode(path))[1])
-    whole, counts = [], []
+    monkeypatch.setattr(
+        samples, "decode", lambda path: (read.append(Path(path).name), decode(path))[1]
+    )
+    whole = []
+    counts = []
     for cache in (0, 512):
         config = settings(1, plain=False, background="subtract", cache=cache)
         batches = [Loader(manifest, config).batch(step).clip for step in range(2)]
@@ -36,7 +48,9 @@ def test_cached_frames_change_no_byte_and_are_read_once(make, settings, monkeypa
     assert counts[0] > 60 and counts[1] == len(set(read)) == 10
     config = settings(1, plain=False, background="subtract")
     rng = augmentation_rng(config.run.seed, 3, 3, TOUCH)
-    files = [decode(manifest.file(row)) for row in range(4)] + [decode(manifest.file(3, "background_path"))]
+    files = [decode(manifest.file(row)) for row in range(4)] + [
+        decode(manifest.file(3, "background_path"))
+    ]
     *frames, gel = touch_transform(files, config.model.image_size, rng, config.data)
     made = samples.SampleReader(manifest, config).touch(np.arange(4), 3)
     np.testing.assert_array_equal(made, subtract_background(frames, gel))
@@ -63,16 +77,23 @@ def _outside_link(path):
 
 
 BAD = {
-    "missing": (lambda path: path.unlink(), "there is no file"), "truncated": (_truncate, "corrupt or cut short"),
-    "garbage": (_garbage, "not a PNG"), "nan": (_nan, "NaN pixels"), "link": (_outside_link, "leaves the folder"),
+    "missing": (lambda path: path.unlink(), "there is no file"),
+    "truncated": (_truncate, "corrupt or cut short"),
+    "garbage": (_garbage, "not a PNG"),
+    "nan": (_nan, "NaN pixels"),
+    "link": (_outside_link, "leaves the folder"),
     "path": (None, "leaves the folder"),
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize(("what", "threads"), [(what, 2 * (number % 2)) for number, what in enumerate(BAD)])
+@pytest.mark.parametrize(
+    ("what", "threads"), [(what, 2 * (number % 2)) for number, what in enumerate(BAD)]
+)
 def test_a_bad_sample_is_named_or_skipped_and_counted(make, settings, read_back, what, threads):
     spoil, words = BAD[what]
-    rows = [{"path": "../escape.png" if what == "path" and i == 2 else f"f{i}.png"} for i in range(5)]
+    rows = [
+        {"path": "../escape.png" if what == "path" and i == 2 else f"f{i}.png"} for i in range(5)
+    ]
     manifest = make(rows, folder="data")
     if spoil:
         spoil(manifest.file(2))
@@ -90,7 +111,8 @@ def test_a_bad_sample_is_named_or_skipped_and_counted(make, settings, read_back,
     assert logged == [f"{message}; another sample replaces it"]
     drawn = read_back(batch.clip)[:, 0]
     assert info["skipped_samples"] >= 1 and 2 not in drawn and set(drawn) == {0, 1, 3, 4}
-    assert_same(batch, Loader(manifest, skipping).batch(0))  # the replacement is deterministic
+    # the replacement is deterministic
+    assert_same(batch, Loader(manifest, skipping).batch(0))
 
 
 def test_replacements_differ_by_step_slot_and_attempt(settings):
@@ -104,7 +126,10 @@ def test_replacements_differ_by_step_slot_and_attempt(settings):
             if index in bad or len(tried) < 3:
                 raise SampleError("bad")
 
-        assert fill_slot(write, 1000, step, slot, settings(on_bad_sample="skip"), 3, 0) == len(tried) - 1
+        assert (
+            fill_slot(write, 1000, step, slot, settings(on_bad_sample="skip"), 3, 0)
+            == len(tried) - 1
+        )
         return tuple(tried[1:])
 
     drawn = [replaced(step, slot) for step in range(4) for slot in range(4)]
@@ -141,20 +166,33 @@ def test_rows_come_in_the_order_given_and_the_last_batch_is_filled_up(make, sett
         assert batch.clip.shape == (4, 1, 28, 28, 3) and batch.sensor.tolist() == [1] * 4
         assert read_back(batch.clip)[:, 0].tolist() == [*ids, *[ids[-1]] * (4 - len(ids))]
     for (_, a), (_, b) in zip(got, evaluation(manifest, rows, settings(threads=0)), strict=True):
-        np.testing.assert_array_equal(a.clip, b.clip)  # no augmentation in either
+        # no augmentation in either
+        np.testing.assert_array_equal(a.clip, b.clip)
     assert list(evaluation(manifest, np.array([], int), settings())) == []
 
 
 @pytest.mark.parametrize("frames", [None, 3, 5])
 def test_clips_end_at_their_row(make, settings, read_back, frames):
-    manifest, length = _clips(make), frames or 3
+    manifest = _clips(make)
+    length = frames or 3
     rows = np.array([11, 5, 4])
     ((ids, batch),) = evaluation(manifest, rows, settings(), "clip", frames=frames)
     assert ids.tolist() == [11, 5, 4]
     assert read_back(batch.clip)[:3].tolist() == [list(range(r - length + 1, r + 1)) for r in rows]
-    with pytest.raises(UserError, match=r"row 7 of .*manifest\.csv does not end a clip of 3 frames \(nor do 1 other"):
+    with pytest.raises(
+        UserError,
+        match=r"row 7 of .*manifest\.csv does not end a clip of 3 frames \(nor do 1 other",
+    ):
         evaluation(manifest, np.array([5, 7, 6]), settings(), "clip")
-    refused("does not end a clip of 30 frames", evaluation, manifest, np.array([5]), settings(), "clip", frames=30)
+    refused(
+        "does not end a clip of 30 frames",
+        evaluation,
+        manifest,
+        np.array([5]),
+        settings(),
+        "clip",
+        frames=30,
+    )
 
 
 def test_bad_rows_are_named_or_left_out(make, settings, read_back):
@@ -163,5 +201,6 @@ def test_bad_rows_are_named_or_left_out(make, settings, read_back):
         manifest.file(row).unlink()
     refused(r"row 0 of .*f0\.png", list, evaluation(manifest, np.arange(12), settings()))
     got = list(evaluation(manifest, np.arange(12), settings(on_bad_sample="skip")))
-    assert [ids.tolist() for ids, _ in got] == [[1, 3], [4, 5, 6, 7]]  # a batch of nothing but bad rows is not given
+    # a batch of nothing but bad rows is not given
+    assert [ids.tolist() for ids, _ in got] == [[1, 3], [4, 5, 6, 7]]
     assert read_back(got[0][1].clip)[:, 0].tolist() == [1, 3, 3, 3]

@@ -28,7 +28,8 @@ def test_turns_count_the_earlier_steps_of_a_kind():
         kind, rank = turns.at(step)
         assert kind == (step * 7 % 5 < 2) and rank == earlier[kind]
         earlier[kind] += 1
-    assert s.StepSchedule(lambda steps: steps % 3 == 0).at(3000) == (1, 1000)  # no need to walk there
+    # no need to walk there
+    assert s.StepSchedule(lambda steps: steps % 3 == 0).at(3000) == (1, 1000)
     with pytest.raises(ValueError, match="from 0"):
         turns.at(-1)
 
@@ -47,16 +48,25 @@ def test_every_epoch_of_a_stream_holds_all_once(size, batch):
 
 
 CASES = [
-    ((3, 5, 7, 9), 8, 1), ((0, 0, 0, 9), 4, 1), ((0, 9, 0, 0), 4, 4), ((9, 0, 0, 0), 4, 1), ((5, 0, 5, 0), 3, 1),
-    ((1, 0, 0, 1999), 64, 1), ((0, 1999, 0, 1), 64, 1), ((350, 250, 510, 450), 64, 4), ((13, 2, 0, 500), 16, 8),
-    ((1, 1, 1, 1), 1, 1), ((2, 3, 1, 0), 5, 2),
-]  # fmt: skip
+    ((3, 5, 7, 9), 8, 1),
+    ((0, 0, 0, 9), 4, 1),
+    ((0, 9, 0, 0), 4, 4),
+    ((9, 0, 0, 0), 4, 1),
+    ((5, 0, 5, 0), 3, 1),
+    ((1, 0, 0, 1999), 64, 1),
+    ((0, 1999, 0, 1), 64, 1),
+    ((350, 250, 510, 450), 64, 4),
+    ((13, 2, 0, 500), 16, 8),
+    ((1, 1, 1, 1), 1, 1),
+    ((2, 3, 1, 0), 5, 2),
+]
 
 
 @pytest.mark.parametrize(("sizes", "batch", "multiple"), CASES)
 def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
     strata = s.StratumQuota(sizes, batch, multiple)
-    total, steps = np.zeros(4, np.int64), 6 * sum(sizes)
+    total = np.zeros(4, np.int64)
+    steps = 6 * sum(sizes)
     for k in range(steps):
         before, now = strata.at(k)
         np.testing.assert_array_equal(before, total)
@@ -66,18 +76,21 @@ def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
         total += now
     shares = np.array(sizes) * batch / sum(sizes)
     assert ((total > 0) == (np.array(sizes) > 0)).all()
-    assert (total / steps >= shares / 2 - batch / steps).all()  # nobody loses more than half
+    # nobody loses more than half
+    assert (total / steps >= shares / 2 - batch / steps).all()
     for slots, share in ((strata.images, shares[:2].sum()), (strata.texts, shares[1:3].sum())):
         assert share - 1e-9 <= slots <= batch
         assert slots == batch or (slots % multiple == 0 and slots < share + multiple)
-    again = s.StratumQuota(sizes, batch, multiple).at(steps - 1)  # straight to one step
+    # straight to one step
+    again = s.StratumQuota(sizes, batch, multiple).at(steps - 1)
     np.testing.assert_array_equal(again[0] + again[1], total)
 
 
 @pytest.mark.parametrize("multiple", [1, 2, 4, 16])
 def test_slots_are_full_but_for_what_the_devices_add_and_a_batch_does_not_depend_on_them(multiple):
     lock, strata = (s.StratumQuota((350, 250, 510, 450), 64, m) for m in (1, multiple))
-    assert (lock.images, lock.texts) == (25, 32)  # of 64 * 600 / 1560 = 24.6 and 64 * 760 / 1560 = 31.2
+    # of 64 * 600 / 1560 = 24.6 and 64 * 760 / 1560 = 31.2
+    assert (lock.images, lock.texts) == (25, 32)
     assert strata.images == -(-25 // multiple) * multiple and strata.texts % multiple == 0
     for k in range(500):
         before, now = strata.at(k)
@@ -92,7 +105,9 @@ def test_a_rare_stratum_is_visited_at_even_distances():
     assert np.diff([-1, *visits, 3000]).max() <= 21
 
 
-@pytest.mark.parametrize("weights", [[2, 2, 2, 1, 1], [3, 0.5, 0.5, 0.5, 0.5], [1, 2.5, 2.5, 1, 1], [0.2] * 5])
+@pytest.mark.parametrize(
+    "weights", [[2, 2, 2, 1, 1], [3, 0.5, 0.5, 0.5, 0.5], [1, 2.5, 2.5, 1, 1], [0.2] * 5]
+)
 def test_an_epoch_draws_each_thing_by_its_weight(weights):
     weights = np.array(weights, float)
     stream = EpochSampler(5, 0, 9, weights)
@@ -108,6 +123,8 @@ def test_an_epoch_draws_each_thing_by_its_weight(weights):
         ids = np.flatnonzero(weights == weight)
         share = max(1, round(weight * len(ids))) / len(ids)
         assert all(abs(many[t] / epochs - share) < 0.15 for t in ids)
-    assert len(set(drawn)) == len(drawn)  # each time with another augmentation
-    assert EpochSampler(5, 0, 9, weights).take(377, 20) == drawn[377:397]  # no need to walk there
+    # each time with another augmentation
+    assert len(set(drawn)) == len(drawn)
+    # no need to walk there
+    assert EpochSampler(5, 0, 9, weights).take(377, 20) == drawn[377:397]
     assert stream.take(0, stream.size) != stream.take(stream.size, stream.size)

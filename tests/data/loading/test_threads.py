@@ -27,7 +27,10 @@ def test_batches_come_whole_and_in_order(threads, prefetch):
     got = list(prefetch_batches(_plan, range(3, 9), threads, prefetch))
     assert [step for step, _, _ in got] == list(range(3, 9))
     for step, batch, info in got:
-        assert batch == [(step, slot) for slot in range(10)] and info == {"skipped_samples": 5, "n": step}
+        assert batch == [(step, slot) for slot in range(10)] and info == {
+            "skipped_samples": 5,
+            "n": step,
+        }
     assert not _ours()
     assert run_jobs(_plan(4)) == (got[1][1], got[1][2])
     assert list(prefetch_batches(_plan, range(0), threads, prefetch)) == []
@@ -45,7 +48,8 @@ def test_no_more_is_planned_than_the_prefetch():
 
 
 def test_closing_early_ends_the_threads_and_drops_what_waits():
-    done, gate = [], threading.Event()
+    done = []
+    gate = threading.Event()
 
     def plan(step):
         def job():

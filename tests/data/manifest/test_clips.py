@@ -7,8 +7,10 @@ from anytouch_jax.data.manifest import manifest as manifests
 
 def _brute(sequence, frame, stride, length):
     at = {pair: i for i, pair in enumerate(zip(sequence.tolist(), frame.tolist(), strict=True))}
-    want = [[at.get((s, f - b * d), -1) for b in range(length - 1, -1, -1)]
-            for s, f, d in zip(sequence.tolist(), frame.tolist(), stride.tolist(), strict=True)]  # fmt: skip
+    want = [
+        [at.get((s, f - b * d), -1) for b in range(length - 1, -1, -1)]
+        for s, f, d in zip(sequence.tolist(), frame.tolist(), stride.tolist(), strict=True)
+    ]
     return [row for row in want if -1 not in row]
 
 
@@ -25,7 +27,9 @@ def test_windows_are_what_the_words_say(monkeypatch, start, shuffle, block):
     stride = rng.choice([1, 2, 3, 10**18], 540, p=[0.4, 0.3, 0.2, 0.1])
     if shuffle:
         order = rng.permutation(540)
-        sequence, frame, stride = sequence[order], frame[order], stride[order]
+        sequence = sequence[order]
+        frame = frame[order]
+        stride = stride[order]
     for length in (1, 2, 3):
         want = _brute(sequence, frame, stride, length)
         assert w.clip_windows(sequence, frame, stride, length).tolist() == want and len(want) > 20
@@ -36,8 +40,13 @@ def test_windows_are_what_the_words_say(monkeypatch, start, shuffle, block):
 
 
 def test_what_no_64_bits_hold_is_one_sentence(tmp_path):
-    columns = {"path": ["a"] * 4, "sensor": ["digit"] * 4, "sequence": ["s", "s", "r", "r"],
-               "frame_index": [0, 1 << 62, 0, 1 << 62], "split": ["train"] * 4}  # fmt: skip
+    columns = {
+        "path": ["a"] * 4,
+        "sensor": ["digit"] * 4,
+        "sequence": ["s", "s", "r", "r"],
+        "frame_index": [0, 1 << 62, 0, 1 << 62],
+        "split": ["train"] * 4,
+    }
     with pytest.raises(manifests.ManifestError, match="more than 64 bits hold"):
         manifests.from_columns(columns, tmp_path / "m.csv").clips(2)
 

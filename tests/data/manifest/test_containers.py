@@ -84,8 +84,12 @@ def test_addresses_are_copied_by_shard_once_and_the_oldest_leave(store, tmp_path
     columns = {"path": paths, "sensor": ["digit"] * count, "sequence": list(map(str, range(count)))}
     columns |= {"frame_index": [0] * count, "split": ["train"] * count}
     manifests.write(manifests.from_columns(columns, tmp_path / "m.parquet"), tmp_path / "m.parquet")
-    manifest, fetched, fetch = manifests.read(tmp_path / "m.parquet"), [], files._fetch
-    monkeypatch.setattr(files, "_fetch", lambda file, target: (fetched.append(file), fetch(file, target)))
+    manifest = manifests.read(tmp_path / "m.parquet")
+    fetched = []
+    fetch = files._fetch
+    monkeypatch.setattr(
+        files, "_fetch", lambda file, target: (fetched.append(file), fetch(file, target))
+    )
     for row in range(count):
         assert decode(manifest.file(row))[0, 0, 0] == row
     assert fetched == [f"{store}/{shard}.parquet" for shard in range(8)]
@@ -94,8 +98,13 @@ def test_addresses_are_copied_by_shard_once_and_the_oldest_leave(store, tmp_path
 
 
 def test_a_missing_object_a_broken_store_and_a_foreign_address_are_one_sentence(store, monkeypatch):
-    refused(r"there is no memory://corpus/9\.parquet", files.local_copy, f"{store}/9.parquet/image/0")
-    monkeypatch.setattr(fsspec.filesystem("memory"), "size", lambda path: [][0])  # the error is none of a file
-    refused(r"0\.parquet cannot be copied .*list index", files.local_copy, f"{store}/0.parquet/image/0")
+    refused(
+        r"there is no memory://corpus/9\.parquet", files.local_copy, f"{store}/9.parquet/image/0"
+    )
+    # the error is none of a file
+    monkeypatch.setattr(fsspec.filesystem("memory"), "size", lambda path: [][0])
+    refused(
+        r"0\.parquet cannot be copied .*list index", files.local_copy, f"{store}/0.parquet/image/0"
+    )
     for address in ("file:///etc/passwd", "s3://bucket/../x.png", "local://x"):
         refused("is none of", files.local_copy, address)

@@ -64,19 +64,33 @@ def test_write_makes_paths_relative_to_the_new_folder(tmp_path):
     up = m.read(tmp_path / "up.parquet")
     assert up.value(0, "path") == "deep/a.png"
     assert up.file(0) == first.file(0)
-    refused(r"line 2 of .*manifest\.csv.*is not inside .*elsewhere", m.write, first, tmp_path / "elsewhere" / "x.csv")
+    refused(
+        r"line 2 of .*manifest\.csv.*is not inside .*elsewhere",
+        m.write,
+        first,
+        tmp_path / "elsewhere" / "x.csv",
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (GOOD.replace(",split", ",slit"), ["lacks the column 'split'", "slit"]),
-        (GOOD.replace("s,2,train", "s,two,train"), ["line 3 of", "'frame_index'", "whole number", "'two'"]),
+        (
+            GOOD.replace("s,2,train", "s,two,train"),
+            ["line 3 of", "'frame_index'", "whole number", "'two'"],
+        ),
         (GOOD.replace("s,2,train", "s,1_0,train"), ["line 3 of", "'frame_index'", "'1_0'"]),
         (GOOD.replace("s,2,train", "s,,train"), ["line 3 of", "'frame_index' is empty"]),
         (GOOD.replace("c.png", "  "), ["line 4 of", "'path' is empty"]),
-        (GOOD.replace("test", "tset"), ["line 4 of", "'split'", "'tset'", "background", "did you mean test?"]),
-        (GOOD.replace("test", "Validation"), ["line 4 of", "'split'", "'Validation'", "did you mean val?"]),
+        (
+            GOOD.replace("test", "tset"),
+            ["line 4 of", "'split'", "'tset'", "background", "did you mean test?"],
+        ),
+        (
+            GOOD.replace("test", "Validation"),
+            ["line 4 of", "'split'", "'Validation'", "did you mean val?"],
+        ),
         (GOOD.replace("train,2,t,0", "train,0,t,0"), ["line 3 of", "'stride'", "at least 1, is 0"]),
         (GOOD.replace("2,,1,0,x", "2,,yes,0,x"), ["line 2 of", "'commercial'", "0 or 1", "'yes'"]),
         (GOOD.replace("\nb.png,digit,", "\nb.png,"), ["line 3: 10 cells for 11 columns", "b.png,"]),
@@ -95,12 +109,16 @@ def test_other_ways_to_give_no_manifest(tmp_path):
     (tmp_path / "x.parquet").write_bytes(b"PAR1 this is not one")
     (tmp_path / "latin.csv").write_bytes(f"{HEAD}\nf\xfcr.png,digit,s,0,train\n".encode("latin-1"))
     for path, words in [
-        (tmp_path, "is a folder"), (tmp_path / "none.csv", "there is no manifest"),
-        (tmp_path / "x.parquet", "cannot be read as a parquet"), (tmp_path / "latin.csv", "cannot be read as a csv"),
-        (_file(tmp_path, GOOD, "x.txt"), "ends in .csv or .parquet"), ([], "no manifest is given"),
-    ]:  # fmt: skip
+        (tmp_path, "is a folder"),
+        (tmp_path / "none.csv", "there is no manifest"),
+        (tmp_path / "x.parquet", "cannot be read as a parquet"),
+        (tmp_path / "latin.csv", "cannot be read as a csv"),
+        (_file(tmp_path, GOOD, "x.txt"), "ends in .csv or .parquet"),
+        ([], "no manifest is given"),
+    ]:
         refused(words, m.read, path)
-    link, cached = tmp_path / "link.csv", tmp_path / "cached.csv"
+    link = tmp_path / "link.csv"
+    cached = tmp_path / "cached.csv"
     link.symlink_to(_file(tmp_path, GOOD))
     assert len(m.read(link)) == 3
     (tmp_path / "3f2a").write_text(GOOD)
@@ -124,7 +142,10 @@ def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
     one = _file(tmp_path / "one", GOOD)
-    two = _file(tmp_path / "two", GOOD.replace("label.slip", "label.grip").replace(",x,", ",3,").replace("y, z", "4"))
+    two = _file(
+        tmp_path / "two",
+        GOOD.replace("label.slip", "label.grip").replace(",x,", ",3,").replace("y, z", "4"),
+    )
     both = m.read([one, two])
     assert len(both) == 6
     assert both.file(4) == tmp_path / "two" / "b.png"
@@ -140,7 +161,9 @@ def test_joined_manifests_keep_their_folders_and_keys_apart(tmp_path):
 def test_rows_of_names_the_file_of_an_empty_split(tmp_path):
     got = m.read(_file(tmp_path, GOOD))
     assert got.rows_of("train").tolist() == [0, 1]
-    refused(r"manifest\.csv: column 'split' has no row 'val'; it has test, train", got.rows_of, "val")
+    refused(
+        r"manifest\.csv: column 'split' has no row 'val'; it has test, train", got.rows_of, "val"
+    )
     refused("unknown split 'trian'", got.rows_of, "trian")
     wide = m.from_columns(columns(**{f"label.c{i}": [i] for i in range(3000)}), tmp_path / "m.csv")
     assert len(refused("has no column 'gone'; it has path.* more", wide.column, "gone")) < 600
@@ -159,28 +182,39 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
     for bad in ("../secret.png", "in/../../secret.png", "../data2/x"):
         refused(r"leaves the folder of the manifest, .*/data$", m.resolve_path, root, bad)
     for bad in ("link.png", "out/x.png"):
-        refused(r"leaves the folder .*, by a link; put the files there, or", m.resolve_path, root, bad)
+        refused(
+            r"leaves the folder .*, by a link; put the files there, or", m.resolve_path, root, bad
+        )
     for bad in ("in\\a.png", r"C:\data\a.png", r".\in\a.png", "C:/data/a.png"):
         refused(r"as on Windows; write it relative .* forward slashes", m.resolve_path, root, bad)
     (root / r"odd\name.png").write_bytes(b"x")
     assert m.resolve_path(root, r"odd\name.png").is_file()
-    for bad, words in (("", "empty"), (None, "empty"), ("a\0b", "not a file name"), (str(root / "a.png"), "absolute")):
+    for bad, words in (
+        ("", "empty"),
+        (None, "empty"),
+        ("a\0b", "not a file name"),
+        (str(root / "a.png"), "absolute"),
+    ):
         refused(words, m.resolve_path, root, bad)
 
 
 def test_sensor_rows(tmp_path):
     text = f"{HEAD}\na,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
-    got, model = m.read(_file(tmp_path, text)), preset("tiny").model
+    got = m.read(_file(tmp_path, text))
+    model = preset("tiny").model
     refused(r"line 4 of .*manifest\.csv.*unknown sensor 'newfinger'", m.sensor_rows, got, model)
     ids, notes = m.sensor_rows(got, model, unknown="skip")
     assert ids.tolist() == [1, -1, -1, 6] and ids.dtype == np.int32
-    assert any("1 rows of tac3d" in note for note in notes) and any("newfinger" in note for note in notes)
+    assert any("1 rows of tac3d" in note for note in notes) and any(
+        "newfinger" in note for note in notes
+    )
     ids, notes = m.sensor_rows(got, model, unknown="universal")
     assert ids.tolist() == [1, -1, 9, 6] and any("universal" in note for note in notes)
     other = m.read(_file(tmp_path, text.replace("digit", "DIGIT")))
     for unknown in ("error", "skip", "universal"):
         with pytest.raises(
-            m.ManifestError, match=r"line 2 of .*column 'sensor': sensor 'DIGIT' is not known: did you mean digit"
+            m.ManifestError,
+            match=r"line 2 of .*column 'sensor': sensor 'DIGIT' is not known: did you mean digit",
         ):
             m.sensor_rows(other, model, unknown=unknown)
     ids, notes = m.sensor_rows(got, model, np.array([0, 3]))
@@ -188,7 +222,9 @@ def test_sensor_rows(tmp_path):
 
 
 def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
-    got = m.read(_file(tmp_path, f"{HEAD}\na,digit,s,0,train\nb,digit,r,7,train\nc,digit,r,7,train\n"))
+    got = m.read(
+        _file(tmp_path, f"{HEAD}\na,digit,s,0,train\nb,digit,r,7,train\nc,digit,r,7,train\n")
+    )
     assert len(got.clips(1)) == 3
     refused(r"line 4 of .* repeats frame_index 7 of sequence 'r', as in line 3 of", got.clips, 2)
 
@@ -196,15 +232,21 @@ def test_a_repeated_frame_is_an_error_for_clips_only(tmp_path):
 def test_joined_manifests_written_as_one_keep_their_keys_apart(tmp_path):
     for name in "ab":
         (tmp_path / name).mkdir()
-        one = m.from_columns(columns(2, touch=["t0", "t1"], grasp_group=[7, 8]), tmp_path / name / "m.parquet")
+        one = m.from_columns(
+            columns(2, touch=["t0", "t1"], grasp_group=[7, 8]), tmp_path / name / "m.parquet"
+        )
         m.write(one, tmp_path / name / "m.parquet")
     m.write(m.read([tmp_path / "a/m.parquet", tmp_path / "b/m.parquet"]), tmp_path / "both.parquet")
     one = m.read(tmp_path / "both.parquet")
-    assert len(one.clips(2)) == 2 and [len(np.unique(one.codes(name))) for name in ("touch", "grasp_group")] == [4, 4]
+    assert len(one.clips(2)) == 2 and [
+        len(np.unique(one.codes(name))) for name in ("touch", "grasp_group")
+    ] == [4, 4]
 
 
 def test_columns_of_any_kind_are_carried_along(tmp_path):
-    one, two = (m.from_columns(columns(box=[[1, k]], bytes=[b"\xff"]), tmp_path / "m.csv") for k in (2, 3))
+    one, two = (
+        m.from_columns(columns(box=[[1, k]], bytes=[b"\xff"]), tmp_path / "m.csv") for k in (2, 3)
+    )
     assert one.content_hash != two.content_hash
     m.write(one, tmp_path / "m.parquet")
     assert m.read(tmp_path / "m.parquet").column("box").to_pylist() == [[1, 2]]
@@ -215,15 +257,22 @@ def test_columns_of_any_kind_are_carried_along(tmp_path):
 def test_a_csv_reads_one_class_from_spaces_unicode_forms_and_empty_spellings(tmp_path):
     head = "path,sensor,sequence,frame_index,split,object,label.kind,label.force"
     cells = [
-        ("train ", "mug", "oak wood", "1"), (" train", " mug", "oak  wood ", "n/a"), ("train", "mug\u00a0", "", "NaN"),
-        ("train", "-", "#N/A", "<NA>"), ("train", "None", "caf\u00e9", "none"), ("train", "null", "cafe\u0301", "2"),
-    ]  # fmt: skip
+        ("train ", "mug", "oak wood", "1"),
+        (" train", " mug", "oak  wood ", "n/a"),
+        ("train", "mug\u00a0", "", "NaN"),
+        ("train", "-", "#N/A", "<NA>"),
+        ("train", "None", "caf\u00e9", "none"),
+        ("train", "null", "cafe\u0301", "2"),
+    ]
     lines = [f"{i}.png, digit,s,{i},{','.join(line)}" for i, line in enumerate(cells)]
     got = m.read(_file(tmp_path, "\n".join([head, *lines]) + "\n"))
-    assert set(got.column("split").to_pylist()) == {"train"} and set(got.column("sensor").to_pylist()) == {"digit"}
+    assert set(got.column("split").to_pylist()) == {"train"} and set(
+        got.column("sensor").to_pylist()
+    ) == {"digit"}
     assert got.column("object").to_pylist() == ["mug"] * 3 + [None] * 3
     assert got.column("label.kind").to_pylist() == ["oak wood"] * 2 + [None] * 2 + ["caf\u00e9"] * 2
-    assert got.column("label.force").to_pylist() == [1, None, None, None, None, 2]  # a column of numbers
+    # a column of numbers
+    assert got.column("label.force").to_pylist() == [1, None, None, None, None, 2]
 
 
 def test_texts_of_a_parquet_are_meant_as_they_are_written(tmp_path):
@@ -236,7 +285,8 @@ def test_texts_of_a_parquet_are_meant_as_they_are_written(tmp_path):
 
 
 def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
-    head = " path, sensor,sequence ,frame_index,split,text,label.x"  # spaces around names do not count
+    # spaces around names do not count
+    head = " path, sensor,sequence ,frame_index,split,text,label.x"
     good = '0.png,digit,s,0,train,"of two\nlines",1\n\n'
     for bad, words in (
         ("1.png,digit,s,one,train,,2", "line 5 of .*csv: column 'frame_index'"),
@@ -245,25 +295,42 @@ def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
         ("1.png,digit,s,1,train,soft, red,2", "line 5: 8 cells for 7 columns"),
         ('1.png,digit,s,1,train,"open,2', "the quote in line 5 is not closed"),
         ('1.png,digit,s,1,train,,"open', "the quote in line 5 is not closed"),
-        ('1.png,digit,s,1,train,,"open\n1.png,digit,s,1,train,,"2', "the quote in line 5 is not closed"),
+        (
+            '1.png,digit,s,1,train,,"open\n1.png,digit,s,1,train,,"2',
+            "the quote in line 5 is not closed",
+        ),
     ):
         refused(words, m.read, _file(tmp_path, f"{head}\n{good}{bad}\n2.png,digit,s,2,train,,3\n"))
     for cells, words in (
-        (["Wood", "clay", "wood"], "line 7 of .*csv: column 'label.x' has 'wood', and line 5 of .* has 'Wood'"),
-        ([*map(str, range(9)), "12,5"], "line 14 of .*csv: column 'label.x' has '12,5' among numbers"),
+        (
+            ["Wood", "clay", "wood"],
+            "line 7 of .*csv: column 'label.x' has 'wood', and line 5 of .* has 'Wood'",
+        ),
+        (
+            [*map(str, range(9)), "12,5"],
+            "line 14 of .*csv: column 'label.x' has '12,5' among numbers",
+        ),
     ):
-        lines = "".join(f'{i + 1}.png,digit,s,{i + 1},train,,"{cell}"\n' for i, cell in enumerate(cells))
+        lines = "".join(
+            f'{i + 1}.png,digit,s,{i + 1},train,,"{cell}"\n' for i, cell in enumerate(cells)
+        )
         refused(words, m.read, _file(tmp_path, f"{head}\n{good}{lines}"))
 
 
 def test_labels_of_a_csv_keep_what_they_say(tmp_path):
     head = "path,sensor,sequence,frame_index,split,label.object,label.force,label.stable,label.word,label.serial"
-    rows = ["a.png,digit,s,0,train,001, 1.5 ,True,True,0x1A", "b.png,digit,s,1,train,007, ,false,maybe,0x10"]
+    rows = [
+        "a.png,digit,s,0,train,001, 1.5 ,True,True,0x1A",
+        "b.png,digit,s,1,train,007, ,false,maybe,0x10",
+    ]
     got = m.read(_file(tmp_path, "\n".join([head, *rows, "c.png,digit,s,2,train,100,2,,,"]) + "\n"))
-    assert got.column("label.serial").to_pylist() == ["0x1A", "0x10", None]  # not 26 and 16
-    assert got.column("label.object").to_pylist() == ["001", "007", "100"]  # names, whose zeros no number keeps
+    # not 26 and 16
+    assert got.column("label.serial").to_pylist() == ["0x1A", "0x10", None]
+    # names, whose zeros no number keeps
+    assert got.column("label.object").to_pylist() == ["001", "007", "100"]
     assert got.column("label.force").to_pylist() == [1.5, None, 2]
-    assert got.column("label.stable").to_pylist() == [True, False, None]  # as a Parquet manifest has it
+    # as a Parquet manifest has it
+    assert got.column("label.stable").to_pylist() == [True, False, None]
     assert got.column("label.word").to_pylist() == ["True", "maybe", None]
     m.write(got, tmp_path / "again.csv")
     again = m.read(tmp_path / "again.csv")
@@ -280,10 +347,16 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     (tmp_path / "t.csv").write_text(csv, encoding="utf-8")
     got, notes = attach_text(loose, tmp_path / "t.csv")
     assert got.column("text").to_pylist() == ['soft, "very" and round'] * 3 + [None] * 3
-    assert notes == ["3 rows got a caption by 'sequence'", "1 of 2 keys of t.csv are not in the manifest"]
+    assert notes == [
+        "3 rows got a caption by 'sequence'",
+        "1 of 2 keys of t.csv are not in the manifest",
+    ]
     (tmp_path / "u.csv").write_text("object,text\n cafe\u0301  noir,smooth\n", encoding="utf-8")
     drinks = m.replace_column(loose, "object", ["caf\u00e9 noir"] * 2 + ["tea"] * 4)
-    assert attach_text(drinks, tmp_path / "u.csv")[0].column("text").to_pylist() == ["smooth"] * 2 + [None] * 4
+    assert (
+        attach_text(drinks, tmp_path / "u.csv")[0].column("text").to_pylist()
+        == ["smooth"] * 2 + [None] * 4
+    )
     table = pa.table({"frame_index": [0, 1], "words": ["new", "one"], "n": [1, 2]})
     pa.parquet.write_table(table, tmp_path / "t.parquet")
     more, notes = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words")
@@ -291,9 +364,23 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
     assert notes == ["2 rows got a caption by 'frame_index'", "2 rows already had a caption"]
     nested = m.replace_column(got, "extra", pa.array([[0]] * len(got)))
     pa.parquet.write_table(pa.table({"extra": ["0"], "text": ["x"]}), tmp_path / "e.parquet")
-    refused("the key 'extra' must be a plain column, is list", attach_text, nested, tmp_path / "e.parquet")
-    over, _ = attach_text(got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True)
-    assert over.column("text").to_pylist() == ["new", "one", 'soft, "very" and round', "new", "one", None]
+    refused(
+        "the key 'extra' must be a plain column, is list",
+        attach_text,
+        nested,
+        tmp_path / "e.parquet",
+    )
+    over, _ = attach_text(
+        got, tmp_path / "t.parquet", key="frame_index", text="words", overwrite=True
+    )
+    assert over.column("text").to_pylist() == [
+        "new",
+        "one",
+        'soft, "very" and round',
+        "new",
+        "one",
+        None,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -303,7 +390,11 @@ def test_captions_are_attached_by_a_table(make, tmp_path):
         ("sequence,text\n\ns0,a\ns0,b\n", {}, "line 4 of .*csv: sequence 's0' has another caption"),
         ("sequence,caption\ns0,a\n", {}, "no column 'text'; it has sequence, caption"),
         ("sequence,touch,text\ns0,x,a\n", {}, "name the key column"),
-        ("sequence,text\ns9,a\n", {}, "no key 'sequence' of it is in the manifest; its first one is 's9'"),
+        (
+            "sequence,text\ns9,a\n",
+            {},
+            "no key 'sequence' of it is in the manifest; its first one is 's9'",
+        ),
         ("sequence,text\ns0,a\n", {"key": "tuoch"}, "no column 'tuoch'"),
         ("grip,text\ns0,a\n", {}, "has no column 'grip'"),
         ('sequence,text\n"s0,a\n', {}, "the quote in line 2 is not closed"),
@@ -322,11 +413,12 @@ def test_a_table_that_does_not_fit_is_named(make, tmp_path, text, options, words
         ({"frame_index": ["one", "two"]}, "'frame_index' must be a whole"),
         ({"frame_index": [1.5, 2.0]}, "row 0 of .*: column 'frame_index'"),
         ({"sensor": [1, 2]}, "'sensor' must be text"),
-        ({"path": [["a"], ["b"]]}, "'path' must be text"), ({"commercial": [2, 0]}, "'commercial' must be a 0 or 1"),
+        ({"path": [["a"], ["b"]]}, "'path' must be text"),
+        ({"commercial": [2, 0]}, "'commercial' must be a 0 or 1"),
         ({"path": ["a", None]}, "row 1 of .*parquet: column 'path' is empty"),
         ({"split": [b"train", b"test"]}, "'split' must be text"),
     ],
-)  # fmt: skip
+)
 def test_a_parquet_with_a_missing_or_mistyped_column_is_named(tmp_path, change, words):
     given = {name: values for name, values in columns(2, **change).items() if values is not None}
     pa.parquet.write_table(pa.table(given), tmp_path / "m.parquet")
@@ -340,7 +432,9 @@ def _with_broken_text(name):
     cells = [value.encode() for value in table[name].to_pylist()]
     cells[1] = b"a\xff\xfeb"
     buffers = pa.array(cells, pa.binary()).buffers()
-    return table.set_column(table.column_names.index(name), name, pa.StringArray.from_buffers(len(cells), *buffers[1:]))
+    return table.set_column(
+        table.column_names.index(name), name, pa.StringArray.from_buffers(len(cells), *buffers[1:])
+    )
 
 
 GOOD_COLUMNS = columns(2, object=["mug"] * 2, note=["n"] * 2) | {"label.x": ["u", "v"]}
@@ -349,13 +443,19 @@ GOOD_COLUMNS = columns(2, object=["mug"] * 2, note=["n"] * 2) | {"label.x": ["u"
 @pytest.mark.parametrize("name", ["path", "split", "object", "label.x", "note"])
 def test_text_of_a_parquet_that_is_not_utf8_is_named(tmp_path, name):
     pa.parquet.write_table(_with_broken_text(name), tmp_path / "m.parquet")
-    refused(f"row 1 of .*parquet: column '{name}' must be UTF-8 text", m.read, tmp_path / "m.parquet")
+    refused(
+        f"row 1 of .*parquet: column '{name}' must be UTF-8 text", m.read, tmp_path / "m.parquet"
+    )
 
 
-@pytest.mark.parametrize("kind", [pa.large_string(), pa.string_view(), pa.dictionary(pa.int8(), pa.large_string())])
+@pytest.mark.parametrize(
+    "kind", [pa.large_string(), pa.string_view(), pa.dictionary(pa.int8(), pa.large_string())]
+)
 def test_labels_of_every_text_type_are_text(tmp_path, kind):
     labels = pa.array(["Wood", "wood"]).cast(pa.large_string())
-    labels = labels.dictionary_encode().cast(kind) if pa.types.is_dictionary(kind) else labels.cast(kind)
+    labels = (
+        labels.dictionary_encode().cast(kind) if pa.types.is_dictionary(kind) else labels.cast(kind)
+    )
     pa.parquet.write_table(pa.table(GOOD_COLUMNS | {"label.x": labels}), tmp_path / "m.parquet")
     manifest = m.read(tmp_path / "m.parquet")
     assert manifest.table["label.x"].type == pa.string()
@@ -364,7 +464,8 @@ def test_labels_of_every_text_type_are_text(tmp_path, kind):
 
 @pytest.mark.parametrize("name", ["m.csv", "m.parquet"])
 @pytest.mark.parametrize(
-    ("text", "kind"), [("<!DOCTYPE html>\n<a,b>\n", "a web page"), ("version https://git-lfs.x", "a Git")]
+    ("text", "kind"),
+    [("<!DOCTYPE html>\n<a,b>\n", "a web page"), ("version https://git-lfs.x", "a Git")],
 )
 @pytest.mark.parametrize("read", [m.read, m.summarise_file])
 def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name, text, kind, read):
@@ -376,9 +477,12 @@ def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name, text, kind, read
 def test_a_huge_cell_is_named_and_never_printed(tmp_path, name):
     huge = GOOD_COLUMNS | {name: ["train", "Z" * 1_000_000]}
     pa.parquet.write_table(pa.table(huge), tmp_path / "m.parquet")
-    error = refused(f"row 1 of .*: column '{name}' has a text of 1000000 bytes", m.read, tmp_path / "m.parquet")
+    error = refused(
+        f"row 1 of .*: column '{name}' has a text of 1000000 bytes", m.read, tmp_path / "m.parquet"
+    )
     assert len(error) < 400
-    long = huge | {name: ["train", "Z" * 9_000], "frame_index": [0, 0]}  # is read, and shortened in messages
+    # is read, and shortened in messages
+    long = huge | {name: ["train", "Z" * 9_000], "frame_index": [0, 0]}
     pa.parquet.write_table(pa.table(long), tmp_path / "m.parquet")
     if name == "split":
         error = refused("unknown split 'ZZZ", m.read, tmp_path / "m.parquet")
@@ -397,19 +501,29 @@ def test_a_table_of_too_many_rows_is_refused_before_it_is_read(tmp_path, monkeyp
 def test_a_description_in_blocks_equals_the_whole_table(tmp_path, monkeypatch):
     monkeypatch.setattr(schema, "BLOCK", 7)
     monkeypatch.setattr(content, "BLOCK", 5)
-    count, rng, file = 40, np.random.default_rng(0), tmp_path / "m.parquet"
+    count = 40
+    rng = np.random.default_rng(0)
+    file = tmp_path / "m.parquet"
     cells = columns(
-        count, sensor=rng.choice(["digit", "taxim", "gelslim"], count).tolist(), stride=[1, 2] * (count // 2),
-        sequence=[f"r{i // 9}" for i in range(count)], frame_index=[i % 9 for i in range(count)],
-        split=rng.choice(["train", "test"], count).tolist(), object=[None if i % 3 else "ball" for i in range(count)],
+        count,
+        sensor=rng.choice(["digit", "taxim", "gelslim"], count).tolist(),
+        stride=[1, 2] * (count // 2),
+        sequence=[f"r{i // 9}" for i in range(count)],
+        frame_index=[i % 9 for i in range(count)],
+        split=rng.choice(["train", "test"], count).tolist(),
+        object=[None if i % 3 else "ball" for i in range(count)],
         extra=[b"a", None] * (count // 2),
-    )  # fmt: skip
-    cells |= {"label.b": [[i] for i in range(count)], "label.a": [None if i == 9 else i / 7 for i in range(count)]}
+    )
+    cells |= {
+        "label.b": [[i] for i in range(count)],
+        "label.a": [None if i == 9 else i / 7 for i in range(count)],
+    }
     order = rng.permutation(count)
     cells = {name: [values[i] for i in order] for name, values in cells.items()}
     pa.parquet.write_table(pa.table(cells), file, row_group_size=11)
     table = m.read(file)
-    for kept in (1 << 20, 3):  # bytes of text that are kept
+    # bytes of text that are kept
+    for kept in (1 << 20, 3):
         monkeypatch.setattr(content, "_KEPT", kept)
         got = m.summarise_file(file)
         assert got.digest == table.content_hash
@@ -417,16 +531,26 @@ def test_a_description_in_blocks_equals_the_whole_table(tmp_path, monkeypatch):
     assert list(got.filled) == list(cells) and got.filled["object"] == table.present("object").sum()
     for name in ("split", "sensor"):
         values, rows = np.unique(cells[name], return_counts=True)
-        assert got.counts[name] == (list(zip(values.tolist(), rows.tolist(), strict=True)), len(values))
+        assert got.counts[name] == (
+            list(zip(values.tolist(), rows.tolist(), strict=True)),
+            len(values),
+        )
     (tmp_path / "m.csv").write_text(GOOD)
     assert m.summarise_file(tmp_path / "m.csv").digest == m.read(tmp_path / "m.csv").content_hash
     twice = {name: cells[name][20] for name in ("frame_index", "sequence", "split")}
     for row, changes, words in (
-        (30, twice, r"row 30 of .*m\.parquet repeats frame_index \d of sequence 'r\d', as in row 20 of"),
+        (
+            30,
+            twice,
+            r"row 30 of .*m\.parquet repeats frame_index \d of sequence 'r\d', as in row 20 of",
+        ),
         (33, {"split": "tset"}, r"row 33 of .*m\.parquet: column 'split' .* did you mean test"),
         (33, {"path": None}, r"row 33 of .*m\.parquet: column 'path' is empty"),
     ):
-        changed = {name: [*of[:row], changes.get(name, of[row]), *of[row + 1 :]] for name, of in cells.items()}
+        changed = {
+            name: [*of[:row], changes.get(name, of[row]), *of[row + 1 :]]
+            for name, of in cells.items()
+        }
         pa.parquet.write_table(pa.table(changed), file, row_group_size=11)
         refused(words, m.summarise_file, file)
     for name in ("gone.parquet", "gone.csv", "m.txt"):

@@ -53,14 +53,19 @@ class Hub(BaseHTTPRequestHandler):
         if file.is_dir():
             return {"type": "directory", "path": name, "oid": "0" * 40}
         return {
-            "type": "file", "path": name, "oid": hashlib.sha1(name.encode()).hexdigest(), "size": file.stat().st_size,
-        }  # fmt: skip
+            "type": "file",
+            "path": name,
+            "oid": hashlib.sha1(name.encode()).hexdigest(),
+            "size": file.stat().st_size,
+        }
 
     def do_GET(self):
         path = unquote(urlsplit(self.path).path)
         if path.startswith("/datasets/me/touches/resolve/main/"):
             data = (self.root / path.split("/", 6)[6]).read_bytes()
-            first, last = (self.headers.get("Range") or "bytes=0-").removeprefix("bytes=").split("-")
+            first, last = (
+                (self.headers.get("Range") or "bytes=0-").removeprefix("bytes=").split("-")
+            )
             self.answer(data[int(first) : int(last or len(data)) + 1], 206)
         elif path.startswith("/api/datasets/me/touches/tree/main"):
             files = sorted(self.root.rglob("*"))
@@ -81,7 +86,8 @@ def hub(corpus, monkeypatch):
     server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (Hub,), {"root": corpus}))
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
-    here, constants = f"http://127.0.0.1:{server.server_port}", huggingface_hub.constants
+    here = f"http://127.0.0.1:{server.server_port}"
+    constants = huggingface_hub.constants
     template = constants.HUGGINGFACE_CO_URL_TEMPLATE.replace(constants.ENDPOINT, here)
     monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
     monkeypatch.setattr(constants, "ENDPOINT", here)
@@ -95,12 +101,16 @@ def hub(corpus, monkeypatch):
 def bucket(corpus, monkeypatch):
     """The address of the corpus in a bucket of moto's server."""
     pytest.importorskip("s3fs")
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(
+        ip_address="127.0.0.1", port=0, verbose=False
+    )
     server.start()
     for name, value in {
-        "AWS_ENDPOINT_URL": "http://{}:{}".format(*server.get_host_and_port()), "AWS_ACCESS_KEY_ID": "testing",
-        "AWS_SECRET_ACCESS_KEY": "testing", "AWS_DEFAULT_REGION": "us-east-1",
-    }.items():  # fmt: skip
+        "AWS_ENDPOINT_URL": "http://{}:{}".format(*server.get_host_and_port()),
+        "AWS_ACCESS_KEY_ID": "testing",
+        "AWS_SECRET_ACCESS_KEY": "testing",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }.items():
         monkeypatch.setenv(name, value)
     system = fsspec.filesystem("s3", skip_instance_cache=True)
     type(system).clear_instance_cache()
@@ -115,11 +125,18 @@ def check_store(url, corpus, tmp_path, monkeypatch):
     """The same batches as from the folder, a shard copied once, nothing copied for the manifest."""
     (tmp_path / "far").mkdir()
     near = index("webdataset", corpus, options=IndexOptions(sensor="digit")).manifest
-    far = index("webdataset", tmp_path / "far", options=IndexOptions(sensor="digit", url=url)).manifest
-    assert far.column("path").to_pylist() == [f"{url}/{path}" for path in near.column("path").to_pylist()]
+    far = index(
+        "webdataset", tmp_path / "far", options=IndexOptions(sensor="digit", url=url)
+    ).manifest
+    assert far.column("path").to_pylist() == [
+        f"{url}/{path}" for path in near.column("path").to_pylist()
+    ]
     assert not (tmp_path / "cache").exists()
-    fetched, fetch = [], files._fetch
-    monkeypatch.setattr(files, "_fetch", lambda file, target: (fetched.append(file), fetch(file, target)))
+    fetched = []
+    fetch = files._fetch
+    monkeypatch.setattr(
+        files, "_fetch", lambda file, target: (fetched.append(file), fetch(file, target))
+    )
     loaders = [Loader(manifest, config()) for manifest in (near, far)]
     for step in range(4):
         batches = [loader.batch(step) for loader in loaders]
@@ -134,10 +151,16 @@ def check_store(url, corpus, tmp_path, monkeypatch):
 
 def test_a_corpus_on_the_hub_gives_the_batches_of_the_folder(hub, corpus, tmp_path, monkeypatch):
     check_store(hub, corpus, tmp_path, monkeypatch)
-    refused(r"there is no hf://datasets/me/other/0\.tar", files.local_copy, "hf://datasets/me/other/0.tar/0")
+    refused(
+        r"there is no hf://datasets/me/other/0\.tar",
+        files.local_copy,
+        "hf://datasets/me/other/0.tar/0",
+    )
 
 
 @pytest.mark.slow
-def test_a_corpus_in_a_bucket_gives_the_batches_of_the_folder(bucket, corpus, tmp_path, monkeypatch):
+def test_a_corpus_in_a_bucket_gives_the_batches_of_the_folder(
+    bucket, corpus, tmp_path, monkeypatch
+):
     check_store(bucket, corpus, tmp_path, monkeypatch)
     refused(r"there is no s3://other/0\.tar", files.local_copy, "s3://other/0.tar/0")

@@ -12,7 +12,8 @@ def _recording(make, count=12, shape=(48, 64), seed=0):
     loose = make([{"sequence": "s", "frame_index": i, "unit": "u"} for i in range(count)])
     rng = np.random.default_rng(seed)
     ramp = np.add.outer(np.arange(shape[0]) / shape[0] * 40, np.arange(shape[1]) / shape[1] * 60)
-    gel = np.array([90, 130, 200]) - ramp[..., None] * [0.6, 1.0, 0.8]  # BGR
+    # BGR
+    gel = np.array([90, 130, 200]) - ramp[..., None] * [0.6, 1.0, 0.8]
     for i in range(count):
         dent = np.zeros(shape)
         cv2.circle(dent, (10 + 3 * i, 20), 6, 30, -1)
@@ -24,7 +25,9 @@ def _recording(make, count=12, shape=(48, 64), seed=0):
 def _cut_jpeg(picture):
     """The picture as a decoder gives it from a JPEG file with a lost end and an end marker."""
     data = cv2.imencode(".jpg", picture)[1].tobytes()
-    return cv2.imdecode(np.frombuffer(data[: len(data) // 2] + b"\xff\xd9", np.uint8), cv2.IMREAD_COLOR)
+    return cv2.imdecode(
+        np.frombuffer(data[: len(data) // 2] + b"\xff\xd9", np.uint8), cv2.IMREAD_COLOR
+    )
 
 
 def _with_bars(picture):
@@ -33,13 +36,19 @@ def _with_bars(picture):
 
 
 SPOILS = {
-    "flat": lambda picture: np.full_like(picture, 77), "cut": _cut_jpeg, "border": _with_bars,
+    "flat": lambda picture: np.full_like(picture, 77),
+    "cut": _cut_jpeg,
+    "border": _with_bars,
     "noise": lambda picture: np.random.default_rng(1).integers(0, 256, picture.shape, np.uint8),
-    "grey": lambda picture: np.repeat(picture.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8),
-    "dark": lambda picture: picture // 8, "inverted": lambda picture: 255 - picture,
-    "channels": lambda picture: picture[..., ::-1], "turned": lambda picture: picture[::-1, ::-1],
+    "grey": lambda picture: np.repeat(picture.mean(axis=2, keepdims=True), 3, axis=2).astype(
+        np.uint8
+    ),
+    "dark": lambda picture: picture // 8,
+    "inverted": lambda picture: 255 - picture,
+    "channels": lambda picture: picture[..., ::-1],
+    "turned": lambda picture: picture[::-1, ::-1],
     "wrong_size": lambda picture: picture[::2, ::2],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", SPOILS)
@@ -54,7 +63,10 @@ def test_a_picture_that_cannot_be_right_is_named(make, kind):
 
 
 def test_a_mirrored_picture_is_turned(make):
-    for spoil in (lambda picture: picture[:, ::-1], lambda picture: cv2.resize(np.rot90(picture), (64, 48))):
+    for spoil in (
+        lambda picture: picture[:, ::-1],
+        lambda picture: cv2.resize(np.rot90(picture), (64, 48)),
+    ):
         loose = _recording(make)
         cv2.imwrite(str(loose.file(3)), spoil(cv2.imread(str(loose.file(3)))))
         assert finding_rows(verify(loose)) == {"turned": [3]}
@@ -62,7 +74,8 @@ def test_a_mirrored_picture_is_turned(make):
 
 def test_a_camera_that_hangs_repeats_its_picture(make):
     loose = _recording(make)
-    for row in (5, 6, 7):  # other bytes, equal pixels
+    # other bytes, equal pixels
+    for row in (5, 6, 7):
         params = [cv2.IMWRITE_PNG_COMPRESSION, row]
         cv2.imwrite(str(loose.file(row)), cv2.imread(str(loose.file(4))), params)
     assert finding_rows(verify(loose))["frozen"] == [5, 6, 7]
@@ -73,7 +86,9 @@ def test_a_sequence_of_several_sensors_is_noticed(make, sensors):
     loose = _recording(make, 16)
     for row in range(16):
         picture = cv2.imread(str(loose.file(row))).astype(int)
-        cv2.imwrite(str(loose.file(row)), np.clip(picture + 12 * (row % sensors), 0, 255).astype(np.uint8))
+        cv2.imwrite(
+            str(loose.file(row)), np.clip(picture + 12 * (row % sensors), 0, 255).astype(np.uint8)
+        )
     assert finding_rows(verify(loose)) == {"alternating": list(range(16))}
 
 

@@ -17,7 +17,8 @@ def read(tmp_path: Path) -> Callable[..., Table]:
         table = Table(index(name, root, out, options=IndexOptions(**options)))  # type: ignore[arg-type]
         check_laws(table, root)
         again = Table(index(name, root, out, options=IndexOptions(**options)))  # type: ignore[arg-type]
-        assert again.manifest.content_hash == table.manifest.content_hash  # one order, always
+        # one order, always
+        assert again.manifest.content_hash == table.manifest.content_hash
         return table
 
     return run

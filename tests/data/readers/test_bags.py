@@ -18,7 +18,10 @@ START = 5_000_000_000
 def ros_messages(store, *, ros1: bool):
     """(topic, type, time, message): four pictures with a padded row, and a force that is late for the last."""
     names = "sensor_msgs/Image std_msgs/Header builtin_interfaces/Time geometry_msgs/Wrench geometry_msgs/Vector3"
-    types = [store.types[name.replace("/", "/msg/")] for name in [*names.split(), "geometry_msgs/WrenchStamped"]]
+    types = [
+        store.types[name.replace("/", "/msg/")]
+        for name in [*names.split(), "geometry_msgs/WrenchStamped"]
+    ]
     Image, Header, Time, Wrench, Vector, Stamped = types
 
     def header(time):
@@ -26,14 +29,18 @@ def ros_messages(store, *, ros1: bool):
         return Header(stamp=stamp, frame_id="", **{"seq": 0} if ros1 else {})
 
     for i in range(4):
-        time, late = START + i * 50_000_000, 200_000_000 * (i == 3)
+        time = START + i * 50_000_000
+        late = 200_000_000 * (i == 3)
         pixels = np.zeros((8, 26), np.uint8)
-        pixels[:, :24] = np.tile([10 * i, 0, 200], 8)  # blue, green, red and two bytes of padding
+        # blue, green, red and two bytes of padding
+        pixels[:, :24] = np.tile([10 * i, 0, 200], 8)
         about = {"height": 8, "width": 8, "encoding": "bgr8", "is_bigendian": 0, "step": 26}
         message = Image(header=header(time), data=pixels.ravel(), **about)
         yield "/gel/left", "sensor_msgs/msg/Image", time + 1_000_000, message
         force = Vector(x=0.0, y=0.0, z=float(i))
-        stamped = Stamped(header=header(time + late + 10_000_000), wrench=Wrench(force=force, torque=force))
+        stamped = Stamped(
+            header=header(time + late + 10_000_000), wrench=Wrench(force=force, torque=force)
+        )
         yield "/ft", "geometry_msgs/msg/WrenchStamped", time + late + 20_000_000, stamped
 
 
@@ -43,11 +50,15 @@ def write_ros(folder, version):
     if version == 1:
         from rosbags.rosbag1 import Writer
 
-        store, target, options = get_typestore(Stores.ROS1_NOETIC), folder / "run.bag", {}
+        store = get_typestore(Stores.ROS1_NOETIC)
+        target = folder / "run.bag"
+        options = {}
     else:
         from rosbags.rosbag2 import Writer
 
-        store, target, options = get_typestore(Stores.ROS2_HUMBLE), folder / "run", {"version": 8}
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        target = folder / "run"
+        options = {"version": 8}
     with Writer(target, **options) as writer:
         places = {}
         for topic, kind, time, message in ros_messages(store, ros1=version == 1):
@@ -74,7 +85,11 @@ def write_protobuf(file):
     }.items():
         kind = ours.message_type.add(name=name)
         kind.field.add(
-            name="timestamp", number=1, type=types["TYPE_MESSAGE"], label=1, type_name=".google.protobuf.Timestamp"
+            name="timestamp",
+            number=1,
+            type=types["TYPE_MESSAGE"],
+            label=1,
+            type_name=".google.protobuf.Timestamp",
         )
         for number, (field, code) in enumerate(fields.items(), 2):
             kind.field.add(name=field, number=number, type=types[code], label=1)
@@ -95,7 +110,9 @@ def write_protobuf(file):
             )
             for i in range(3):
                 message = kind(timestamp={"seconds": 7, "nanos": i}, **values(i))
-                writer.add_message(channel, log_time=i, publish_time=0, data=message.SerializeToString())
+                writer.add_message(
+                    channel, log_time=i, publish_time=0, data=message.SerializeToString()
+                )
         writer.finish()
 
 
@@ -105,8 +122,11 @@ def test_images_of_a_bag_have_their_times_and_the_nearest_force(read, tmp_path, 
     values = ("force_z=/ft:wrench.force.z",)
     refused("--export", read, "bags", sensor="digit", values=values)
     table = read("bags", sensor="digit", values=values, export=True)
-    assert table["path"] == [f"run/gel.left/{i:06d}.png" for i in range(4)] and table["frame_index"] == [0, 1, 2, 3]
-    assert table["time"] == [START + i * 50_000_000 for i in range(4)]  # of the header, not of the log
+    assert table["path"] == [f"run/gel.left/{i:06d}.png" for i in range(4)] and table[
+        "frame_index"
+    ] == [0, 1, 2, 3]
+    # of the header, not of the log
+    assert table["time"] == [START + i * 50_000_000 for i in range(4)]
     assert table["label.force_z"] == [0, 1, 2, 2]
     np.testing.assert_array_equal(decode(tmp_path / "run/gel.left/000002.png")[0, 0], [200, 0, 20])
     assert set(table["unit"]) == {"/gel/left"} and len(table.clips(3)) == 2
@@ -116,14 +136,22 @@ def test_json_in_mcap_is_read_and_topics_are_chosen(read, tmp_path):
     forces = ("/force", "force", [(i / 30, {"f": [0, i]}) for i in range(4)])
     write_topics(tmp_path / "run.mcap", [GEL, ("/other", GEL[1], GEL[2]), forces])
     table = read("bags", sensor="digit", keys=("/gel",), values=("f=/force:f[1]",), export=True)
-    assert table["time"] == [round((1000 + i / 30) * 1e9) for i in range(4)] and table["label.f"] == [0, 1, 2, 3]
+    assert table["time"] == [round((1000 + i / 30) * 1e9) for i in range(4)] and table[
+        "label.f"
+    ] == [0, 1, 2, 3]
     assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 10, 20, 30]
     refused("without images", read, "bags", sensor="digit", keys=("/none",), export=True)
-    for value, words in {"f=/force": "NAME=TOPIC:FIELD", "f=/force:g": "have no g", "f=/force:f": "no number"}.items():
+    for value, words in {
+        "f=/force": "NAME=TOPIC:FIELD",
+        "f=/force:g": "have no g",
+        "f=/force:f": "no number",
+    }.items():
         refused(words, read, "bags", sensor="digit", values=(value,), export=True)
 
 
-def test_protobuf_in_mcap_is_read_and_without_its_package_only_its_messages_are_an_error(read, tmp_path, monkeypatch):
+def test_protobuf_in_mcap_is_read_and_without_its_package_only_its_messages_are_an_error(
+    read, tmp_path, monkeypatch
+):
     pytest.importorskip("mcap_protobuf")
     write_protobuf(tmp_path / "run.mcap")
     table = read("bags", sensor="digit", values=("z=/ft:z",), export=True)
@@ -131,7 +159,13 @@ def test_protobuf_in_mcap_is_read_and_without_its_package_only_its_messages_are_
     assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 1, 2]
     write_topics(tmp_path / "plain.mcap", [GEL])
     monkeypatch.setitem(sys.modules, "mcap_protobuf.decoder", None)
-    refused(r"run\.mcap needs a package.*anytouch_jax\[bags\]", read, "bags", sensor="digit", export=True)
+    refused(
+        r"run\.mcap needs a package.*anytouch_jax\[bags\]",
+        read,
+        "bags",
+        sensor="digit",
+        export=True,
+    )
     (tmp_path / "run.mcap").unlink()
     assert len(read("bags", sensor="digit", export=True)["path"]) == 4
 
@@ -149,7 +183,9 @@ def write_topics(file, topics):
         writer = mcap.Writer(stream)
         writer.start()
         for topic, kind, messages in topics:
-            channel = writer.register_channel(topic, "json", writer.register_schema(kind, "jsonschema", b"{}"))
+            channel = writer.register_channel(
+                topic, "json", writer.register_schema(kind, "jsonschema", b"{}")
+            )
             for number, (seconds, content) in enumerate(messages):
                 whole, rest = divmod(round((1000 + seconds) * 1e9), 10**9)
                 data = json.dumps({"timestamp": {"sec": whole, "nsec": rest}} | content).encode()
@@ -163,33 +199,58 @@ def image(grey=0):
 
 def raw(encoding, pixels, **more):
     pixels = np.asarray(pixels)
-    about = {"height": pixels.shape[0], "width": pixels.shape[1], "step": pixels.nbytes // pixels.shape[0]}
-    return about | {"encoding": encoding, "data": base64.b64encode(pixels.tobytes()).decode()} | more
+    about = {
+        "height": pixels.shape[0],
+        "width": pixels.shape[1],
+        "step": pixels.nbytes // pixels.shape[0],
+    }
+    return (
+        about | {"encoding": encoding, "data": base64.b64encode(pixels.tobytes()).decode()} | more
+    )
 
 
 GEL = ("/gel", "foxglove.CompressedImage", [(i / 30, image(10 * i)) for i in range(4)])
-MOSAIC = {"rggb": (200, 120, 120, 40), "bggr": (40, 120, 120, 200), "gbrg": (120, 40, 200, 120),
-          "grbg": (120, 200, 40, 120)}  # fmt: skip
+MOSAIC = {
+    "rggb": (200, 120, 120, 40),
+    "bggr": (40, 120, 120, 200),
+    "gbrg": (120, 40, 200, 120),
+    "grbg": (120, 200, 40, 120),
+}
 
 
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        *((raw(f"bayer_{name}8", np.tile(np.reshape(cells, (2, 2)), (8, 8)).astype("u1")), (200, 120, 40))
-          for name, cells in MOSAIC.items()),
-        (raw("bayer_rggb16", np.tile(np.reshape(MOSAIC["rggb"], (2, 2)), (8, 8)).astype("<u2") * 257), (200, 120, 40)),
+        *(
+            (
+                raw(f"bayer_{name}8", np.tile(np.reshape(cells, (2, 2)), (8, 8)).astype("u1")),
+                (200, 120, 40),
+            )
+            for name, cells in MOSAIC.items()
+        ),
+        (
+            raw(
+                "bayer_rggb16",
+                np.tile(np.reshape(MOSAIC["rggb"], (2, 2)), (8, 8)).astype("<u2") * 257,
+            ),
+            (200, 120, 40),
+        ),
         (raw("yuv422_yuy2", np.tile(np.array([200, 128], "u1"), (16, 16, 1))), (214, 214, 214)),
         (raw("yuv422", np.tile(np.array([128, 200], "u1"), (16, 16, 1))), (214, 214, 214)),
         (raw("mono16", np.full((16, 16), 200 * 257, "<u2")), (200, 200, 200)),
         (raw("mono16", np.full((16, 16), 200 * 257, ">u2"), is_bigendian=1), (200, 200, 200)),
-        (raw("32FC1", np.ones((16, 16), "f4")), "encoding 32FC1"), (raw("16UC1", np.ones((16, 16), "u2")), "16UC1"),
+        (raw("32FC1", np.ones((16, 16), "f4")), "encoding 32FC1"),
+        (raw("16UC1", np.ones((16, 16), "u2")), "16UC1"),
         (raw("rgb8", np.ones((16, 16, 3), "u1"), step=0), "16 x 16 pixels and 0 bytes a row"),
         (raw("rgb8", np.ones((16, 16, 3), "u1"), height=17), "cut short"),
         (raw("yuyv", np.ones((16, 15, 2), "u1")), "15 x 16 pixels in yuyv"),
     ],
-)  # fmt: skip
+)
 def test_other_encodings_are_read_or_left_out_and_named(read, tmp_path, content, expected):
-    write_topics(tmp_path / "run.mcap", [GEL, ("/head", "foxglove.RawImage", [(i / 30, content) for i in range(3)])])
+    write_topics(
+        tmp_path / "run.mcap",
+        [GEL, ("/head", "foxglove.RawImage", [(i / 30, content) for i in range(3)])],
+    )
     table = read("bags", sensor="digit", export=True)
     assert table["unit"].count("/gel") == 4
     if isinstance(expected, str):
@@ -203,26 +264,46 @@ def test_other_encodings_are_read_or_left_out_and_named(read, tmp_path, content,
 
 
 def test_one_bad_picture_or_recording_beside_good_ones_is_counted_by_place(read, tmp_path):
-    bad = [(0, image(0)), (1 / 30, image(10) | {"data": base64.b64encode(png(10)[:40]).decode()}), (2 / 30, image(20))]
-    others = [("/depth", "foxglove.CompressedImage", [(0, image() | {"format": "16UC1; compressedDepth png"})]),
-              ("/film", "foxglove.CompressedVideo", [(0, {"format": "h264", "data": ""})])]  # fmt: skip
+    bad = [
+        (0, image(0)),
+        (1 / 30, image(10) | {"data": base64.b64encode(png(10)[:40]).decode()}),
+        (2 / 30, image(20)),
+    ]
+    others = [
+        (
+            "/depth",
+            "foxglove.CompressedImage",
+            [(0, image() | {"format": "16UC1; compressedDepth png"})],
+        ),
+        ("/film", "foxglove.CompressedVideo", [(0, {"format": "h264", "data": ""})]),
+    ]
     write_topics(tmp_path / "run.mcap", [("/gel", "foxglove.CompressedImage", bad), *others])
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "run.mcap").read_bytes()[:400])
     table = read("bags", sensor="digit", export=True)
-    assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 20] and table["frame_index"] == [0, 1]
+    assert [decode(tmp_path / path)[0, 0, 0] for path in table["path"]] == [0, 20] and table[
+        "frame_index"
+    ] == [0, 1]
     examples = {example for _, example in table.report.skipped.values()}
     assert {
-        f"run.mcap, topic {topic}, frame {at}" for topic, at in (("/gel", 1), ("/depth", 0), ("/film", 0))
+        f"run.mcap, topic {topic}, frame {at}"
+        for topic, at in (("/gel", 1), ("/depth", 0), ("/film", 0))
     } < examples
     assert any(str(tmp_path / "cut.mcap") in example for example in examples) and len(examples) == 4
 
 
 def test_a_recording_made_again_and_two_of_one_name_have_their_own_pictures(read, tmp_path):
     for grey, topics in ((1, ("/gel", "/g/el")), (7, ("/gel", "/g/el", "/g.el"))):
-        write_topics(tmp_path / "run.mcap", [
-            (topic, "foxglove.CompressedImage", [(i / 30, image(10 * at + grey)) for i in range(3)])
-            for at, topic in enumerate(topics)
-        ])  # fmt: skip
+        write_topics(
+            tmp_path / "run.mcap",
+            [
+                (
+                    topic,
+                    "foxglove.CompressedImage",
+                    [(i / 30, image(10 * at + grey)) for i in range(3)],
+                )
+                for at, topic in enumerate(topics)
+            ],
+        )
         table = read("bags", sensor="digit", export=True)
         assert len(table.rows) == 3 * len(topics)
         for path, row in table.rows.items():
@@ -232,13 +313,17 @@ def test_a_recording_made_again_and_two_of_one_name_have_their_own_pictures(read
 @pytest.mark.parametrize(
     ("shift", "topic", "found", "words"),
     [
-        (0, "/ft", 4, None), (-1.5, "/ft", 0, "no value of /ft within 0.1 s of it (the nearest is 1.4 s away): 4"),
+        (0, "/ft", 4, None),
+        (-1.5, "/ft", 0, "no value of /ft within 0.1 s of it (the nearest is 1.4 s away): 4"),
         (0, "/f_t", 0, "no message of the topic /f_t, so label.f has no value; did you mean /ft?"),
         (-0.15, "/ft", 2, "no value of /ft within 0.1 s of it (the nearest is 0.117 s away): 2"),
     ],
-)  # fmt: skip
+)
 def test_labels_that_are_not_found_are_reported(read, tmp_path, shift, topic, found, words):
-    write_topics(tmp_path / "run.mcap", [GEL, ("/ft", "Force", [(i / 30 + shift, {"z": i}) for i in range(4)])])
+    write_topics(
+        tmp_path / "run.mcap",
+        [GEL, ("/ft", "Force", [(i / 30 + shift, {"z": i}) for i in range(4)])],
+    )
     report = read("bags", sensor="digit", export=True, values=(f"f={topic}:z",)).report
     assert words is None or any(words in line for line in report.lines())
     cells = report.manifest.table.to_pylist()

@@ -21,8 +21,15 @@ def test_links_hidden_files_and_odd_names_are_counted_not_followed(tmp_path, rea
     frames = root / "real/mug/dataset_0/frames"
     fill(tmp_path, ["outside/frame_0000009.jpg"])
     (frames / "frame_0000008.jpg").symlink_to(tmp_path / "outside/frame_0000009.jpg")
-    (root / "real/link").symlink_to(root / "real", target_is_directory=True)  # a loop, if it were followed
-    fill(root, ["real/mug/dataset_0/frames/._frame_0000007.jpg", "real/mug/dataset_0/frames/frame_0000002.png"])
+    # a loop, if it were followed
+    (root / "real/link").symlink_to(root / "real", target_is_directory=True)
+    fill(
+        root,
+        [
+            "real/mug/dataset_0/frames/._frame_0000007.jpg",
+            "real/mug/dataset_0/frames/frame_0000002.png",
+        ],
+    )
     (frames / "frame_2.jpg").write_bytes((frames / "frame_0000002.jpg").read_bytes())
     with open(os.path.join(os.fsencode(frames), b"frame_\xff.jpg"), "wb") as file:
         file.write(b"x")
@@ -38,22 +45,40 @@ def test_links_hidden_files_and_odd_names_are_counted_not_followed(tmp_path, rea
 
 def test_no_frame_is_opened_or_stated(tmp_path, monkeypatch):
     fill_ycb(tmp_path, ("a", "b"), 50)
-    paths, scans, real_stat, real_scan = [], [], os.stat, os.scandir
-    monkeypatch.setattr(os, "stat", lambda path, *a, **k: (paths.append(os.fspath(path)), real_stat(path, *a, **k))[1])
-    monkeypatch.setattr(os, "scandir", lambda path: (scans.append(os.fspath(path)), real_scan(path))[1])
+    paths = []
+    scans = []
+    real_stat = os.stat
+    real_scan = os.scandir
+    monkeypatch.setattr(
+        os,
+        "stat",
+        lambda path, *a, **k: (paths.append(os.fspath(path)), real_stat(path, *a, **k))[1],
+    )
+    monkeypatch.setattr(
+        os, "scandir", lambda path: (scans.append(os.fspath(path)), real_scan(path))[1]
+    )
     READERS["ycb_slide"].read(DatasetIndex("ycb_slide", tmp_path))
     assert not [path for path in paths if str(path).endswith(".jpg")]
-    assert len(scans) == len(set(scans)) == 1 + 2 + 2  # real, the objects, their frames: each once
+    # real, the objects, their frames: each once
+    assert len(scans) == len(set(scans)) == 1 + 2 + 2
 
 
 def test_hash_splits_are_stable_disjoint_and_of_the_wanted_share():
     options = IndexOptions(val=0.1, test=0.2)
     of = {f"o{k}": hash_split("x", f"o{k}", options) for k in range(4000)}
-    shares = {split: sum(one == split for one in of.values()) / len(of) for split in ("train", "val", "test")}
+    shares = {
+        split: sum(one == split for one in of.values()) / len(of)
+        for split in ("train", "val", "test")
+    }
     assert shares == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.03)
-    fixed = [hash_split("ycb_slide", name, IndexOptions(0.5, 0.25)) for name in ("mug", "hammer", "ball")]
-    assert fixed == ["test", "val", "test"]  # a change of the rule moves every published split
+    fixed = [
+        hash_split("ycb_slide", name, IndexOptions(0.5, 0.25)) for name in ("mug", "hammer", "ball")
+    ]
+    # a change of the rule moves every published split
+    assert fixed == ["test", "val", "test"]
     wider = replace(options, test=0.4)
-    assert all(hash_split("x", name, wider) != "train" for name, split in of.items() if split != "train")
+    assert all(
+        hash_split("x", name, wider) != "train" for name, split in of.items() if split != "train"
+    )
     assert {hash_split("x", f"o{k}", IndexOptions(0, 0)) for k in range(50)} == {"train"}
     assert {hash_split("x", f"o{k}", IndexOptions(0, 1)) for k in range(50)} == {"test"}

@@ -17,7 +17,15 @@ PHASES = ("before", "during", "after")
 
 def _tree(root, objects=("mug", "blue bär"), grasps=2):
     for name in objects:
-        fill(root, [f"{name}/touch_{phase}/{n}_{f}.png" for phase in PHASES for n in range(grasps) for f in "AB"])
+        fill(
+            root,
+            [
+                f"{name}/touch_{phase}/{n}_{f}.png"
+                for phase in PHASES
+                for n in range(grasps)
+                for f in "AB"
+            ],
+        )
         fill(root, [f"{name}/vision_{phase}/{n}.png" for phase in PHASES for n in range(grasps)])
     lines = [f"{name},{n},{n % 2}" for name in objects for n in range(grasps)]
     (root / "feel.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -33,12 +41,18 @@ def test_only_during_frames_are_train_and_test(tmp_path, read):
     table = read("feel")
     assert table.report.splits == {"train": 4, "test": 4, "background": 8, "unused": 8}
     row = table.rows["blue bär/touch_during/1_B.png"]
-    assert (row["split"], row["label.success"], row["grasp_group"], row["unit"]) == ("test", 1, "blue bär/1", "B")
+    assert (row["split"], row["label.success"], row["grasp_group"], row["unit"]) == (
+        "test",
+        1,
+        "blue bär/1",
+        "B",
+    )
     assert row["image_path"] == "blue bär/vision_during/1.png"
     assert row["background_path"] == "blue bär/touch_before/1_B.png"
     assert table.rows["mug/touch_before/0_A.png"]["label.contact"] == 0
     assert table.rows["mug/touch_after/0_A.png"]["grasp_group"] is None
-    assert "touch" not in row  # the fingers press opposite sides: no place that two sensors felt
+    # the fingers press opposite sides: no place that two sensors felt
+    assert "touch" not in row
     pairs = {}
     for one in table.rows.values():
         pairs.setdefault(one["grasp_group"], []).append(one["unit"])
@@ -66,7 +80,9 @@ def test_split_files_are_read_as_numpy_writes_them(tmp_path, protocol):
     array[()] = table
     path = tmp_path / "split.npy"
     with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": ()})
+        np.lib.format.write_array_header_1_0(
+            file, {"descr": "|O", "fortran_order": False, "shape": ()}
+        )
         file.write(pickle.dumps(array, protocol))
     assert np.load(path, allow_pickle=True).item() == table
     assert read_pickle(path).item() == table
@@ -94,7 +110,9 @@ def test_without_a_split_file_objects_stay_whole(tmp_path, read):
     for row in table.rows.values():
         if "_during" in row["path"]:
             parts.setdefault(row["object"], set()).add(row["split"])
-    assert all(len(splits) == 1 for splits in parts.values()) and len(set.union(*parts.values())) == 3
+    assert (
+        all(len(splits) == 1 for splits in parts.values()) and len(set.union(*parts.values())) == 3
+    )
     assert table.reasons["picture of feel.csv that is not on disk"] == 1
 
 
@@ -107,7 +125,11 @@ def test_a_broken_table_names_its_line(tmp_path, read, line):
 
 
 def test_original_files_are_written_as_pictures(tmp_path, read):
-    grasps = {"i10": (50, 0, b"mug"), "i2": (40, 1, b"mug"), "i0": (30, 1, np.frombuffer(b"blue b\xc3\xa4r", np.uint8))}
+    grasps = {
+        "i10": (50, 0, b"mug"),
+        "i2": (40, 1, b"mug"),
+        "i0": (30, 1, np.frombuffer(b"blue b\xc3\xa4r", np.uint8)),
+    }
     with h5py.File(tmp_path / "calandra_corl2017_000.h5", "w") as file:
         for name, (shade, success, thing) in grasps.items():
             group = file.create_group(f"data/{name}")
@@ -118,7 +140,8 @@ def test_original_files_are_written_as_pictures(tmp_path, read):
     table = read("feel", export=True)
     assert (tmp_path / "feel.csv").read_text() == "blue bär,0,1\nmug,0,1\nmug,1,0\n"
     assert len(table.rows) == 18
-    assert decode(tmp_path / "mug/touch_during/1_A.png")[0, 0].tolist() == [50, 0, 9]  # RGB stays RGB; i2 before i10
+    # RGB stays RGB; i2 before i10
+    assert decode(tmp_path / "mug/touch_during/1_A.png")[0, 0].tolist() == [50, 0, 9]
     assert table.rows["mug/touch_during/1_A.png"]["label.success"] == 0
 
 

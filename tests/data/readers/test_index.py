@@ -16,7 +16,8 @@ def test_every_reader_says_what_it_is():
     for one in READERS.values():
         assert one.license and one.citation and set(one.uses) <= known
     total = sum(one.paper for one in READERS.values() if one.paper)
-    assert abs(total - 2_481_703) < 450_000  # the paper's table sums to 2.9 million, its text says 2,481,703
+    # the paper's table sums to 2.9 million, its text says 2,481,703
+    assert abs(total - 2_481_703) < 450_000
 
 
 def test_the_manifest_may_lie_above_the_data_but_not_elsewhere(tmp_path, read):
@@ -32,8 +33,12 @@ def test_the_manifest_may_lie_above_the_data_but_not_elsewhere(tmp_path, read):
 def test_a_failed_write_is_an_error_and_leaves_the_old_file(tmp_path, monkeypatch):
     fill_ycb(tmp_path)
     before = index("ycb_slide", tmp_path).out.read_bytes()
-    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(PermissionError(13, "Permission denied")))
-    with pytest.raises(UserError, match=r"cannot be written: Permission denied; name another file with --out"):
+    monkeypatch.setattr(
+        os, "replace", lambda *_: (_ for _ in ()).throw(PermissionError(13, "Permission denied"))
+    )
+    with pytest.raises(
+        UserError, match=r"cannot be written: Permission denied; name another file with --out"
+    ):
         index("ycb_slide", tmp_path, options=IndexOptions(val=0.5))
     assert (tmp_path / "ycb_slide.parquet").read_bytes() == before
     assert sorted(os.listdir(tmp_path)) == ["real", "ycb_slide.parquet"]
@@ -43,7 +48,8 @@ def test_folders_that_lead_elsewhere_are_refused(tmp_path):
     fill_ycb(tmp_path / "big")
     fill(tmp_path, ["root/ssvtp/images_tac/image_0_tac.jpg", "images_rgb/image_0_rgb.jpg"])
     (tmp_path / "root" / "real").symlink_to(tmp_path / "big" / "real")
-    (tmp_path / "root" / "ssvtp" / "images_rgb").symlink_to(tmp_path / "images_rgb")  # of photographs
+    # of photographs
+    (tmp_path / "root" / "ssvtp" / "images_rgb").symlink_to(tmp_path / "images_rgb")
     for name, folder in (("ycb_slide", "frames"), ("ssvtp", "images_rgb")):
         refused(f"{folder} leads out of", index, name, tmp_path / "root")
     assert not list((tmp_path / "root").glob("*.parquet"))
@@ -57,9 +63,17 @@ EMPTY = "visgel cloth objectfolder_real ycb_slide octopi tacquad tvl ssvtp feel 
     [
         ("visgel", "images/toch/a/frame0000.jpg", "images/touch"),
         ("cloth", "Data/nothing.txt.png", "no frame of cloth that could be used"),
-        ("cloth", "Daten/11/t/gelsight_frame/0000.png", "is ROOT the folder that holds 'Data_ICRA18'"),
+        (
+            "cloth",
+            "Daten/11/t/gelsight_frame/0000.png",
+            "is ROOT the folder that holds 'Data_ICRA18'",
+        ),
         ("objectfolder_real", "tactile/1/0/gelsite/0.png", "gelsight/<n>.png"),
-        ("ycb_slide", "real/mug/dataset_0/frame/frame_0000000.jpg", "is ROOT the folder that holds 'real'"),
+        (
+            "ycb_slide",
+            "real/mug/dataset_0/frame/frame_0000000.jpg",
+            "is ROOT the folder that holds 'real'",
+        ),
         ("octopi", "dataset/apple_0.mov.png", "process_dataset.py"),
         *((name, None, "expected .*is ROOT the folder") for name in EMPTY.split()),
     ],
@@ -77,9 +91,14 @@ def edited(tmp_path, read):
         fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])
         out = tmp_path / f"hand{ending}"
         table = read("recordings", out=out, sensor="digit", val=0, test=0).manifest
-        split = ["test" if path.startswith("mug") else "train" for path in table.column("path").to_pylist()]
+        split = [
+            "test" if path.startswith("mug") else "train"
+            for path in table.column("path").to_pylist()
+        ]
         material = [None, *["clay"] * 5]
-        manifests.write(replace_column(replace_column(table, "split", split), "label.material", material), out)
+        manifests.write(
+            replace_column(replace_column(table, "split", split), "label.material", material), out
+        )
         return out
 
     return make
@@ -101,7 +120,9 @@ def test_an_edited_manifest_is_not_replaced_without_keep(tmp_path, read, edited,
     tested = {path for path, row in rows.items() if row["split"] == "test"}
     assert tested == {*(f"mug/{n}.png" for n in range(4)), "mug/more/0.png"}
     assert sum(row["label.material"] == "clay" for row in rows.values()) == 4 and len(rows) == 8
-    assert rows["mug/3.png"]["label.material"] is None and "kept from hand" in " ".join(report.notes)
+    assert rows["mug/3.png"]["label.material"] is None and "kept from hand" in " ".join(
+        report.notes
+    )
 
 
 def test_what_index_wrote_itself_is_replaced(tmp_path, read):
@@ -111,5 +132,14 @@ def test_what_index_wrote_itself_is_replaced(tmp_path, read):
         (tmp_path / "ball" / "2.png").unlink(missing_ok=True)
         fill(tmp_path, ["cup/0.png"])
         assert "cup/0.png" in read("recordings", out=out, sensor="digit", val=0, test=0).rows
-    assert set(read("recordings", out=out, sensor="digit", val=0, test=1)["split"]) == {"test"}  # Parquet tells
-    refused("other values of split", read, "recordings", out=tmp_path / "a.csv", sensor="digit", val=0, test=1)
+    # Parquet tells
+    assert set(read("recordings", out=out, sensor="digit", val=0, test=1)["split"]) == {"test"}
+    refused(
+        "other values of split",
+        read,
+        "recordings",
+        out=tmp_path / "a.csv",
+        sensor="digit",
+        val=0,
+        test=1,
+    )

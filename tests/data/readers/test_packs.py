@@ -16,7 +16,10 @@ def test_real_touch_is_checked_and_rewritten(tmp_path, read):
     assert len(table.rows) == 2
     assert table.rows["a/1.png"]["label.slip"] == 1
     assert table.rows["a/1.png"]["background_path"] == "a/bg.png"
-    lost = {"file of the manifest that is not on disk": 1, "image_path that is not on disk (kept without)": 2}
+    lost = {
+        "file of the manifest that is not on disk": 1,
+        "image_path that is not on disk (kept without)": 2,
+    }
     assert table.reasons == lost
     refused("the pack's own manifest", index, "real_touch", tmp_path, tmp_path / "manifest.csv")
     (tmp_path / "manifest.csv").write_text(head + lines[0] + lines[0])
@@ -26,7 +29,8 @@ def test_real_touch_is_checked_and_rewritten(tmp_path, read):
 def test_taxim_presses_become_pictures(tmp_path, read):
     calib = tmp_path / "calib"
     images = np.zeros((5, 6, 8, 3), np.uint8)
-    images[:, :, :, 0] = np.arange(5, dtype=np.uint8)[:, None, None]  # blue: the pack is BGR
+    # blue: the pack is BGR
+    images[:, :, :, 0] = np.arange(5, dtype=np.uint8)[:, None, None]
     (calib / "gelsight").mkdir(parents=True)
     place = {"touch_center": np.ones((5, 2)), "touch_radius": np.arange(5)}
     np.savez(calib / "gelsight/dataPack.npz", f0=images[0], imgs=images, **place)

@@ -5,7 +5,14 @@ from refused import refused
 
 
 def test_ycb_slide_clips_take_every_third_frame(tmp_path, read):
-    fill(tmp_path, [f"real/035_power_drill/dataset_{k}/frames/frame_{i:07d}.jpg" for k in (0, 4) for i in range(10)])
+    fill(
+        tmp_path,
+        [
+            f"real/035_power_drill/dataset_{k}/frames/frame_{i:07d}.jpg"
+            for k in (0, 4)
+            for i in range(10)
+        ],
+    )
     fill(tmp_path, ["real/035_power_drill/dataset_0/webcam_frames/frame_0000000.jpg"])
     table = read("ycb_slide")
     assert set(table["stride"]) == {3}
@@ -17,7 +24,10 @@ def test_ycb_slide_clips_take_every_third_frame(tmp_path, read):
 
 def _visgel(root, names=("a/rec_0", "a/rec_1", "größe 3/rec 2"), frames=5, place="images"):
     for kind in ("touch", "vision"):
-        fill(root, [f"{place}/{kind}/{name}/frame{i:04d}.jpg" for name in names for i in range(frames)])
+        fill(
+            root,
+            [f"{place}/{kind}/{name}/frame{i:04d}.jpg" for name in names for i in range(frames)],
+        )
 
 
 def test_visgel_pairs_photographs_and_takes_frame_0_as_background(tmp_path, read):
@@ -29,7 +39,8 @@ def test_visgel_pairs_photographs_and_takes_frame_0_as_background(tmp_path, read
     assert row["background_path"] == "images/touch/größe 3/rec 2/frame0000.jpg"
     assert (row["sensor"], row["frame_index"]) == ("gelsight", 2)
     assert len(table.clips(3)) == 9
-    assert table.clips(4)[0] == [f"images/touch/a/rec_0/frame{i:04d}.jpg" for i in range(4)]  # all four with folder
+    # all four with folder
+    assert table.clips(4)[0] == [f"images/touch/a/rec_0/frame{i:04d}.jpg" for i in range(4)]
 
 
 def test_visgel_contact_list_and_missing_files(tmp_path, read):
@@ -42,7 +53,8 @@ def test_visgel_contact_list_and_missing_files(tmp_path, read):
     assert table.report.splits == {"train": 2, "unused": 12}
     assert [row["frame_index"] for row in table.rows.values() if row["label.contact"]] == [3, 4]
     assert table.rows["images/touch/a/rec_0/frame0003.jpg"]["image_path"] is None
-    assert table.rows["images/touch/a/rec_1/frame0001.jpg"]["background_path"] is None  # frame 0 is not there
+    # frame 0 is not there
+    assert table.rows["images/touch/a/rec_1/frame0001.jpg"]["background_path"] is None
     assert table.reasons["listed contact frame that is not on disk"] == 1
     assert table.reasons["photograph missing (kept without)"] == 1
 
@@ -57,12 +69,21 @@ def test_visgel_unseen_objects_are_test(tmp_path, read):
 
 def test_cloth_has_its_properties(tmp_path, read):
     base = "Data_ICRA18/Data"
-    fill(tmp_path, [f"{base}/{cloth}/t{k}/gelsight_frame/{i:04d}.png" for cloth in (11, 12) for k in (0, 1)
-                    for i in range(4)])  # fmt: skip
+    fill(
+        tmp_path,
+        [
+            f"{base}/{cloth}/t{k}/gelsight_frame/{i:04d}.png"
+            for cloth in (11, 12)
+            for k in (0, 1)
+            for i in range(4)
+        ],
+    )
     fill(tmp_path, [f"{base}/13/t0/gsframes/frame{i:06d}.jpg" for i in range(1, 4)])
     (tmp_path / base / "13/t1").mkdir()
     (tmp_path / base / "13/t1/GelSight_video.mp4").write_bytes(b"x")
-    (tmp_path / "Data_ICRA18/cloth_metadata.json").write_text(json.dumps({"11": list(range(11)), "12": [0] * 11}))
+    (tmp_path / "Data_ICRA18/cloth_metadata.json").write_text(
+        json.dumps({"11": list(range(11)), "12": [0] * 11})
+    )
     table = read("cloth")
     assert len(table.rows) == 19
     row = table.rows[f"{base}/11/t1/gelsight_frame/0003.png"]
@@ -77,7 +98,12 @@ def test_cloth_has_its_properties(tmp_path, read):
 
 def test_octopi_follows_its_sample_files(tmp_path, read):
     frames = (0, 1, 2, 7, 8)
-    samples = ("physiclear_apple_0", "physiclear_apple_1", "physiclear_tea_towel_0", "physiclear_rest_0")
+    samples = (
+        "physiclear_apple_0",
+        "physiclear_apple_1",
+        "physiclear_tea_towel_0",
+        "physiclear_rest_0",
+    )
     fill(tmp_path, [f"processed/{name}/{i:010d}.jpg" for name in samples for i in frames])
     for split, name in zip(("train", "val", "test"), samples, strict=False):
         (tmp_path / f"processed/{split}_samples.json").write_text(
@@ -88,7 +114,8 @@ def test_octopi_follows_its_sample_files(tmp_path, read):
     assert table.report.splits == {"train": 5, "val": 5, "test": 5, "unused": 5}
     row = table.rows[f"processed/{samples[2]}/{7:010d}.jpg"]
     assert (row["split"], row["object"], row["sensor"]) == ("test", "tea_towel", "gelsight_mini")
-    assert len(table.clips(3)) == 4  # frames with gaps: only 0, 1, 2 of each sample
+    # frames with gaps: only 0, 1, 2 of each sample
+    assert len(table.clips(3)) == 4
     (tmp_path / "processed/val_samples.json").write_text(json.dumps({"x": [samples[0]]}))
     refused(f"{samples[0]} is in train and in val", read, "octopi")
 

@@ -6,12 +6,16 @@ from anytouch_jax.errors import UserError
 SENSORS = ("gelsight", "digit", "duragel")
 
 
-def _tree(root, subset="indoor", items=("apple", "tea towel"), frames=10, photos=5, windows="3,6,2,9,0,4"):
+def _tree(
+    root, subset="indoor", items=("apple", "tea towel"), frames=10, photos=5, windows="3,6,2,9,0,4"
+):
     for item in items:
         for sensor in SENSORS:
             fill(root, [f"data_{subset}/{item}/{sensor}/{i}.png" for i in range(frames)])
             fill(root, [f"data_{subset}/{item}/img_{sensor}/{i}.png" for i in range(photos)])
-    (root / f"contact_{subset}.csv").write_text("".join(f"{item},{windows}\n" for item in items), encoding="utf-8-sig")
+    (root / f"contact_{subset}.csv").write_text(
+        "".join(f"{item},{windows}\n" for item in items), encoding="utf-8-sig"
+    )
 
 
 def test_contact_windows_pairs_photographs_and_captions(tmp_path, read):
@@ -21,15 +25,26 @@ def test_contact_windows_pairs_photographs_and_captions(tmp_path, read):
     assert table.report.splits == {"train": 2 * (4 + 8 + 5), "background": 2 * (6 + 2 + 5)}
     row = table.rows["data_indoor/tea towel/gelsight/6.png"]
     assert (row["split"], row["label.contact"], row["touch"]) == ("train", 1, "indoor/tea towel")
-    assert row["image_path"] == "data_indoor/tea towel/img_gelsight/3.png"  # 6 / 10 of 5 photographs
+    # 6 / 10 of 5 photographs
+    assert row["image_path"] == "data_indoor/tea towel/img_gelsight/3.png"
     assert row["background_path"] == "data_indoor/tea towel/gelsight/0.png"
     assert row["caption_id"] == "tacquad_indoor_1"
     free = table.rows["data_indoor/tea towel/gelsight/7.png"]
     assert (free["split"], free["label.contact"]) == ("background", 0)
-    assert table.rows["data_indoor/apple/duragel/1.png"]["background_path"] is None  # contact from frame 0 on
+    # contact from frame 0 on
+    assert table.rows["data_indoor/apple/duragel/1.png"]["background_path"] is None
     touches = {row["sensor"] for row in table.rows.values() if row["touch"] == "indoor/apple"}
     assert touches == {"gelsight_mini", "digit", "duragel"}
-    assert len([c for c in table.clips(3) if "/digit/" in c[0] and table.rows[c[0]]["split"] == "train"]) == 2 * 6
+    assert (
+        len(
+            [
+                c
+                for c in table.clips(3)
+                if "/digit/" in c[0] and table.rows[c[0]]["split"] == "train"
+            ]
+        )
+        == 2 * 6
+    )
 
 
 @pytest.mark.parametrize("numbers", [range(0, 20, 2), [*range(4), *range(8, 12)]])
@@ -76,12 +91,18 @@ def test_the_wrong_name_in_the_list_is_mended_and_noted(tmp_path, read):
     (tmp_path / "data_indoor/yumaoqiu").rename(tmp_path / "data_indoor/shuttlecock")
     table = read("tacquad", val=0, test=0)
     row = table.rows["data_indoor/shuttlecock/digit/4.png"]
-    assert (row["object"], row["label.contact"], row["caption_id"]) == ("shuttlecock", 1, "tacquad_indoor_1")
+    assert (row["object"], row["label.contact"], row["caption_id"]) == (
+        "shuttlecock",
+        1,
+        "tacquad_indoor_1",
+    )
     assert any("shuttlecock" in note and "yumaoqiu" in note for note in table.report.notes)
     assert not any("list" in reason or "contact_indoor" in reason for reason in table.reasons)
 
 
-@pytest.mark.parametrize("line", ["apple,1,2,3,4,5,x", "tea towel,0,1,0,1,0,1\ntea towel,0,1,0,1,0,1", None])
+@pytest.mark.parametrize(
+    "line", ["apple,1,2,3,4,5,x", "tea towel,0,1,0,1,0,1\ntea towel,0,1,0,1,0,1", None]
+)
 def test_a_broken_or_missing_list_is_an_error(tmp_path, read, line):
     _tree(tmp_path)
     (tmp_path / "contact_indoor.csv").unlink()

@@ -32,10 +32,15 @@ def test_lists_labels_photographs_and_backgrounds(tmp_path, read):
     assert table.report.splits == {"train": 6, "test": 5}
     row = _at(table, 16)
     assert row["image_path"] == f"dataset/{VIDEO}/video_frame/{16:010d}.jpg"
-    assert row["background_path"] == f"dataset/{VIDEO}/gelsight_frame/{10:010d}.jpg"  # 4 before the touch at 14
+    # 4 before the touch at 14
+    assert row["background_path"] == f"dataset/{VIDEO}/gelsight_frame/{10:010d}.jpg"
     assert (row["label.material"], row["label.hardness"], row["label.contact"]) == (3, "hard", 1)
     test = _at(table, 24)
-    assert (test["label.material"], test["label.hardness"], test["downstream_test"]) == (7, "soft", "material")
+    assert (test["label.material"], test["label.hardness"], test["downstream_test"]) == (
+        7,
+        "soft",
+        "material",
+    )
     assert row["downstream_test"] is None
     assert table.reasons["frame in no list (no contact)"] == 30 - 11
     assert {row["sequence"] for row in table.rows.values()} == {f"{VIDEO}/14", f"{VIDEO}/24"}
@@ -50,7 +55,8 @@ def test_label_txt_adds_contact_frames_without_a_label(tmp_path, read):
     table = read("touch_and_go")
     assert len(table.rows) == 6 + 5 + 2 + 1
     assert (_at(table, 20)["split"], _at(table, 20)["label.material"]) == ("train", None)
-    assert _at(table, 20)["sequence"] != _at(table, 14)["sequence"]  # not a frame of a listed touch
+    # not a frame of a listed touch
+    assert _at(table, 20)["sequence"] != _at(table, 14)["sequence"]
 
 
 def test_minus_one_is_no_label_and_background_lists_and_windows_line_ends_are_read(tmp_path, read):
@@ -68,7 +74,8 @@ def test_the_task_decides_the_split_and_the_other_test_is_marked(tmp_path, read)
     _both(tmp_path)
     _list(tmp_path, "train_rough.txt", [(24, 0), (25, 0)])
     _list(tmp_path, "test_rough.txt", [(16, 1), (17, 1)])
-    material, rough = read("touch_and_go"), read("touch_and_go", task="rough")
+    material = read("touch_and_go")
+    rough = read("touch_and_go", task="rough")
     assert (_at(material, 16)["split"], _at(material, 16)["downstream_test"]) == ("train", "rough")
     assert (_at(rough, 16)["split"], _at(rough, 16)["label.rough"]) == ("test", 1)
     assert _at(rough, 24)["split"] == "train"
@@ -95,14 +102,20 @@ def test_what_is_missing_is_counted(tmp_path, read):
 
 
 def test_lists_may_be_elsewhere(tmp_path, read):
-    root, lists = tmp_path / "daten für touch", tmp_path / "lists"
+    root = tmp_path / "daten für touch"
+    lists = tmp_path / "lists"
     lists.mkdir()
     _tree(root)
     _list(lists, "train.txt", [(14, 3)])
     _list(lists, "test.txt", [(20, 3)])
     assert len(read("touch_and_go", root, lists=lists).rows) == 2
     refused(r"expected the list train.txt in .*fredfyyang/Touch-and-Go", read, "touch_and_go", root)
-    refused(r"expected dataset/.*is ROOT the folder that holds 'dataset'", read, "touch_and_go", root / "dataset")
+    refused(
+        r"expected dataset/.*is ROOT the folder that holds 'dataset'",
+        read,
+        "touch_and_go",
+        root / "dataset",
+    )
 
 
 @pytest.mark.parametrize(
@@ -125,5 +138,10 @@ def test_frames_of_a_touch_that_is_tested_are_not_trained_on(tmp_path, read):
     _list(tmp_path, "label.txt", [(i, 3) for i in range(14, 32)])
     table = read("touch_and_go")
     assert {i: _at(table, i)["split"] for i in (14, 23, 24, 28, 29, 31)} == {
-        14: "train", 23: "unused", 24: "test", 28: "test", 29: "unused", 31: "unused",
-    }  # fmt: skip
+        14: "train",
+        23: "unused",
+        24: "test",
+        28: "test",
+        29: "unused",
+        31: "unused",
+    }

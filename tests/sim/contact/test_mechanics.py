@@ -42,9 +42,12 @@ def ball(pitch, radius=8.0, at=(0.0, 0.0)):
 def rough(pitch, seed=0, spread=0.03):
     x, y = grid(pitch)
     rng = np.random.default_rng(seed)
-    waves, turns, phases = rng.uniform(1.2, 2.6, 80), rng.uniform(0, 2 * np.pi, 80), rng.uniform(0, 2 * np.pi, 80)
+    waves = rng.uniform(1.2, 2.6, 80)
+    turns = rng.uniform(0, 2 * np.pi, 80)
+    phases = rng.uniform(0, 2 * np.pi, 80)
     field = sum(
-        np.cos(k * (x * np.cos(a) + y * np.sin(a)) / pitch + b) for k, a, b in zip(waves, turns, phases, strict=True)
+        np.cos(k * (x * np.cos(a) + y * np.sin(a)) / pitch + b)
+        for k, a, b in zip(waves, turns, phases, strict=True)
     )
     return (field - field.max()) / np.sqrt(40) * spread
 
@@ -56,20 +59,27 @@ def test_hertz_sphere(depth):
     a = np.sqrt(radius * depth)
     pitch = 3.2 * a / N
     outcome = solved(ball(pitch, radius), depth, pitch)
-    assert outcome.force == pytest.approx(4 / 3 * PLANE * np.sqrt(radius) * depth**1.5 * 1e-3, rel=0.01)
+    assert outcome.force == pytest.approx(
+        4 / 3 * PLANE * np.sqrt(radius) * depth**1.5 * 1e-3, rel=0.01
+    )
     assert np.sqrt(mechanics.area(outcome.pressure, pitch) / np.pi) == pytest.approx(a, rel=0.01)
-    assert outcome.pressure.max() == pytest.approx(2 * PLANE * np.sqrt(depth / radius) / np.pi, rel=0.01)
+    assert outcome.pressure.max() == pytest.approx(
+        2 * PLANE * np.sqrt(depth / radius) / np.pi, rel=0.01
+    )
     assert outcome.displacement.max() == pytest.approx(depth, rel=2e-3)
     x, y = grid(pitch)
     far = np.hypot(x, y) > 1.2 * a
     r = np.hypot(x, y)[far] / a
-    outside = depth / np.pi * ((2 - r**2) * np.arcsin(1 / r) + np.sqrt(r**2 - 1))  # Johnson 3.42a
+    # Johnson 3.42a
+    outside = depth / np.pi * ((2 - r**2) * np.arcsin(1 / r) + np.sqrt(r**2 - 1))
     np.testing.assert_allclose(outcome.displacement[far], outside, rtol=0.01)
 
 
 def test_flat_punch():
     """F = 2 a E* d; the pressure at the centre is E* d / (pi a)."""
-    radius, pitch, depth = 2.4, 0.1, 0.2
+    radius = 2.4
+    pitch = 0.1
+    depth = 0.2
     x, y = grid(pitch)
     inside = np.hypot(x, y) <= radius
     outcome = solved(np.where(inside, 0.0, -INF), depth, pitch)
@@ -85,10 +95,16 @@ def test_force_is_the_slope_of_the_energy(shape):
     """The sum of the pressure against the load that does the work: dU / dd, U = half of pressure times motion."""
     pitch = 0.1
     surface = ball(pitch) if shape == "ball" else rough(pitch)
-    depths, energies = (0.28, 0.3, 0.32), []
+    depths = (0.28, 0.3, 0.32)
+    energies = []
     for depth in depths:
         outcome = solved(surface, depth, pitch)
-        energies.append(0.5 * np.sum(outcome.pressure * outcome.displacement, dtype=np.float64) * pitch**2 * 1e-3)
+        energies.append(
+            0.5
+            * np.sum(outcome.pressure * outcome.displacement, dtype=np.float64)
+            * pitch**2
+            * 1e-3
+        )
     work = (energies[2] - energies[0]) / (depths[2] - depths[0])
     assert work == pytest.approx(solved(surface, 0.3, pitch).force, rel=2e-3)
 
@@ -112,7 +128,9 @@ def test_moves_and_turns_with_the_object(solve):
     moved = solve(jnp.asarray(other, jnp.float32), 0.2, pitch)
     np.testing.assert_allclose(turned.displacement, np.rot90(first.displacement), atol=1e-5)
     inner = np.asarray(moved.displacement)[: N - 4, 8:]
-    np.testing.assert_allclose(inner, np.asarray(first.displacement)[4:, : N - 8], atol=2e-4 if solve is fast else 1e-5)
+    np.testing.assert_allclose(
+        inner, np.asarray(first.displacement)[4:, : N - 8], atol=2e-4 if solve is fast else 1e-5
+    )
     assert moved.force == pytest.approx(float(first.force), rel=1e-3)
 
 
@@ -153,7 +171,8 @@ def test_hard_cases_converge_and_stay_finite(shape, depth):
     for result in (outcome, fast(surface, depth, 0.1)):
         assert all(np.isfinite(np.asarray(field)).all() for field in result)
         assert (np.asarray(result.pressure) >= 0).all()
-        highest = max(float(jnp.max(jnp.where(jnp.isfinite(surface), surface, -1))) + depth, 0)  # apex between pixels
+        # apex between pixels
+        highest = max(float(jnp.max(jnp.where(jnp.isfinite(surface), surface, -1))) + depth, 0)
         assert np.asarray(result.displacement).max() <= highest * 1.35 + 1e-12
         assert (float(result.force) > 0) == (highest > 0)
 
@@ -169,51 +188,69 @@ def test_double_precision_in_double_precision_out():
 
 
 def test_on_a_bonded_layer_an_elastic_object_moves_as_a_half_space_and_the_gel_as_a_layer():
-    pitch, soft, gel = 0.25, PLANE / 3, Gel(thickness=2.0)
+    pitch = 0.25
+    soft = PLANE / 3
+    gel = Gel(thickness=2.0)
     surface = jnp.asarray(ball(pitch), jnp.float32)
     outcome = press(surface, 0.6, gel, pitch, modulus_object=soft, tolerance=1e-5)
     plan = Plan(N, N)
 
     def moves(thickness, modulus):
         spectrum = elastic.normal_spectrum(plan, pitch, gel.poisson, thickness, 1.0, jnp.float32)
-        return np.asarray(plan.inverse(plan.even(plan.forward(outcome.pressure * (pitch / modulus)), spectrum)))
+        return np.asarray(
+            plan.inverse(plan.even(plan.forward(outcome.pressure * (pitch / modulus)), spectrum))
+        )
 
-    layer, object_ = moves(2.0, PLANE), moves(INF, soft)
+    layer = moves(2.0, PLANE)
+    object_ = moves(INF, soft)
     np.testing.assert_allclose(outcome.displacement, layer, atol=2e-4)
     touching = np.asarray(outcome.pressure) > 0
-    np.testing.assert_allclose((layer + object_)[touching], (np.asarray(surface) + 0.6)[touching], atol=1e-3)
-    assert abs(outcome.displacement[N // 2, 2]) < 0.02 * np.max(outcome.displacement)  # no dent like 1 / r far away
+    np.testing.assert_allclose(
+        (layer + object_)[touching], (np.asarray(surface) + 0.6)[touching], atol=1e-3
+    )
+    # no dent like 1 / r far away
+    assert abs(outcome.displacement[N // 2, 2]) < 0.02 * np.max(outcome.displacement)
     quick = press(surface, 0.6, gel, pitch, fidelity="fast", modulus_object=soft).displacement
     assert np.sqrt(np.mean((quick - layer) ** 2)) < 0.02 * layer.max()
 
 
 @pytest.mark.parametrize(
-    ("surface", "rms", "force"), [(ball(0.1), 2e-3, 0.01), (rough(0.1), 0.03, 0.05), (square(0.1), 0.01, 0.02)]
+    ("surface", "rms", "force"),
+    [(ball(0.1), 2e-3, 0.01), (rough(0.1), 0.03, 0.05), (square(0.1), 0.01, 0.02)],
 )
 def test_fast_is_near_exact(surface, rms, force):
-    right, quick = solved(surface, 0.3, 0.1), fast(jnp.asarray(surface, jnp.float32), 0.3, 0.1)
+    right = solved(surface, 0.3, 0.1)
+    quick = fast(jnp.asarray(surface, jnp.float32), 0.3, 0.1)
     error = np.asarray(quick.displacement) - right.displacement
     assert np.sqrt(np.mean(error**2)) < rms * right.displacement.max()
     assert float(quick.force) == pytest.approx(right.force, rel=force)
-    assert (np.asarray(quick.displacement) >= surface + 0.3 - 1e-6).all()  # the gel is never inside the object
+    # the gel is never inside the object
+    assert (np.asarray(quick.displacement) >= surface + 0.3 - 1e-6).all()
     area = (right.pressure > 0).sum()
-    assert abs((np.asarray(quick.pressure) > 0).sum() - area) < 0.6 * area + 1  # unsharpened: every pixel
+    # unsharpened: every pixel
+    assert abs((np.asarray(quick.pressure) > 0).sum() - area) < 0.6 * area + 1
     assert np.linalg.norm(quick.pressure - right.pressure) < 0.35 * np.linalg.norm(right.pressure)
 
 
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ({"depth": -0.1}, "depth"), ({"pitch": float("inf")}, "pitch"), ({"surface": np.full((8, 8), np.nan)}, "NaN"),
-        ({"surface": np.zeros((2, 8, 8))}, "vmap"), ({"fidelity": "exactly"}, "fidelity"),
+        ({"depth": -0.1}, "depth"),
+        ({"pitch": float("inf")}, "pitch"),
+        ({"surface": np.full((8, 8), np.nan)}, "NaN"),
+        ({"surface": np.zeros((2, 8, 8))}, "vmap"),
+        ({"fidelity": "exactly"}, "fidelity"),
         ({"modulus_object": 0.0}, "modulus_object must be above 0"),
         ({"gel": Gel(modulus=float("nan"))}, "modulus must be above 0"),
         ({"gel": Gel(thickness=0.0)}, "thickness must be above 0"),
         ({"gel": Gel(poisson=1.0)}, "Poisson ratio is 0 to 0.5"),
         ({"gel": Gel(thickness=0.09)}, "too thin for this grid: 0.1 mm is the least"),
-        ({"gel": Gel(thickness=0.25), "fidelity": "fast"}, "too thin for this grid: 0.3 mm is the least"),
+        (
+            {"gel": Gel(thickness=0.25), "fidelity": "fast"},
+            "too thin for this grid: 0.3 mm is the least",
+        ),
     ],
-)  # fmt: skip
+)
 def test_mistakes_are_named(change, word):
     with pytest.raises(UserError, match=word):
         press(**{"surface": np.zeros((64, 64)), "depth": 0.05, "gel": Gel(), "pitch": 0.1} | change)

@@ -7,12 +7,15 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.mechanics import Gel, PressResult, press, sideways
 from anytouch_jax.sim.contact.shear import at_rest, shear_step
 
-N, MU = 48, 0.5
-POISSON, MODULUS = 0.4, 150.0
+N = 48
+MU = 0.5
+POISSON = 0.4
+MODULUS = 150.0
 GEL = Gel(MODULUS, POISSON)
 SHEAR = MODULUS / (2 * (1 + POISSON))
 STIFFNESS = SHEAR / (2 - POISSON)  # G* of a rigid object, Johnson 7.43
-RADIUS, DEPTH = 8.0, 0.5
+RADIUS = 8.0
+DEPTH = 0.5
 A = np.sqrt(RADIUS * DEPTH)
 PITCH = 2.6 * A / N
 POSITION = (np.arange(N) - (N - 1) / 2) * PITCH
@@ -46,7 +49,8 @@ def fast(state, contact, motion, friction=MU):
 
 
 def walk(step, motions, contacts=None, friction=MU):
-    state, states = at_rest((N, N)), []
+    state = at_rest((N, N))
+    states = []
     for number, motion in enumerate(motions):
         contact = CONTACT if contacts is None else contacts[number]
         state = step(state, contact, jnp.asarray(motion, jnp.float32), friction)
@@ -72,7 +76,9 @@ def test_mindlin_force_and_stick_circle():
         assert state.converged
         assert state.force[0] == pytest.approx(MU * LOAD * mindlin(share), rel=0.01)
         assert abs(state.force[1]) < 1e-5 * MU * LOAD and abs(state.twist_torque) < 1e-5 * LOAD
-        stick = np.sqrt(((np.asarray(CONTACT.pressure) > 0) & ~state.slipping).sum() * PITCH**2 / np.pi)
+        stick = np.sqrt(
+            ((np.asarray(CONTACT.pressure) > 0) & ~state.slipping).sum() * PITCH**2 / np.pi
+        )
         assert stick == pytest.approx(A * np.sqrt(1 - share), abs=0.05 * A)
         within_coulomb(state, CONTACT)
     assert states[-1].slip_fraction == 1
@@ -94,7 +100,8 @@ def test_a_sticking_circle_has_mindlins_stiffness():
     a = np.sqrt(inside.sum() * PITCH**2 / np.pi)
     punch = PressResult(jnp.asarray(inside, jnp.float32), jnp.zeros((N, N)), 1.0, True, 0, 0.0)
     pushed, turned = (
-        exact(at_rest((N, N)), punch, jnp.array(motion), 1e6) for motion in ((0.1, 0.0, 0.0), (0.0, 0.0, 0.1))
+        exact(at_rest((N, N)), punch, jnp.array(motion), 1e6)
+        for motion in ((0.1, 0.0, 0.0), (0.0, 0.0, 0.1))
     )
     assert float(pushed.force[0]) == pytest.approx(8 * a * STIFFNESS * 0.1 * 1e-3, rel=0.02)
     assert float(turned.twist_torque) == pytest.approx(16 / 3 * SHEAR * a**3 * 0.1 * 1e-3, rel=0.03)
@@ -108,7 +115,8 @@ def test_a_slowly_turning_contact_slips_from_its_rim():
     assert 0 < states[0].slip_fraction < 0.4
     rim = (R > 0.97 * A) & (np.asarray(CONTACT.pressure) > 0)
     assert states[0].slipping[rim].all() and not states[0].slipping[R < 0.5 * A].any()
-    assert states[-1].twist_torque == pytest.approx(3 * np.pi / 16 * MU * LOAD * A, rel=0.01)  # Lubkin 1951
+    # Lubkin 1951
+    assert states[-1].twist_torque == pytest.approx(3 * np.pi / 16 * MU * LOAD * A, rel=0.01)
     assert np.abs(states[-1].force).max() < 1e-5 * LOAD
     turning = X * states[1].traction[..., 1] - Y * states[1].traction[..., 0]
     assert (turning >= -1e-4).all()
@@ -117,9 +125,13 @@ def test_a_slowly_turning_contact_slips_from_its_rim():
 @pytest.mark.parametrize("step", [exact, fast])
 def test_turns_with_the_motion(step):
     """A quarter turn, x to y, of the motion turns the tractions; pushing back reverses them."""
-    first, second, back = (walk(step, [motion])[0] for motion in ((0.1, 0, 0), (0, 0.1, 0), (-0.1, 0, 0)))
+    first, second, back = (
+        walk(step, [motion])[0] for motion in ((0.1, 0, 0), (0, 0.1, 0), (-0.1, 0, 0))
+    )
     np.testing.assert_allclose(second.traction[..., 1], np.rot90(first.traction[..., 0]), atol=0.02)
-    np.testing.assert_allclose(second.traction[..., 0], -np.rot90(first.traction[..., 1]), atol=0.02)
+    np.testing.assert_allclose(
+        second.traction[..., 0], -np.rot90(first.traction[..., 1]), atol=0.02
+    )
     np.testing.assert_allclose(back.traction, -first.traction, atol=1e-4)
 
 
@@ -150,7 +162,9 @@ def test_tiny_and_huge_motions(size):
         state = walk(step, [(size, 0, 0)])[0]
         assert all(np.isfinite(field).all() for field in state)
         linear = 8 * A * STIFFNESS * size * 1e-3
-        assert state.force[0] == pytest.approx(min(linear, MU * LOAD), rel=0.1 if step is fast else 0.02)
+        assert state.force[0] == pytest.approx(
+            min(linear, MU * LOAD), rel=0.1 if step is fast else 0.02
+        )
 
 
 def test_fast_is_near_exact_on_a_path():
@@ -168,14 +182,18 @@ def test_scan_and_batch_equal_steps():
     both = [CONTACT, hertz(0.3)]
 
     def path(contact, motions):
-        return jax.lax.scan(lambda state, motion: (fast(state, contact, motion),) * 2, at_rest((N, N)), motions)[1]
+        return jax.lax.scan(
+            lambda state, motion: (fast(state, contact, motion),) * 2, at_rest((N, N)), motions
+        )[1]
 
     contacts = jax.tree.map(lambda *fields: jnp.stack([jnp.asarray(one) for one in fields]), *both)
     batch = jax.jit(jax.vmap(path))(contacts, jnp.stack([motions, -motions]))
     for row, (contact, sign) in enumerate(zip(both, (1, -1), strict=True)):
         for number, state in enumerate(walk(fast, sign * motions, [contact] * 3)):
             np.testing.assert_allclose(batch.traction[row, number], state.traction, atol=2e-3)
-            np.testing.assert_allclose(batch.displacement[row, number], state.displacement, atol=2e-5)
+            np.testing.assert_allclose(
+                batch.displacement[row, number], state.displacement, atol=2e-5
+            )
 
 
 def test_mistakes_are_named():
@@ -196,21 +214,32 @@ def test_friction_holds_back_what_pressing_squeezes_out(fidelity):
     squeezed = sideways(contact.pressure, layer, PITCH)
     step = jax.jit(
         lambda friction: shear_step(
-            None, contact, (0, 0, 0), layer, PITCH, friction, fidelity=fidelity, squeezed=squeezed, tolerance=3e-4
+            None,
+            contact,
+            (0, 0, 0),
+            layer,
+            PITCH,
+            friction,
+            fidelity=fidelity,
+            squeezed=squeezed,
+            tolerance=3e-4,
         )
     )
     inside = np.asarray(contact.pressure) > 0.05 * float(contact.pressure.max())
     free, partly, held = (step(friction) for friction in (0.0, 0.2, 20.0))
-    moved = [np.linalg.norm(state.displacement + squeezed, axis=-1)[inside] for state in (free, partly, held)]
+    moved = [
+        np.linalg.norm(state.displacement + squeezed, axis=-1)[inside]
+        for state in (free, partly, held)
+    ]
     np.testing.assert_allclose(moved[0], np.linalg.norm(squeezed, axis=-1)[inside], atol=1e-6)
-    assert (
-        moved[2].max() < (0.02 if fidelity == "exact" else 0.3) * moved[0].max()
-    )  # it moves with the object: not at all
+    # it moves with the object: not at all
+    assert moved[2].max() < (0.02 if fidelity == "exact" else 0.3) * moved[0].max()
     assert moved[2].mean() < moved[1].mean() < moved[0].mean()
     assert held.slip_fraction < 0.05 < partly.slip_fraction < 1
     within_coulomb(jax.tree.map(np.asarray, partly), contact, 0.2)
     inward = (partly.traction * jnp.asarray(np.stack([X, Y], -1))).sum(-1)
-    assert np.asarray(inward)[inside].max() < 1e-3  # the object pulls toward the middle
+    # the object pulls toward the middle
+    assert np.asarray(inward)[inside].max() < 1e-3
     assert np.abs(partly.force).max() < 1e-3 * float(contact.force)
 
 
@@ -224,9 +253,17 @@ def dragged():
             contact = press(surface, now[3], gel, 0.3, fidelity="fast", modulus_object=1e6)
             squeezed = sideways(contact.pressure, gel, 0.3, fidelity="fast", coarse=True)
             state = shear_step(
-                start._replace(traction=before[0]), contact, now[:3], gel, 0.3, friction, fidelity="fast",
-                modulus_object=1e6, squeezed=squeezed - before[1], coarse=True,
-            )  # fmt: skip
+                start._replace(traction=before[0]),
+                contact,
+                now[:3],
+                gel,
+                0.3,
+                friction,
+                fidelity="fast",
+                modulus_object=1e6,
+                squeezed=squeezed - before[1],
+                coarse=True,
+            )
             return (state.traction, squeezed), (state.force[0], state.twist_torque)
 
         start = at_rest((N, N))
@@ -255,8 +292,11 @@ def test_gradients_through_frames_are_finite(dragged, surface, friction):
 
 
 def test_the_gradient_through_frames_is_that_of_finite_differences(dragged):
-    frames, surface = jnp.asarray(SLIDE, jnp.float32), jnp.asarray(BALL, jnp.float32)
+    frames = jnp.asarray(SLIDE, jnp.float32)
+    surface = jnp.asarray(BALL, jnp.float32)
     slope = dragged(frames, surface, jnp.float32(0.6))[1][0]
     for at in ((0, 0), (1, 0), (2, 0), (2, 2), (2, 3)):
-        ends = [dragged(frames.at[at].add(step), surface, jnp.float32(0.6))[0] for step in (0.01, -0.01)]
+        ends = [
+            dragged(frames.at[at].add(step), surface, jnp.float32(0.6))[0] for step in (0.01, -0.01)
+        ]
         np.testing.assert_allclose(slope[at], (ends[0] - ends[1]) / 0.02, rtol=0.1, atol=0.02)

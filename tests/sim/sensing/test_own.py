@@ -24,18 +24,36 @@ def folder(tmp_path):
 
 def test_it_is_read_as_it_was_written_and_again_when_it_changes(folder):
     sensor = find_sensor(str(folder))
-    assert (sensor.name, sensor.field, sensor.noise, sensor.markers) == ("mine", (13.5, 18.0), 0.7, DOTS)
+    assert (sensor.name, sensor.field, sensor.noise, sensor.markers) == (
+        "mine",
+        (13.5, 18.0),
+        0.7,
+        DOTS,
+    )
     np.testing.assert_array_equal(look(sensor).normal, look(SENSORS["digit"]).normal)
-    assert bases(sensor)[0, 0, 0, 0] == np.float32(90 / 255) and find_sensor("digit") is SENSORS["digit"]
-    write_sensor(folder, own.read_numbers(folder), np.full((1, 30, 40, 3), 50, np.uint8), look(SENSORS["9dtact"]))
-    assert bases(find_sensor(str(folder)))[0, 0, 0, 0] == np.float32(50 / 255) and "mine" not in SENSORS
+    assert (
+        bases(sensor)[0, 0, 0, 0] == np.float32(90 / 255)
+        and find_sensor("digit") is SENSORS["digit"]
+    )
+    write_sensor(
+        folder,
+        own.read_numbers(folder),
+        np.full((1, 30, 40, 3), 50, np.uint8),
+        look(SENSORS["9dtact"]),
+    )
+    assert (
+        bases(find_sensor(str(folder)))[0, 0, 0, 0] == np.float32(50 / 255)
+        and "mine" not in SENSORS
+    )
 
 
 def test_one_device_varies_less_than_a_product(folder):
     units = [draw_unit(find_sensor(str(folder)), np.random.default_rng(n)) for n in range(40)]
     family = [draw_unit(SENSORS["digit"], np.random.default_rng(n)) for n in range(40)]
     assert all((unit.mirror == 1).all() and unit.zoom > 0.9 and unit.marked for unit in units)
-    assert np.std([unit.gain for unit in units]) < 0.5 * np.std([unit.gain / 1.4 for unit in family])
+    assert np.std([unit.gain for unit in units]) < 0.5 * np.std(
+        [unit.gain / 1.4 for unit in family]
+    )
 
 
 def test_data_sets_and_worlds_take_it(folder):
@@ -51,11 +69,15 @@ def test_data_sets_and_worlds_take_it(folder):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"width_mm": 400}, "width_mm must be 4 to 40 mm"), ({"noise": "much"}, "sensor.noise must be float"),
-        ({"name": "digit"}, "digit is a sensor of the table"), ({"colour": 1}, "no setting called colour"),
-        (None, "is not JSON"), ("no arrays", "look.npz"), ("other arrays", "the array normal is missing"),
+        ({"width_mm": 400}, "width_mm must be 4 to 40 mm"),
+        ({"noise": "much"}, "sensor.noise must be float"),
+        ({"name": "digit"}, "digit is a sensor of the table"),
+        ({"colour": 1}, "no setting called colour"),
+        (None, "is not JSON"),
+        ("no arrays", "look.npz"),
+        ("other arrays", "the array normal is missing"),
     ],
-)  # fmt: skip
+)
 def test_a_damaged_folder_gets_a_sentence(folder, change, named):
     file = folder / own.NUMBERS
     if isinstance(change, dict):

@@ -18,7 +18,11 @@ def test_the_records_are_whole_and_known_to_the_model():
         assert sensor.name == name and hash(sensor) == hash(replace(sensor))
         aspect = sensor.field[0] / sensor.field[1] * sensor.resolution[1] / sensor.resolution[0]
         assert abs(aspect - 1) < 0.02, "square pixels"
-        assert sensor.gel.modulus > 0 and 0 < sensor.gel.thickness < 10 and 0 < sensor.gel.poisson < 0.5
+        assert (
+            sensor.gel.modulus > 0
+            and 0 < sensor.gel.thickness < 10
+            and 0 < sensor.gel.poisson < 0.5
+        )
     assert [s.name for s in SENSORS.values() if s.kind == "field"] == ["tac3d"]
 
 
@@ -41,9 +45,17 @@ def test_a_digit_shades_as_in_real_pictures():
 
     def colour(nx, ny):
         tilts = jnp.full((1, 1), nx), jnp.full((1, 1), ny)
-        return np.array([optics.colour_change(model.normal[..., c], *tilts, middle, middle)[0, 0] for c in range(3)])
+        return np.array(
+            [
+                optics.colour_change(model.normal[..., c], *tilts, middle, middle)[0, 0]
+                for c in range(3)
+            ]
+        )
 
-    up, down, right, left = colour(0, 0.5), colour(0, -0.5), colour(-0.5, 0), colour(0.5, 0)
+    up = colour(0, 0.5)
+    down = colour(0, -0.5)
+    right = colour(-0.5, 0)
+    left = colour(0.5, 0)
     assert up[0] > 0.1 > up[1] > 0 > up[2] and up[0] > up[2] + 0.2
     assert down[2] > down[0] + 0.15 and right[1] > left[1] + 0.1
     assert not colour(0, 0).any()
@@ -52,9 +64,29 @@ def test_a_digit_shades_as_in_real_pictures():
 def test_a_unit_follows_from_the_seed_alone():
     first, again, other = (sensors.draw_unit(DIGIT, np.random.default_rng(s)) for s in (3, 3, 4))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
-    differs = [name for name, a, b in zip(first._fields, first, other, strict=True) if not np.array_equal(a, b)]
-    assert set(differs) >= {"tint", "gain", "uneven", "thickness", "modulus", "zoom", "rotation", "offset", "noise",
-                            "base", "focus", "specks", "grain", "lights", "quality", "marker_pitch"}  # fmt: skip
+    differs = [
+        name
+        for name, a, b in zip(first._fields, first, other, strict=True)
+        if not np.array_equal(a, b)
+    ]
+    assert set(differs) >= {
+        "tint",
+        "gain",
+        "uneven",
+        "thickness",
+        "modulus",
+        "zoom",
+        "rotation",
+        "offset",
+        "noise",
+        "base",
+        "focus",
+        "specks",
+        "grain",
+        "lights",
+        "quality",
+        "marker_pitch",
+    }
     streams = [np.random.default_rng(5) for _ in SENSORS]
     for sensor, stream in zip(SENSORS.values(), streams, strict=True):
         sensors.draw_unit(sensor, stream)
@@ -71,6 +103,10 @@ def test_units_stay_inside_the_field_and_carry_markers_by_share():
         assert set(np.abs(unit.mirror)) == {1}
         assert unit.tint.min() > 0 and unit.modulus > 0 and unit.thickness > 0 and unit.noise > 0
     assert abs(np.mean([u.marked for u in drawn]) - 0.5) < 0.1
-    assert not any(sensors.draw_unit(DIGIT, rng).marked for _ in range(20)), "a DIGIT has no markers"
+    assert not any(sensors.draw_unit(DIGIT, rng).marked for _ in range(20)), (
+        "a DIGIT has no markers"
+    )
     assert all(a.dtype == np.float32 for a in drawn[0])
-    assert np.std([u.base.mean() for u in drawn]) > 0.005, "units are untouched gels of several real ones"
+    assert np.std([u.base.mean() for u in drawn]) > 0.005, (
+        "units are untouched gels of several real ones"
+    )

@@ -5,20 +5,76 @@ import numpy as np
 import pytest
 
 from anytouch_jax.sim.world import objects as captions
-from anytouch_jax.sim.world.objects import MATERIALS, PRIMITIVE_KINDS, caption, catalogue, hardness_of, roughness_of
+from anytouch_jax.sim.world.objects import (
+    MATERIALS,
+    PRIMITIVE_KINDS,
+    caption,
+    catalogue,
+    hardness_of,
+    roughness_of,
+)
 from anytouch_jax.sim.world.shapes import PRIMITIVES
 
 THINGS = catalogue(0, 300)
 # What a caption would give away: kinds of primitive and things, materials, and all about the touch itself.
 SECRET = {
-    *PRIMITIVES, *(kind.noun for kind in PRIMITIVE_KINDS.values()), *MATERIALS,
-    "letters", "bolt", "threaded", "plate", "sheet", "torus", "tip",
-    "indenter", "probe", "sensor", "gel", "newton", "newtons", "millimetre", "mm",
-    "turn", "turned", "clockwise", "left", "right", "up", "down", "upward", "downward", "above", "below",
-    "north", "south", "east", "west", "horizontal", "vertical", "diagonal", "direction", "shear", "motion", "moving",
-    "deep", "deeply", "shallow",
-}  # fmt: skip
-SECRET_STEMS = ("force", "press", "push", "indent", "depth", "slip", "slid", "twist", "rotat", "direction", "horizont")
+    *PRIMITIVES,
+    *(kind.noun for kind in PRIMITIVE_KINDS.values()),
+    *MATERIALS,
+    "letters",
+    "bolt",
+    "threaded",
+    "plate",
+    "sheet",
+    "torus",
+    "tip",
+    "indenter",
+    "probe",
+    "sensor",
+    "gel",
+    "newton",
+    "newtons",
+    "millimetre",
+    "mm",
+    "turn",
+    "turned",
+    "clockwise",
+    "left",
+    "right",
+    "up",
+    "down",
+    "upward",
+    "downward",
+    "above",
+    "below",
+    "north",
+    "south",
+    "east",
+    "west",
+    "horizontal",
+    "vertical",
+    "diagonal",
+    "direction",
+    "shear",
+    "motion",
+    "moving",
+    "deep",
+    "deeply",
+    "shallow",
+}
+SECRET_STEMS = (
+    "force",
+    "press",
+    "push",
+    "indent",
+    "depth",
+    "slip",
+    "slid",
+    "twist",
+    "rotat",
+    "direction",
+    "horizont",
+)
 
 
 def drawn(thing, count, seed=0):
@@ -45,7 +101,11 @@ def test_captions_tell_hardness_roughness_and_texture_rightly():
             wide = thing.shape.texture_pitch >= captions.WIDE
             spacings = captions.SPACING["wide" if wide else "fine"]
             patterns = captions.PATTERN[thing.shape.texture]
-            assert any(re.sub("^an ", "a ", p.format(s=s).lower()) in low for p in patterns for s in spacings), sentence
+            assert any(
+                re.sub("^an ", "a ", p.format(s=s).lower()) in low
+                for p in patterns
+                for s in spacings
+            ), sentence
 
 
 def test_a_caption_does_not_know_the_form():

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from anytouch_jax.sim.world import objects
-from anytouch_jax.sim.world.objects import MATERIALS, catalogue, draw_object, hardness_of, hold_out, roughness_of
+from anytouch_jax.sim.world.objects import (
+    MATERIALS,
+    catalogue,
+    draw_object,
+    hardness_of,
+    hold_out,
+    roughness_of,
+)
 from anytouch_jax.sim.world.shapes import PRIMITIVES, TEXTURES, Shape, height, relief
 
 THINGS = catalogue(0)
@@ -25,7 +32,8 @@ def test_all_kinds_occur_about_as_often(seed):
 
 
 def test_a_texture_does_not_give_the_material_away():
-    textures, materials = defaultdict(set), defaultdict(set)
+    textures = defaultdict(set)
+    materials = defaultdict(set)
     for thing in THINGS:
         assert thing.shape.texture in thing.material.textures
         textures[thing.material.name].add(thing.shape.texture)
@@ -48,7 +56,10 @@ def test_no_two_objects_feel_alike():
     maps = []
     for thing in THINGS:
         z = relief(thing.shape, 48, 0.2)
-        if thing.shape.primitive in ("edge", "corner"):  # over the plate, as their rims alone are alike
+        if thing.shape.primitive in (
+            "edge",
+            "corner",
+        ):  # over the plate, as their rims alone are alike
             x, y = np.meshgrid(np.arange(48) * 0.2 - 10, np.arange(48) * 0.2 - 10)
             z = height(thing.shape, x, y)
         maps.append(np.maximum(z, -1.2))
@@ -61,16 +72,22 @@ def test_no_two_objects_feel_alike():
 
 
 def test_labels_have_three_classes_each_and_follow_the_object():
-    hardness, roughness = Counter(map(hardness_of, THINGS)), Counter(map(roughness_of, THINGS))
+    hardness = Counter(map(hardness_of, THINGS))
+    roughness = Counter(map(roughness_of, THINGS))
     assert set(hardness) == {"soft", "firm", "hard"} and min(hardness.values()) >= 8
     assert set(roughness) == {"smooth", "textured", "rough"} and min(roughness.values()) >= 6
     for thing in THINGS:
         assert (roughness_of(thing) == "smooth") == (thing.shape.texture == "smooth")
     thing = draw_object("sphere", "ridges", "foam", 1)
     deep, shallow = (
-        dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, texture_depth=d)) for d in (0.5, 0.05)
+        dataclasses.replace(thing, shape=dataclasses.replace(thing.shape, texture_depth=d))
+        for d in (0.5, 0.05)
     )
-    assert (roughness_of(deep), roughness_of(shallow), hardness_of(deep)) == ("rough", "textured", "soft")
+    assert (roughness_of(deep), roughness_of(shallow), hardness_of(deep)) == (
+        "rough",
+        "textured",
+        "soft",
+    )
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.35])
@@ -78,11 +95,13 @@ def test_labels_have_three_classes_each_and_follow_the_object():
 def test_whole_pairs_are_held_out(share, seed):
     received, unseen = hold_out(THINGS, share, seed)
     assert sorted((*received, *unseen), key=THINGS.index) == list(THINGS)
-    assert list(received) == sorted(received, key=THINGS.index) and list(unseen) == sorted(unseen, key=THINGS.index)
-    assert not {t.kind for t in received} & {t.kind for t in unseen}
-    assert {t.shape.primitive for t in received} == set(PRIMITIVES) and {t.shape.texture for t in received} == set(
-        TEXTURES
+    assert list(received) == sorted(received, key=THINGS.index) and list(unseen) == sorted(
+        unseen, key=THINGS.index
     )
+    assert not {t.kind for t in received} & {t.kind for t in unseen}
+    assert {t.shape.primitive for t in received} == set(PRIMITIVES) and {
+        t.shape.texture for t in received
+    } == set(TEXTURES)
     largest = max(Counter(t.kind for t in THINGS).values())
     assert share * 64 <= len(unseen) < share * 64 + largest
     assert hold_out(THINGS, share, seed) == (received, unseen)

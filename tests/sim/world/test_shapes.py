@@ -19,10 +19,13 @@ def axes(count, pitch):
 
 
 @pytest.mark.parametrize(
-    ("primitive", "texture"), [(p, t) for i, p in enumerate(PRIMITIVES) for t in [*TEXTURES][i % 3 :: 3]]
+    ("primitive", "texture"),
+    [(p, t) for i, p in enumerate(PRIMITIVES) for t in [*TEXTURES][i % 3 :: 3]],
 )
 def test_heights_lie_between_the_table_and_the_top(primitive, texture):
-    shape = Shape(primitive, texture, 6.0, 1.5, 0.3, seed=4, irregularity=0.1, grain="pores", grain_depth=0.05)
+    shape = Shape(
+        primitive, texture, 6.0, 1.5, 0.3, seed=4, irregularity=0.1, grain="pores", grain_depth=0.05
+    )
     z = relief(shape, 96, 0.25)
     assert z.dtype == np.float32 and z.shape == (96, 96) and np.isfinite(z).all()
     assert z.max() <= 0 and z.min() >= floor(shape) - 0.35 - 1e-5
@@ -33,8 +36,12 @@ def test_heights_lie_between_the_table_and_the_top(primitive, texture):
 def test_the_ball_and_the_rod_are_round():
     x, y = axes(41, 0.1)
     r2 = x * x + y * y
-    np.testing.assert_allclose(height(Shape("sphere", size=7.0), x, y), np.sqrt(49 - r2) - 7, atol=1e-12)
-    np.testing.assert_allclose(height(Shape("cylinder", size=4.0), x, y), np.sqrt(16 - x * x) - 4, atol=1e-12)
+    np.testing.assert_allclose(
+        height(Shape("sphere", size=7.0), x, y), np.sqrt(49 - r2) - 7, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        height(Shape("cylinder", size=4.0), x, y), np.sqrt(16 - x * x) - 4, atol=1e-12
+    )
 
 
 def test_the_ring_is_a_torus():
@@ -63,7 +70,9 @@ def test_the_thread_winds():
 @pytest.mark.parametrize("primitive", PRIMITIVES)
 def test_jax_arrays_give_what_numpy_gives(primitive):
     texture = list(TEXTURES)[list(PRIMITIVES).index(primitive) % len(TEXTURES)]
-    shape = Shape(primitive, texture, 6.0, seed=3, irregularity=0.05, grain="streaks", grain_depth=0.04)
+    shape = Shape(
+        primitive, texture, 6.0, seed=3, irregularity=0.05, grain="streaks", grain_depth=0.04
+    )
     x, y = (a.astype(np.float32) for a in axes(12, 0.4))
     z = jax.jit(lambda x, y: height(shape, x, y))(x, y)
     assert isinstance(z, jax.Array) and z.dtype == jnp.float32
@@ -82,11 +91,21 @@ def test_the_places_of_scenes_meet_the_object(thing):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("primitive", "cube"), ("texture", "velvet"), ("grain", "velvet"), ("letter", "Q"), ("size", -1.0),
-        ("size", math.nan), ("texture_pitch", 0.0), ("grain_pitch", 0.0), ("texture_depth", -0.1),
-        ("grain_depth", math.nan), ("irregularity", -0.1), ("texture_angle", math.inf), ("seed", -1),
+        ("primitive", "cube"),
+        ("texture", "velvet"),
+        ("grain", "velvet"),
+        ("letter", "Q"),
+        ("size", -1.0),
+        ("size", math.nan),
+        ("texture_pitch", 0.0),
+        ("grain_pitch", 0.0),
+        ("texture_depth", -0.1),
+        ("grain_depth", math.nan),
+        ("irregularity", -0.1),
+        ("texture_angle", math.inf),
+        ("seed", -1),
     ],
-)  # fmt: skip
+)
 def test_impossible_shapes_are_named(name, value):
     with pytest.raises(UserError, match=value if isinstance(value, str) else name):
         dataclasses.replace(Shape("sphere"), **{name: value})

@@ -16,7 +16,14 @@ from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data.loading.pools import CLIP, STILL, MatchPool, Pool, find_pools
 from anytouch_jax.data.loading.samples import NAMED, SampleReader, fill_slot
-from anytouch_jax.data.loading.sampling import BOTH, TEXT, VISION, Shard, StepSchedule, uniform_per_step
+from anytouch_jax.data.loading.sampling import (
+    BOTH,
+    TEXT,
+    VISION,
+    Shard,
+    StepSchedule,
+    uniform_per_step,
+)
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches, run_jobs
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.tokenizer import Tokenizer
@@ -26,8 +33,15 @@ Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 _KINDS: tuple[Literal["still"], Literal["clip"]] = ("still", "clip")
 _NONE = -1  # a step without this part
-_WITH_IMAGE, _WITH_TEXT = (VISION, BOTH), (BOTH, TEXT)  # strata
-_KIND, _PART, _ORDER, _TRIPLE, _GALLERY = 1, 2, 3, 4, 5  # tags that keep the random streams of one seed apart
+# strata
+_WITH_IMAGE = (VISION, BOTH)
+_WITH_TEXT = (BOTH, TEXT)
+# tags that keep the random streams of one seed apart
+_KIND = 1
+_PART = 2
+_ORDER = 3
+_TRIPLE = 4
+_GALLERY = 5
 
 
 class Loader:
@@ -41,16 +55,26 @@ class Loader:
     """
 
     def __init__(
-        self, manifest: Manifest, config: Config, *, tokenizer: Tokenizer | None = None, devices: int = 1,
-        shard: tuple[int, int] = (0, 1), log: Callable[[str], None] = lambda _: None,
-    ) -> None:  # fmt: skip
+        self,
+        manifest: Manifest,
+        config: Config,
+        *,
+        tokenizer: Tokenizer | None = None,
+        devices: int = 1,
+        shard: tuple[int, int] = (0, 1),
+        log: Callable[[str], None] = lambda _: None,
+    ) -> None:
         if devices < 1:
             raise UserError(f"devices must be 1 or more, not {devices}")
-        self.manifest, self.config, self._shard = manifest, config, Shard(*shard)
-        size, groups = config.data.batch_size, config.objective.groups
+        self.manifest = manifest
+        self.config = config
+        self._shard = Shard(*shard)
+        size = config.data.batch_size
+        groups = config.objective.groups
         self._seed = config.run.seed % 2**63
         self._match_size = max(1, size // 2) if config.splits_steps else size
-        self._in_batch_negatives = config.model.match_head == "cosine"  # instead of a third touch
+        # instead of a third touch
+        self._in_batch_negatives = config.model.match_head == "cosine"
         contrasted = [size, self._match_size] if self._in_batch_negatives else [size]
         if config.stage == 2 and (odd := [rows for rows in contrasted if rows % groups]):
             raise UserError(
@@ -58,7 +82,9 @@ class Loader:
             )
         for name, number in (("devices", devices), ("batch_size", size)):
             self._shard.check(number, name)
-        self._reader, self._log, self._replaced = SampleReader(manifest, config), log, set[str]()
+        self._reader = SampleReader(manifest, config)
+        self._log = log
+        self._replaced = set[str]()
         self._pools, self._match_pools, self._sensor, self.tokenizer, self.notes = find_pools(
             manifest, config, tokenizer, devices, self._reader.gels
         )
@@ -66,17 +92,23 @@ class Loader:
         clips_only = len(self._pools) > 1 and config.data.clip_share == 1
         self._drawn = self._pools[1:] if clips_only else self._pools
         still, clip = self._match_pools
-        self._drawn_matches = [pool for pool in ((clip,) if clip and clips_only else (still, clip)) if pool]
-        self._text_length, self._align_share = self._caption_length(), self._share_of_align_steps()
-        self._align, self._match = StepSchedule(self._align_kinds), StepSchedule(self._match_kinds)
+        self._drawn_matches = [
+            pool for pool in ((clip,) if clip and clips_only else (still, clip)) if pool
+        ]
+        self._text_length = self._caption_length()
+        self._align_share = self._share_of_align_steps()
+        self._align = StepSchedule(self._align_kinds)
+        self._match = StepSchedule(self._match_kinds)
 
     def __repr__(self) -> str:
-        rows, data = len(self.manifest), self.config.data
+        rows = len(self.manifest)
+        data = self.config.data
         return f"Loader(stage {self.config.stage}, split {data.split} of {rows:,} rows, batches of {data.batch_size})"
 
     def kind(self, step: int) -> Literal["still", "clip"]:
         """Return whether the batch of `step` holds stills or clips."""
-        align, match = self._align.at(step)[0], self._match.at(step)[0]
+        align = self._align.at(step)[0]
+        match = self._match.at(step)[0]
         return _KINDS[match if align == _NONE else align]
 
     @property
@@ -91,7 +123,9 @@ class Loader:
     @property
     def trained_sensors(self) -> list[str]:
         """Names of the sensors that batches are drawn from, in the order of the sensor table."""
-        windows = [pool.windows for pool in self._drawn] + [pool.windows for pool in self._drawn_matches]
+        windows = [pool.windows for pool in self._drawn] + [
+            pool.windows for pool in self._drawn_matches
+        ]
         rows = np.unique(self._sensor[np.concatenate([ids[:, -1] for ids in windows])])
         return [self.config.model.sensors[row] for row in rows]
 
@@ -105,7 +139,9 @@ class Loader:
         The bytes do not depend on the threads. `info` counts `skipped_samples` of this shard, and `images` and `texts`
         of the whole batch. Close the iterator to stop early.
         """
-        return prefetch_batches(self._plan, range(start, stop), self.config.data.threads, self.config.data.prefetch)
+        return prefetch_batches(
+            self._plan, range(start, stop), self.config.data.threads, self.config.data.prefetch
+        )
 
     def _share_of_align_steps(self) -> float:
         """Return 1, or in separate steps (release) the share of align batches among all batches of an epoch."""
@@ -128,17 +164,29 @@ class Loader:
     def _match_kinds(self, steps: np.ndarray) -> np.ndarray:
         if self._match_pools[STILL] is None:
             return np.full(len(steps), _NONE)
-        kinds = self._kinds(steps) if self._match_pools[CLIP] is not None else np.full(len(steps), STILL)
-        return np.where(self._align_kinds(steps) == _NONE, kinds, _NONE) if self.config.splits_steps else kinds
+        kinds = (
+            self._kinds(steps)
+            if self._match_pools[CLIP] is not None
+            else np.full(len(steps), STILL)
+        )
+        if self.config.splits_steps:
+            return np.where(self._align_kinds(steps) == _NONE, kinds, _NONE)
+        return kinds
 
     def _plan(self, step: int) -> BatchJobs[Batch]:
         """Return an empty batch, and a job for each slot that reads and writes one sample."""
         align_kind, align_rank = self._align.at(step)
         match_kind, match_rank = self._match.at(step)
-        align = self._plan_align(step, self._pools[align_kind], align_rank) if align_kind != _NONE else None
+        align = (
+            self._plan_align(step, self._pools[align_kind], align_rank)
+            if align_kind != _NONE
+            else None
+        )
         if self.config.stage == 1:
             assert align is not None
-            return BatchJobs(TouchBatch(align.batch.clip, align.batch.sensor), align.jobs, align.info)
+            return BatchJobs(
+                TouchBatch(align.batch.clip, align.batch.sensor), align.jobs, align.info
+            )
         match = self._plan_match(step, match_kind, match_rank) if match_kind != _NONE else None
         batch = Stage2Batch(align.batch if align else None, match.batch if match else None)
         jobs = [*(align.jobs if align else ()), *(match.jobs if match else ())]
@@ -160,26 +208,41 @@ class Loader:
         with_text = [slot for slot, (stratum, *_) in enumerate(draws) if stratum in _WITH_TEXT]
         image_row = np.full(pool.quota.images, rows, np.int32)
         text_row = np.full(pool.quota.texts if self.tokenizer is not None else 0, rows, np.int32)
-        image_row[: len(with_image)], text_row[: len(with_text)] = with_image, with_text
-        image_slot, text_slot = ({slot: i for i, slot in enumerate(slots)} for slots in (with_image, with_text))
-        batch = AlignBatch(*self._empty(rows, pool.windows.shape[1]), *self._empty_slots(image_row, text_row))
+        image_row[: len(with_image)] = with_image
+        text_row[: len(with_text)] = with_text
+        image_slot, text_slot = (
+            {slot: i for i, slot in enumerate(slots)} for slots in (with_image, with_text)
+        )
+        batch = AlignBatch(
+            *self._empty(rows, pool.windows.shape[1]), *self._empty_slots(image_row, text_row)
+        )
         jobs: list[Callable[[], int]] = []
         for slot, (stratum, index, epoch) in enumerate(draws):
-            parts = ((slot, rows), (image_slot.get(slot), len(image_row)), (text_slot.get(slot), len(text_row)))
+            parts = (
+                (slot, rows),
+                (image_slot.get(slot), len(image_row)),
+                (text_slot.get(slot), len(text_row)),
+            )
             touch, image, text = mine = [self._shard.place(*part) for part in parts]
             if mine == [None, None, None]:
                 continue
             write = partial(self._write_align, batch, pool, stratum, touch, image, text)
             size = len(pool.members[stratum])
-            job = partial(fill_slot, write, size, step, slot, self.config, index, epoch, self._name_replaced)
+            job = partial(
+                fill_slot, write, size, step, slot, self.config, index, epoch, self._name_replaced
+            )
             jobs.append(job if touch is not None else partial(_uncounted, job))
         return BatchJobs(batch, jobs, {"images": len(with_image), "texts": len(with_text)})
 
     def _plan_match(self, step: int, kind: int, rank: int) -> BatchJobs[MatchBatch]:
-        pool, rows = self._match_pools[kind], self._match_size
+        pool = self._match_pools[kind]
+        rows = self._match_size
         assert pool is not None
         self._shard.check(rows, "the rows of a matching batch")
-        parts = [self._empty(rows, pool.windows.shape[1]) for _ in range(2 if self._in_batch_negatives else 3)]
+        parts = [
+            self._empty(rows, pool.windows.shape[1])
+            for _ in range(2 if self._in_batch_negatives else 3)
+        ]
         batch = MatchBatch(*(array for part in parts for array in part))
         if self._in_batch_negatives:
             batch = batch._replace(place=np.zeros(len(batch.sensor), np.int32))
@@ -191,8 +254,21 @@ class Loader:
                 continue
             write = partial(self._write_match, batch, pool, mine, gallery)
             # Slots of matching come after those of alignment, so that their replacements are drawn apart.
-            place, size = self.config.data.batch_size + slot, len(pool.matches.anchors)
-            jobs.append(partial(fill_slot, write, size, step, place, self.config, index, epoch, self._name_replaced))
+            place = self.config.data.batch_size + slot
+            size = len(pool.matches.anchors)
+            jobs.append(
+                partial(
+                    fill_slot,
+                    write,
+                    size,
+                    step,
+                    place,
+                    self.config,
+                    index,
+                    epoch,
+                    self._name_replaced,
+                )
+            )
         return BatchJobs(batch, jobs)
 
     def _name_replaced(self, error: str) -> None:
@@ -219,24 +295,36 @@ class Loader:
         return min(tower.length, -(-self.tokenizer.longest(captions) // 8) * 8)
 
     def _empty(self, rows: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
-        size, rows = self.config.model.image_size, self._shard.share(rows)
+        size = self.config.model.image_size
+        rows = self._shard.share(rows)
         return np.zeros((rows, frames, size, size, 3), np.uint8), np.zeros(rows, np.int32)
 
     def _empty_slots(self, image_row: np.ndarray, text_row: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the empty image and text slots of this shard."""
-        size, length = self.config.model.image_size, self._text_length
-        image_row, text_row = self._shard.cut(image_row), self._shard.cut(text_row)
+        size = self.config.model.image_size
+        length = self._text_length
+        image_row = self._shard.cut(image_row)
+        text_row = self._shard.cut(text_row)
         image = np.zeros((len(image_row), size, size, 3), np.uint8)
         if self.tokenizer is None or not len(text_row):
-            text, mask = np.zeros((0, length), np.int32), np.zeros((0, length), bool)
+            text = np.zeros((0, length), np.int32)
+            mask = np.zeros((0, length), bool)
         else:
-            text, mask = self.tokenizer.encode([""] * len(text_row), length)  # padding alone has a NaN gradient
+            # padding alone has a NaN gradient
+            text, mask = self.tokenizer.encode([""] * len(text_row), length)
         return image, image_row, text, mask, text_row
 
     def _write_align(
-        self, batch: AlignBatch, pool: Pool, stratum: int, touch: int | None, image: int | None, text: int | None,
-        index: int, epoch: int,
-    ) -> None:  # fmt: skip
+        self,
+        batch: AlignBatch,
+        pool: Pool,
+        stratum: int,
+        touch: int | None,
+        image: int | None,
+        text: int | None,
+        index: int,
+        epoch: int,
+    ) -> None:
         """Write sample `index` into the slots `touch`, `image` and `text`, None for those of other shards."""
         rows = pool.windows[pool.members[stratum][index]]
         # The replacement of a bad sample must not depend on the shard, so with "skip" every part is read.
@@ -256,7 +344,13 @@ class Loader:
             batch.text[text], batch.text_mask[text] = ids[0], mask[0]
 
     def _write_match(
-        self, batch: MatchBatch, pool: MatchPool, slot: int, gallery: int | None, index: int, epoch: int
+        self,
+        batch: MatchBatch,
+        pool: MatchPool,
+        slot: int,
+        gallery: int | None,
+        index: int,
+        epoch: int,
     ) -> None:
         anchor = int(pool.matches.anchors[index])
         row = int(pool.windows[anchor, -1])

@@ -28,10 +28,14 @@ from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
 from anytouch_jax.errors import UserError
 
-STILL, CLIP = 0, 1
+STILL = 0
+CLIP = 1
 _NEITHER = 3  # the last stratum: windows without photograph and caption
-_ALIGN, _ANCHOR = 100, 200  # tags that keep the random streams of one seed apart
-_DOWNSTREAM = "downstream_test"  # column of frames in a test split of a downstream task (paper, appendix: fairness)
+# tags that keep the random streams of one seed apart
+_ALIGN = 100
+_ANCHOR = 200
+# column of frames in a test split of a downstream task (paper, appendix: fairness)
+_DOWNSTREAM = "downstream_test"
 _FALSE_WORDS = ("", "0", "0.0", "false", "no", "none")
 
 
@@ -82,11 +86,17 @@ class _Usable(NamedTuple):
     has_text: np.ndarray
 
     def weights_of(self, windows: np.ndarray) -> np.ndarray | None:
-        return None if self.weights is None else self.weights[windows[:, -1]]
+        if self.weights is None:
+            return None
+        return self.weights[windows[:, -1]]
 
 
 def find_pools(
-    manifest: Manifest, config: Config, tokenizer: Tokenizer | None, devices: int, gels: UnitGels | None = None
+    manifest: Manifest,
+    config: Config,
+    tokenizer: Tokenizer | None,
+    devices: int,
+    gels: UnitGels | None = None,
 ) -> Pools:
     """Return the pools of the split `config.data.split`; `devices` sets the multiple of the slots.
 
@@ -98,21 +108,30 @@ def find_pools(
     if captioned.size and tokenizer is None:
         tokenizer, note = choose_tokenizer(manifest, captioned, config)
         notes += note
-    if captioned.size and tokenizer and config.model.text and tokenizer.vocab_size > config.model.text.vocab:
+    if (
+        captioned.size
+        and tokenizer
+        and config.model.text
+        and tokenizer.vocab_size > config.model.text.vocab
+    ):
         raise UserError(
             f"the tokenizer has {tokenizer.vocab_size} tokens but the text tower only {config.model.text.vocab}: "
             f"set --model.text.vocab {tokenizer.vocab_size} or give another tokenizer"
         )
     if config.stage == 2 and config.model.text:
         notes += _withheld_notes(manifest, config, usable.rows)
-    data, frames = config.data, config.model.frames
+    data = config.data
+    frames = config.model.frames
     length = frames + config.reconstructs
-    stills, clips = usable.rows[:, None], _clips(manifest, config, usable, length)
+    stills = usable.rows[:, None]
+    clips = _clips(manifest, config, usable, length)
     shards = _shards(manifest) if data.parts else None
     kinds = [(kind, ids) for kind, ids in enumerate((stills, clips)) if len(ids)]
     touch = tuple(_pool(config, usable, kind, ids, devices, shards) for kind, ids in kinds)
     if len(touch) == 1 and data.clip_share:
-        notes.append(f"split {data.split!r} has no clip of {length} frames, so all batches are stills")
+        notes.append(
+            f"split {data.split!r} has no clip of {length} frames, so all batches are stills"
+        )
     match: tuple[MatchPool | None, MatchPool | None] = (None, None)
     if config.stage == 2 and config.model.match_head != "none":
         clips = clips if length == frames else _clips(manifest, config, usable, frames)
@@ -137,7 +156,9 @@ def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> 
     good = usable.ends[clips[:, -1]]
     for frame in clips.T:
         good &= usable.sensor[frame] >= 0
-    return clips if good.all() else clips[good]
+    if good.all():
+        return clips
+    return clips[good]
 
 
 def _shards(manifest: Manifest) -> np.ndarray:
@@ -149,21 +170,40 @@ def _shards(manifest: Manifest) -> np.ndarray:
 
 
 def _pool(
-    config: Config, usable: _Usable, kind: int, windows: np.ndarray, devices: int, shards: np.ndarray | None
+    config: Config,
+    usable: _Usable,
+    kind: int,
+    windows: np.ndarray,
+    devices: int,
+    shards: np.ndarray | None,
 ) -> Pool:
-    has_image, has_text = usable.has_image[windows[:, -1]], usable.has_text[windows[:, -1]]
-    strata = (has_image & ~has_text, has_image & has_text, ~has_image & has_text, ~has_image & ~has_text)
+    has_image = usable.has_image[windows[:, -1]]
+    has_text = usable.has_text[windows[:, -1]]
+    strata = (
+        has_image & ~has_text,
+        has_image & has_text,
+        ~has_image & has_text,
+        ~has_image & ~has_text,
+    )
     members = tuple(np.flatnonzero(stratum) for stratum in strata)
     samplers: tuple[EpochSampler | PartSampler, ...] = tuple(
-        EpochSampler(len(ids), config.run.seed, _ALIGN + 4 * kind + s, usable.weights_of(windows[ids]))
+        EpochSampler(
+            len(ids), config.run.seed, _ALIGN + 4 * kind + s, usable.weights_of(windows[ids])
+        )
         for s, ids in enumerate(members)
     )
     if shards is not None:
         if config.stage != 1 or usable.weights is not None:
-            raise UserError("--data.parts is for stage 1 without --data.weights; leave one of them out")
-        size, at = config.data.batch_size, shards[windows[:, -1]]
+            raise UserError(
+                "--data.parts is for stage 1 without --data.weights; leave one of them out"
+            )
+        size = config.data.batch_size
+        at = shards[windows[:, -1]]
         none = [EpochSampler(0, 0, 0)] * _NEITHER
-        samplers = (*none, PartSampler(at, size, config.data.parts, config.run.seed, _ALIGN + 4 * kind + _NEITHER))
+        samplers = (
+            *none,
+            PartSampler(at, size, config.data.parts, config.run.seed, _ALIGN + 4 * kind + _NEITHER),
+        )
     quota = StratumQuota([sampler.size for sampler in samplers], config.data.batch_size, devices)
     return Pool(windows, quota, members, samplers)
 
@@ -175,10 +215,15 @@ def _match_pools(
 
     def codes(name: str, own: bool = False) -> np.ndarray:
         codes = manifest.codes(name, own=own)
-        return codes.astype(np.int32) if codes.max(initial=0) < 1 << 31 else codes
+        if codes.max(initial=0) < 1 << 31:
+            return codes.astype(np.int32)
+        return codes
 
-    keys = MatchKeys(codes("touch", own=True), usable.sensor, codes("unit"), codes("object"), codes("dataset"))
-    same_sensor, seed = config.data.negatives == "same_sensor", config.run.seed
+    keys = MatchKeys(
+        codes("touch", own=True), usable.sensor, codes("unit"), codes("object"), codes("dataset")
+    )
+    same_sensor = config.data.negatives == "same_sensor"
+    seed = config.run.seed
 
     def pool(kind: int, windows: np.ndarray) -> MatchPool | None:
         other_object = config.recipe == "release"
@@ -186,9 +231,12 @@ def _match_pools(
         if not matches.anchors.size:
             return None
         weights = usable.weights_of(windows[matches.anchors])
-        return MatchPool(windows, matches, EpochSampler(len(matches.anchors), seed, _ANCHOR + kind, weights))
+        return MatchPool(
+            windows, matches, EpochSampler(len(matches.anchors), seed, _ANCHOR + kind, weights)
+        )
 
-    still, clip = pool(STILL, stills), pool(CLIP, clips) if config.data.clip_share else None
+    still = pool(STILL, stills)
+    clip = pool(CLIP, clips) if config.data.clip_share else None
     notes = []
     if still is None:
         reason = "no place (column 'touch') was touched by two sensors or units"
@@ -197,13 +245,18 @@ def _match_pools(
         option = " with data.negatives=same_sensor" if same_sensor else ""
         notes.append(f"{reason}: there is no cross-sensor matching{option}")
     elif still.matches.one_object:
-        notes.append("all touches are of one object: the negatives of matching are other places on it")
+        notes.append(
+            "all touches are of one object: the negatives of matching are other places on it"
+        )
     return (still, clip), notes
 
 
-def _usable_rows(manifest: Manifest, config: Config, gels: UnitGels | None) -> tuple[_Usable, list[str]]:
+def _usable_rows(
+    manifest: Manifest, config: Config, gels: UnitGels | None
+) -> tuple[_Usable, list[str]]:
     """Return the rows of the split with images of a known sensor, a weight, and all that is required; and notes."""
-    split, on_bad = config.data.split, config.data.on_bad_sample
+    split = config.data.split
+    on_bad = config.data.on_bad_sample
     rows = manifest.rows_of(split)
     sensor, notes = sensor_rows(manifest, config.model, rows, unknown=on_bad)
     rows = rows[sensor[rows] >= 0]
@@ -222,18 +275,27 @@ def _usable_rows(manifest: Manifest, config: Config, gels: UnitGels | None) -> t
                 f"which --data.background subtract requires. {ADVICE}"
             )
         if len(missing):
-            notes.append(f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are left out")
-            sensor, rows = sensor.copy(), np.setdiff1d(rows, missing)
+            notes.append(
+                f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are left out"
+            )
+            sensor = sensor.copy()
+            rows = np.setdiff1d(rows, missing)
             sensor[missing] = -1
     weights, note = epoch_weights(manifest, config, rows)
     notes += note
     if weights is not None:
-        rows, sensor = rows[weights[rows] > 0], np.where(weights > 0, sensor, -1)
-    text = manifest.present("text") & ~withheld_text(manifest, aligned_text=config.data.aligned_text)
+        rows = rows[weights[rows] > 0]
+        sensor = np.where(weights > 0, sensor, -1)
+    text = manifest.present("text") & ~withheld_text(
+        manifest, aligned_text=config.data.aligned_text
+    )
     has = {"image": manifest.present("image_path"), "text": text}
     allowed, note = _required(manifest, config, rows, has)
-    model, aligns, none = config.model, config.stage == 2, np.zeros(len(manifest), bool)
-    has_image, has_text = has["image"] if aligns and model.image else none, text if aligns and model.text else none
+    model = config.model
+    aligns = config.stage == 2
+    none = np.zeros(len(manifest), bool)
+    has_image = has["image"] if aligns and model.image else none
+    has_text = text if aligns and model.text else none
     return _Usable(sensor, rows[allowed[rows]], weights, allowed, has_image, has_text), notes + note
 
 
@@ -249,32 +311,44 @@ def _required(
             raise UserError(
                 "--data.contact-only needs the column 'label.contact', which `anytouch data contact` writes"
             )
-        has = {**has, "contact": known_contact(manifest) != 0}  # rows of unknown contact stay
+        # rows of unknown contact stay
+        has = {**has, "contact": known_contact(manifest) != 0}
     allowed = np.logical_and.reduce([has[name] for name in wanted])
-    count, words = int(allowed[rows].sum()), " and ".join(wanted)
+    count = int(allowed[rows].sum())
+    words = " and ".join(wanted)
     option = "data.contact_only" if wanted == ["contact"] else "data.require"
     if not count:
         split = config.data.split
-        raise UserError(f"{option}: no row of split {split!r} has {words}; add some, or leave the option out")
+        raise UserError(
+            f"{option}: no row of split {split!r} has {words}; add some, or leave the option out"
+        )
     return allowed, [f"{count} of {len(rows)} rows have {words}; only they are drawn ({option})"]
 
 
-def epoch_weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
+def epoch_weights(
+    manifest: Manifest, config: Config, rows: np.ndarray
+) -> tuple[np.ndarray | None, list[str]]:
     """Return how often an epoch draws each row of the manifest, f64 (rows,), None if each comes once; and notes."""
-    column, split = manifest.column("dataset"), config.data.split
+    column = manifest.column("dataset")
+    split = config.data.split
     datasets = pc.unique(column.take(rows)).drop_null().to_pylist()
     wanted = config.data.weights
     if wanted is not None:  # simulated touches are no rows
         wanted = tuple(pair for pair in wanted if pair[0] != "simulated")
     if wanted is None:
-        released = config.recipe == "release" and config.stage == 2  # its stage 1 draws every row once
+        # its stage 1 draws every row once
+        released = config.recipe == "release" and config.stage == 2
         wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in datasets) if released else ()
     for name, weight in wanted:
         if name not in datasets:
             known = ", ".join(sorted(datasets)) or "none: its column 'dataset' is empty"
-            raise UserError(f"--data.weights names the dataset {name!r}, but split {split!r} has {known}")
+            raise UserError(
+                f"--data.weights names the dataset {name!r}, but split {split!r} has {known}"
+            )
         if not 0 <= weight < 1e6:
-            raise UserError(f"--data.weights of {name!r} is the number of draws per epoch, not {weight}")
+            raise UserError(
+                f"--data.weights of {name!r} is the number of draws per epoch, not {weight}"
+            )
     if len(set(dict(wanted))) < len(wanted):
         raise UserError("--data.weights names a dataset twice; name it once")
     if not wanted:
@@ -283,8 +357,12 @@ def epoch_weights(manifest: Manifest, config: Config, rows: np.ndarray) -> tuple
     for name, weight in wanted:
         weights[np.asarray(pc.fill_null(pc.equal(column, name), False))] = weight
     if not weights[rows].any():
-        raise UserError(f"--data.weights leaves out every row of split {split!r}; name a dataset that has some")
-    counts = ", ".join(f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted)
+        raise UserError(
+            f"--data.weights leaves out every row of split {split!r}; name a dataset that has some"
+        )
+    counts = ", ".join(
+        f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted
+    )
     return weights, [f"an epoch draws {counts}, other datasets once"]
 
 
@@ -295,11 +373,15 @@ def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarra
     `aligned_text` touches shared by sensors or units (Table 6, "w/o Text in TacQuad").
     """
     tested = _in_downstream_test(manifest)
-    return tested if aligned_text else tested | _is_aligned(manifest)
+    if aligned_text:
+        return tested
+    return tested | _is_aligned(manifest)
 
 
 def _is_aligned(manifest: Manifest) -> np.ndarray:
-    return is_shared_touch(*(manifest.codes(name, own=name == "touch") for name in ("touch", "sensor", "unit")))
+    return is_shared_touch(
+        *(manifest.codes(name, own=name == "touch") for name in ("touch", "sensor", "unit"))
+    )
 
 
 def _in_downstream_test(manifest: Manifest) -> np.ndarray:
@@ -310,23 +392,33 @@ def _in_downstream_test(manifest: Manifest) -> np.ndarray:
 
 
 def _withheld_notes(manifest: Manifest, config: Config, rows: np.ndarray) -> list[str]:
-    text, notes = manifest.present("text")[rows], []
+    text = manifest.present("text")[rows]
+    notes = []
     if count := int((text & _in_downstream_test(manifest)[rows]).sum()):
-        notes.append(f"the text of {count} rows is withheld: they are in a test split of a downstream task")
+        notes.append(
+            f"the text of {count} rows is withheld: they are in a test split of a downstream task"
+        )
     if not config.data.aligned_text:
         shared = f"the text of {int((text & _is_aligned(manifest)[rows]).sum())} of {int(text.sum())} rows is withheld"
         notes.append(f"{shared}: other sensors or units share the touch (data.aligned_text)")
     return notes
 
 
-def training_captions(manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True) -> list[str]:
+def training_captions(
+    manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True
+) -> list[str]:
     """Return the distinct captions of `rows` that may be trained on (see `withheld_text`), sorted."""
     allowed = rows[~withheld_text(manifest, aligned_text=aligned_text)[rows]]
     return sorted(pc.unique(manifest.column("text").take(allowed)).drop_null().to_pylist())
 
 
 def choose_tokenizer(
-    manifest: Manifest, rows: np.ndarray, config: Config, *, file: Path | None = None, vocabulary: int | None = None
+    manifest: Manifest,
+    rows: np.ndarray,
+    config: Config,
+    *,
+    file: Path | None = None,
+    vocabulary: int | None = None,
 ) -> tuple[Tokenizer | None, list[str]]:
     """Return the tokenizer of a run, and notes: from `file`, else `data.tokenizer`, else trained on the captions.
 
@@ -340,4 +432,6 @@ def choose_tokenizer(
     if not captions or config.model.text is None:
         return None, []
     tokenizer = train_tokenizer(captions, vocabulary or config.model.text.vocab)
-    return tokenizer, [f"no tokenizer was given: one of {tokenizer.vocab_size} tokens was trained on the captions"]
+    return tokenizer, [
+        f"no tokenizer was given: one of {tokenizer.vocab_size} tokens was trained on the captions"
+    ]

@@ -15,12 +15,14 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 
-VISION, BOTH, TEXT, NEITHER = range(4)  # strata by modality, in the order in which `StratumQuota` lays them out
+# strata by modality, in the order in which `StratumQuota` lays them out
+VISION, BOTH, TEXT, NEITHER = range(4)
 
 
 def uniform_per_step(seed: int, tag: int, steps: np.ndarray) -> np.ndarray:
     """Return a number in [0, 1) for every step, f64 of the shape of `steps`: splitmix64 of (seed, tag, step)."""
-    state = np.array([(seed ^ tag * 0xD1342543DE82EF95) % 2**64], np.uint64)  # arrays overflow without a warning
+    # arrays overflow without a warning
+    state = np.array([(seed ^ tag * 0xD1342543DE82EF95) % 2**64], np.uint64)
     x = _mix(state) + (steps.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     return np.asarray((_mix(x) >> np.uint64(11)) * 2.0**-53)
 
@@ -61,12 +63,15 @@ class EpochSampler:
 
     def __init__(self, items: int, seed: int, tag: int, weights: np.ndarray | None = None) -> None:
         self._seed = (seed % 2**63, tag)
-        self._groups: list[tuple[np.ndarray, int, int]] = []  # ids of one weight, draws of each, further draws
-        self.size, self._copies = items, 1
+        # ids of one weight, draws of each, further draws
+        self._groups: list[tuple[np.ndarray, int, int]] = []
+        self.size = items
+        self._copies = 1
         if weights is not None and (weights != 1).any():
             for weight in np.unique(weights):
                 ids = np.flatnonzero(weights == weight)
-                draws, times = max(1, round(weight * len(ids))), int(weight)
+                draws = max(1, round(weight * len(ids)))
+                times = int(weight)
                 self._groups.append((ids, times, draws - times * len(ids)))
                 self._copies = max(self._copies, times + 1)
             self.size = sum(times * len(ids) + more for ids, times, more in self._groups)
@@ -115,11 +120,17 @@ class PartSampler:
 
     def __init__(self, shard: np.ndarray, batch: int, parts: int, seed: int, tag: int) -> None:
         if batch % parts:
-            raise UserError(f"a batch of {batch} does not divide into --data.parts {parts}; change one of them")
-        self.size, self._batch, self._seed = len(shard), batch, (seed % 2**63, tag)
+            raise UserError(
+                f"a batch of {batch} does not divide into --data.parts {parts}; change one of them"
+            )
+        self.size = len(shard)
+        self._batch = batch
+        self._seed = (seed % 2**63, tag)
         names, counts = np.unique(shard, return_counts=True)
         if len(names) < parts:
-            raise UserError(f"--data.parts {parts} needs as many shards, and there are {len(names)}; lower it")
+            raise UserError(
+                f"--data.parts {parts} needs as many shards, and there are {len(names)}; lower it"
+            )
         members: list[list[int]] = [[] for _ in range(parts)]
         sizes = np.zeros(parts, np.int64)
         for at in np.argsort(-counts, kind="stable"):
@@ -129,11 +140,13 @@ class PartSampler:
         order = np.argsort(shard, kind="stable")
         of = dict(zip(names.tolist(), np.split(order, np.cumsum(counts)[:-1]), strict=True))
         self._parts = [[of[name] for name in part] for part in members]
-        self._sizes, self._orders = sizes, dict[tuple[int, int], np.ndarray]()
+        self._sizes = sizes
+        self._orders = dict[tuple[int, int], np.ndarray]()
 
     def take(self, start: int, count: int) -> list[tuple[int, int]]:
         """Return (item, epoch of its part) at positions start .. start + count - 1 of the sequence."""
-        share, draws = self._batch // len(self._parts), []
+        share = self._batch // len(self._parts)
+        draws = []
         for position in range(start, start + count):
             step, slot = divmod(position, self._batch)
             part, place = divmod(slot, share)
@@ -146,10 +159,13 @@ class PartSampler:
         if (part, epoch) not in self._orders:
             while len(self._orders) > 2 * len(self._parts):
                 self._orders.pop(next(iter(self._orders)))
-            rng, shards = np.random.default_rng([*self._seed, part, epoch]), self._parts[part]
+            rng = np.random.default_rng([*self._seed, part, epoch])
+            shards = self._parts[part]
             turn = rng.permutation(len(shards))
             groups = [turn[at : at + self.MIXED] for at in range(0, len(turn), self.MIXED)]
-            items = [rng.permutation(np.concatenate([shards[i] for i in group])) for group in groups]
+            items = [
+                rng.permutation(np.concatenate([shards[i] for i in group])) for group in groups
+            ]
             self._orders[part, epoch] = np.concatenate(items)
         return self._orders[part, epoch]
 
@@ -166,7 +182,8 @@ class StratumQuota:
     def __init__(self, sizes: Sequence[int], batch: int, multiple: int = 1) -> None:
         rows = sum(sizes)
         shares = [Fraction(batch * size, rows) for size in sizes]
-        images, texts = shares[VISION] + shares[BOTH], shares[TEXT] + shares[BOTH]
+        images = shares[VISION] + shares[BOTH]
+        texts = shares[TEXT] + shares[BOTH]
         self.images, self.texts = (_slots(share, batch, multiple) for share in (images, texts))
         shares = _fill(shares, _slots(images, batch, 1), _slots(texts, batch, 1))
         edges = [sum(shares[:end], Fraction(0)) for end in range(5)]
@@ -181,8 +198,11 @@ class StratumQuota:
         """Return the rows taken from each stratum before batch `k` and by batch `k`, i64 (4,) each."""
         if k + 1 >= len(self._table):
             u = np.cumsum(np.full(max(1024, 2 * k + 2), self._step) % self._unit) % self._unit
-            below = -((u[:, None] - self._edges) // self._unit)  # points below each edge: ceil((edge - u) / unit)
-            self._table = np.concatenate([np.zeros((1, 4), np.int64), np.cumsum(np.diff(below, axis=1), axis=0)])
+            # points below each edge: ceil((edge - u) / unit)
+            below = -((u[:, None] - self._edges) // self._unit)
+            self._table = np.concatenate(
+                [np.zeros((1, 4), np.int64), np.cumsum(np.diff(below, axis=1), axis=0)]
+            )
         return self._table[k], self._table[k + 1] - self._table[k]
 
 
@@ -223,7 +243,9 @@ class Shard:
         if not 0 <= self.index < self.count:
             raise UserError(f"there is no shard {self.index} of {self.count}")
         if slots % self.count:
-            raise UserError(f"{name} {slots} cannot be shared by {self.count} processes; choose a multiple of them")
+            raise UserError(
+                f"{name} {slots} cannot be shared by {self.count} processes; choose a multiple of them"
+            )
 
     def share(self, slots: int) -> int:
         """Return the number of slots of this part."""
@@ -239,7 +261,9 @@ class Shard:
         if slot is None:
             return None
         position = slot - self.index * self.share(slots)
-        return position if 0 <= position < self.share(slots) else None
+        if 0 <= position < self.share(slots):
+            return position
+        return None
 
 
 _TABLE = 16  # cells per row up to which a table of flags is used instead of a sort
@@ -266,13 +290,25 @@ class Matches:
     """
 
     def __init__(
-        self, pool: np.ndarray, keys: MatchKeys, *, same_sensor: bool = False, other_object: bool = False
+        self,
+        pool: np.ndarray,
+        keys: MatchKeys,
+        *,
+        same_sensor: bool = False,
+        other_object: bool = False,
     ) -> None:
-        self.pool, self.same_sensor, self.other_object, self._keys = pool, same_sensor, other_object, keys
-        mine = MatchKeys(*(key[pool] for key in keys))  # not stored: one copy of millions of rows is enough
-        touch, obj = mine.touch, mine.object
+        self.pool = pool
+        self.same_sensor = same_sensor
+        self.other_object = other_object
+        self._keys = keys
+        # not stored: one copy of millions of rows is enough
+        mine = MatchKeys(*(key[pool] for key in keys))
+        touch = mine.touch
+        obj = mine.object
         self._rows_of_sensor: dict[int, np.ndarray] = {}
-        self._usable = _distinct(mine.sensor, mine.touch) > 1 if same_sensor else np.ones(len(pool), bool)
+        self._usable = (
+            _distinct(mine.sensor, mine.touch) > 1 if same_sensor else np.ones(len(pool), bool)
+        )
         self.one_object = len(obj) > 0 and bool((obj == obj[0]).all() and obj[0] >= 0)
         anchors = np.flatnonzero((touch >= 0) & _has_partner(mine, self._usable))
         del mine, obj
@@ -280,7 +316,9 @@ class Matches:
         self._order = order.astype(np.int32) if len(order) < 1 << 31 else order
         self._sorted = touch[self._order]
         # With a single place, a row of an unknown place may be on it; a usable partner's sensor has another place.
-        known = same_sensor or np.searchsorted(self._sorted, 0) < np.searchsorted(self._sorted, touch.max(initial=-1))
+        known = same_sensor or np.searchsorted(self._sorted, 0) < np.searchsorted(
+            self._sorted, touch.max(initial=-1)
+        )
         self.anchors = anchors if known else anchors[self._have_negatives(anchors)]
 
     def _have_negatives(self, anchors: np.ndarray) -> np.ndarray:
@@ -288,15 +326,20 @@ class Matches:
         rows = self.pool[anchors]
         things = np.stack([self._keys.object[rows], self._keys.dataset[rows]], 1)
         _, first, thing = np.unique(things, axis=0, return_index=True, return_inverse=True)
-        return np.array([self._negatives(int(anchors[at])).size > 0 for at in first], bool)[thing.ravel()]
+        return np.array([self._negatives(int(anchors[at])).size > 0 for at in first], bool)[
+            thing.ravel()
+        ]
 
     def place(self, anchor: int) -> int:
         """Return the code of the place of `anchor`."""
         return int(self._keys.touch[self.pool[anchor]])
 
-    def draw(self, anchor: int, rng: np.random.Generator, sensor: int | None = None) -> tuple[int, int]:
+    def draw(
+        self, anchor: int, rng: np.random.Generator, sensor: int | None = None
+    ) -> tuple[int, int]:
         """Return (positive, negative) ids for `anchor`: other sensor (`sensor` if there) or unit; other place."""
-        keys, row = self._keys, self.pool[anchor]
+        keys = self._keys
+        row = self.pool[anchor]
         low, high = np.searchsorted(self._sorted, keys.touch[row] + np.array([0, 1]))
         same_place = self._order[low:high]
         rows = self.pool[same_place]
@@ -321,7 +364,9 @@ class Matches:
     def _negatives(self, anchor: int, sensor: int | None = None) -> np.ndarray:
         ids = np.arange(len(self.pool)) if sensor is None else self._of_sensor(sensor)
         negatives = ids[self._elsewhere(anchor, ids)]
-        if not negatives.size and self.other_object:  # fall back to another known place on the same object
+        if (
+            not negatives.size and self.other_object
+        ):  # fall back to another known place on the same object
             touch = self._keys.touch[self.pool[ids]]
             negatives = ids[(touch >= 0) & (touch != self.place(anchor))]
         return negatives
@@ -334,7 +379,9 @@ class Matches:
 
     def _elsewhere(self, anchor: int, ids: np.ndarray) -> np.ndarray:
         """Return which `ids` are surely at another place, and on another object with `other_object`, bool."""
-        keys, rows, row = self._keys, self.pool[ids], self.pool[anchor]
+        keys = self._keys
+        rows = self.pool[ids]
+        row = self.pool[anchor]
 
         def differs(key: np.ndarray) -> np.ndarray:
             return (key[rows] != key[row]) & (key[rows] >= 0) & (key[row] >= 0)
@@ -353,7 +400,8 @@ def is_shared_touch(touch: np.ndarray, sensor: np.ndarray, unit: np.ndarray) -> 
 
 def _has_partner(keys: MatchKeys, usable: np.ndarray) -> np.ndarray:
     """Return which rows have a usable partner of another sensor at their place, or else of another unit."""
-    sensors, units = _distinct(keys.touch, keys.sensor), _distinct(keys.touch, keys.unit)
+    sensors = _distinct(keys.touch, keys.sensor)
+    units = _distinct(keys.touch, keys.unit)
     others = _distinct(keys.touch, np.where(usable, keys.sensor, -1)) - usable
     return np.where(sensors > 1, others > 0, (units > 1) & (keys.unit >= 0) & usable)
 
@@ -361,9 +409,13 @@ def _has_partner(keys: MatchKeys, usable: np.ndarray) -> np.ndarray:
 def _distinct(group: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Return for every row how many known values (>= 0) its group has, 0 without a group (-1): i64 (rows,)."""
     known = (value >= 0) & (group >= 0)
-    width, groups = int(value.max(initial=0)) + 1, int(group.max(initial=-1)) + 2  # the last group is that of -1
+    # the last group is that of -1
+    width = int(value.max(initial=0)) + 1
+    groups = int(group.max(initial=-1)) + 2
     pairs = group[known].astype(np.int64) * width + value[known]
-    if width * groups <= _TABLE * len(group):  # few values per group: millions of pairs need no sort
+    if width * groups <= _TABLE * len(
+        group
+    ):  # few values per group: millions of pairs need no sort
         flags = np.zeros(width * groups, bool)
         flags[pairs] = True
         count = np.count_nonzero(flags.reshape(groups, width), axis=1)

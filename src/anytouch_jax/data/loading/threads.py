@@ -60,7 +60,10 @@ def prefetch_batches(
 
 
 def bounded_map(
-    function: Callable[[Item], Result], items: Iterable[Item], threads: int, ahead: int | None = None
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    threads: int,
+    ahead: int | None = None,
 ) -> Generator[Result, None, None]:
     """Yield `function(item)` in order, `ahead` items ahead (4 per thread). The first error raises; all threads end."""
     if threads < 1:
@@ -68,7 +71,9 @@ def bounded_map(
         return
     executor = ThreadPoolExecutor(threads, thread_name_prefix="anytouch-files")
     try:
-        for future in _ahead((executor.submit(function, item) for item in items), ahead or 4 * threads):
+        for future in _ahead(
+            (executor.submit(function, item) for item in items), ahead or 4 * threads
+        ):
             yield future.result()
     finally:
         executor.shutdown(wait=True, cancel_futures=True)

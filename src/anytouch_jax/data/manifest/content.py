@@ -17,7 +17,8 @@ import pyarrow.compute as pc
 from anytouch_jax.data.manifest.schema import BLOCK, SPLITS
 
 Blocks = Callable[[str], Iterator[pa.Array]]  # of a column's name, its values in blocks
-_KEPT = 400 << 20  # bytes of text that are kept for the second half of a digest; a longer column is read again
+# bytes of text that are kept for the second half of a digest; a longer column is read again
+_KEPT = 400 << 20
 _SHOWN = 20
 
 
@@ -44,11 +45,16 @@ def table_blocks(table: pa.Table) -> Blocks:
     return blocks
 
 
-def content_digest(names: Iterable[str], blocks: Blocks, look: Callable[[str, pa.Array], None] | None = None) -> str:
+def content_digest(
+    names: Iterable[str], blocks: Blocks, look: Callable[[str, pa.Array], None] | None = None
+) -> str:
     """Return the SHA-256 over every column's name and values; `look` gets each block once."""
     digest = hashlib.sha256()
     for name in sorted(names):
-        valid, lengths, texts, size = list[np.ndarray](), list[np.ndarray](), list[memoryview](), 0
+        valid = list[np.ndarray]()
+        lengths = list[np.ndarray]()
+        texts = list[memoryview]()
+        size = 0
         for block in blocks(name):
             if look is not None:
                 look(name, block)
@@ -83,10 +89,15 @@ def _text(block: pa.Array) -> tuple[np.ndarray, memoryview]:
 
 
 def summarise(
-    names: Sequence[str], blocks: Blocks, length: int, repeat: Callable[[int, int, int, str], Exception]
+    names: Sequence[str],
+    blocks: Blocks,
+    length: int,
+    repeat: Callable[[int, int, int, str], Exception],
 ) -> Summary:
     """Return the numbers of a table. Raises `repeat(rows.., frame_index, sequence)` if a sequence repeats a frame."""
-    parts: dict[str, list[Any]] = {name: [] for name in ("sequence", "frame_index", "stride", "split", "sensor")}
+    parts: dict[str, list[Any]] = {
+        name: [] for name in ("sequence", "frame_index", "stride", "split", "sensor")
+    }
     filled: dict[str, int] = {}
 
     def look(name: str, block: pa.Array) -> None:
@@ -104,7 +115,9 @@ def summarise(
     encoded = pa.chunked_array(parts.pop("sequence")).unify_dictionaries()
     recordings = encoded.chunk(0).dictionary
     split = np.concatenate(parts.pop("split"))
-    sequence = np.concatenate([np.asarray(chunk.indices) for chunk in encoded.chunks]).astype(np.int64)
+    sequence = np.concatenate([np.asarray(chunk.indices) for chunk in encoded.chunks]).astype(
+        np.int64
+    )
     del encoded
     sequence *= len(SPLITS)
     sequence += split
@@ -116,12 +129,25 @@ def summarise(
         name = recordings[int(sequence[second]) // len(SPLITS)].as_py()
         return repeat(first, second, int(frame[second]), name)
 
-    clips = sum(map(len, _blocks(sequence, frame, stride, length, error)[2]))  # they are not stored
-    sensors = pa.concat_tables(parts["sensor"]).group_by("values").aggregate([("counts", "sum")]).sort_by("values")
+    # they are not stored
+    clips = sum(map(len, _blocks(sequence, frame, stride, length, error)[2]))
+    sensors = (
+        pa.concat_tables(parts["sensor"])
+        .group_by("values")
+        .aggregate([("counts", "sum")])
+        .sort_by("values")
+    )
     first = (column.slice(0, _SHOWN).to_pylist() for column in sensors.columns)
-    splits = sorted((SPLITS[at], int(count)) for at, count in enumerate(np.bincount(split)) if count)
-    counts = {"split": (splits, len(splits)), "sensor": (list(zip(*first, strict=True)), len(sensors))}
-    return Summary(len(frame), len(recordings), clips, {name: filled[name] for name in names}, counts, digest)
+    splits = sorted(
+        (SPLITS[at], int(count)) for at, count in enumerate(np.bincount(split)) if count
+    )
+    counts = {
+        "split": (splits, len(splits)),
+        "sensor": (list(zip(*first, strict=True)), len(sensors)),
+    }
+    return Summary(
+        len(frame), len(recordings), clips, {name: filled[name] for name in names}, counts, digest
+    )
 
 
 _MOST = 1 << 61
@@ -130,9 +156,13 @@ _BLOCK = 1 << 18  # rows at a time, so that the intermediate arrays of a block f
 
 
 def clip_windows(
-    sequence: np.ndarray, frame: np.ndarray, stride: np.ndarray, length: int,
-    repeat_error: Callable[[int, int], Exception] | None = None, ends: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    sequence: np.ndarray,
+    frame: np.ndarray,
+    stride: np.ndarray,
+    length: int,
+    repeat_error: Callable[[int, int], Exception] | None = None,
+    ends: np.ndarray | None = None,
+) -> np.ndarray:
     """Return row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered by t's row id.
 
     The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` (of row t) are i64 (rows,). A row
@@ -140,21 +170,29 @@ def clip_windows(
     repeats a frame, and OverflowError for a length above 10^12.
     """
     order, key, blocks = _blocks(sequence, frame, stride, length, repeat_error, ends)
-    dtype = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64  # there can be millions of windows
+    # there can be millions of windows
+    dtype = np.int32 if len(key) <= np.iinfo(np.int32).max else np.int64
     if length > np.bincount(sequence, minlength=1).max():
         return np.empty((0, length), dtype)
-    windows, count = np.empty((len(key), length), dtype), 0
+    windows = np.empty((len(key), length), dtype)
+    count = 0
     for positions in blocks:
         windows[count : count + len(positions)] = positions if order is None else order[positions]
         count += len(positions)
     windows = windows[:count]
-    return windows if order is None else windows[np.argsort(windows[:, -1], kind="stable")]
+    if order is None:
+        return windows
+    return windows[np.argsort(windows[:, -1], kind="stable")]
 
 
 def _blocks(
-    sequence: np.ndarray, frame: np.ndarray, stride: np.ndarray, length: int,
-    repeat_error: Callable[[int, int], Exception] | None, ends: np.ndarray | None = None,
-) -> tuple[np.ndarray | None, np.ndarray, Iterator[np.ndarray]]:  # fmt: skip
+    sequence: np.ndarray,
+    frame: np.ndarray,
+    stride: np.ndarray,
+    length: int,
+    repeat_error: Callable[[int, int], Exception] | None,
+    ends: np.ndarray | None = None,
+) -> tuple[np.ndarray | None, np.ndarray, Iterator[np.ndarray]]:
     """Return (order, key) of `_sorted_keys`, and windows as positions in them, in blocks. Raises as `clip_windows`."""
     if length < 1:
         raise ValueError(f"a clip has at least one frame, not {length}")
@@ -163,29 +201,42 @@ def _blocks(
     order, key, spread = _sorted_keys(sequence, frame)
     repeats = np.flatnonzero(key[1:] == key[:-1])
     if repeats.size and length > 1:
-        first, second = sorted(int(at if order is None else order[at]) for at in (repeats[0], repeats[0] + 1))
-        raise repeat_error(first, second) if repeat_error else ValueError(f"rows {first}, {second}: the same frame")
+        first, second = sorted(
+            int(at if order is None else order[at]) for at in (repeats[0], repeats[0] + 1)
+        )
+        raise (
+            repeat_error(first, second)
+            if repeat_error
+            else ValueError(f"rows {first}, {second}: the same frame")
+        )
 
     def blocks() -> Iterator[np.ndarray]:
         for start in range(0, len(key), _BLOCK):
             last = np.arange(start, min(start + _BLOCK, len(key)))
             rows = last if order is None else order[last]
             if ends is not None:
-                last, rows = last[ends[rows]], rows[ends[rows]]
+                last = last[ends[rows]]
+                rows = rows[ends[rows]]
             yield _windows_ending_at(last, key, spread, stride[rows], length)
 
     return order, key, blocks()
 
 
-def _windows_ending_at(last: np.ndarray, key: np.ndarray, spread: int, stride: np.ndarray, length: int) -> np.ndarray:
+def _windows_ending_at(
+    last: np.ndarray, key: np.ndarray, spread: int, stride: np.ndarray, length: int
+) -> np.ndarray:
     """Return the whole windows that end at the positions `last` of `key`, as positions i64 (windows, length)."""
     windows = np.empty((len(last), length), np.int64)
     windows[:, -1] = last
-    is_whole, last_key, stride = np.ones(len(last), bool), key[last], np.minimum(stride, spread)
+    is_whole = np.ones(len(last), bool)
+    last_key = key[last]
+    stride = np.minimum(stride, spread)
     for back in range(1, length):
         wanted = last_key - back * stride
-        same_sequence = last_key % spread >= back * stride  # else the key would be one of the sequence before
-        at = np.maximum(last - back * stride, 0)  # its position if no frame between is missing
+        # else the key would be one of the sequence before
+        same_sequence = last_key % spread >= back * stride
+        # its position if no frame between is missing
+        at = np.maximum(last - back * stride, 0)
         elsewhere = np.flatnonzero(same_sequence & (key[at] != wanted))
         at[elsewhere] = np.minimum(np.searchsorted(key, wanted[elsewhere]), len(key) - 1)
         is_whole &= same_sequence & (key[at] == wanted)
@@ -193,12 +244,16 @@ def _windows_ending_at(last: np.ndarray, key: np.ndarray, spread: int, stride: n
     return windows[is_whole]
 
 
-def _sorted_keys(sequence: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, int]:
+def _sorted_keys(
+    sequence: np.ndarray, frame: np.ndarray
+) -> tuple[np.ndarray | None, np.ndarray, int]:
     """Return (order, key, spread): row ids i64 sorted by sequence and frame (None if sorted), and their keys. A key i64
     is sequence * spread + frame. Frames count from 0 and are below `spread`."""
     if not len(frame):
         return None, np.arange(0), 1
-    low, high, sequences = int(frame.min()), int(frame.max()), int(sequence.max()) + 1
+    low = int(frame.min())
+    high = int(frame.max())
+    sequences = int(sequence.max()) + 1
     if (high - low + 1) * sequences < _MOST:
         spread = high - low + 1
         key = sequence * spread
@@ -210,10 +265,13 @@ def _sorted_keys(sequence: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray | 
         return order, key[order], spread
     # Time stamps in ns: count from the first frame of each sequence.
     order = np.lexsort((frame, sequence))
-    sequence, frame = sequence[order], frame[order]
+    sequence = sequence[order]
+    frame = frame[order]
     starts = np.flatnonzero(np.diff(sequence, prepend=-1))
     frame = frame - np.repeat(frame[starts], np.diff(np.append(starts, len(frame))))
     spread = int(frame.max()) + 1
     if spread * sequences >= _MOST:
-        raise OverflowError(f"frame_index spans {spread} in one of {sequences} sequences, more than 64 bits hold")
+        raise OverflowError(
+            f"frame_index spans {spread} in one of {sequences} sequences, more than 64 bits hold"
+        )
     return order, sequence * spread + frame, spread

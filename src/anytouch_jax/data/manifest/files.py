@@ -36,11 +36,13 @@ from anytouch_jax.files import atomic_path
 MAX_BYTES = 1 << 29  # of one file: an image of images.MAX_PIXELS with four channels of 16 bits
 SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
 _PARQUET_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", (32,))])
-_NPY_HEADER_1, _NPY_HEADER_2 = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+_NPY_HEADER_1 = np.lib.format.read_array_header_1_0
+_NPY_HEADER_2 = np.lib.format.read_array_header_2_0
 _TAR_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8")])
 _OPEN = 64  # open shards at once
 _HELD = 256 << 20  # bytes of a Parquet column in memory
-_NPY_LOCK = threading.Lock()  # a .npy header is Python text, and the parser of 3.11 can fail in two threads
+# a .npy header is Python text, and the parser of 3.11 can fail in two threads
+_NPY_LOCK = threading.Lock()
 
 
 class ShardError(ValueError):
@@ -52,7 +54,9 @@ def read_file(path: Path) -> bytes:
     place = split_shard_path(path)
     if place is None:
         return _read_loose(path)
-    return (_column(place[0], path.parent.name) if path.parent != place[0] else _shard(place[0])).read(place[1])
+    return (
+        _column(place[0], path.parent.name) if path.parent != place[0] else _shard(place[0])
+    ).read(place[1])
 
 
 def split_shard_path(path: Path) -> tuple[Path, int] | None:
@@ -87,7 +91,9 @@ def _read_loose(path: Path) -> bytes:
         if len(parts[0]) != status.st_size:  # it grew, or the read was interrupted
             while part := os.read(file, status.st_size + 1):
                 parts.append(part)
-        return parts[0] if len(parts) == 1 else b"".join(parts)
+        if len(parts) == 1:
+            return parts[0]
+        return b"".join(parts)
     finally:
         os.close(file)
 
@@ -101,7 +107,9 @@ class _Shard:
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError:
-            raise ShardError(f"there is no shard {path}; copy it from where the data were packed") from None
+            raise ShardError(
+                f"there is no shard {path}; copy it from where the data were packed"
+            ) from None
 
     def __del__(self) -> None:
         if self._file >= 0:
@@ -109,10 +117,14 @@ class _Shard:
 
     def read(self, row: int) -> bytes:
         if row >= len(self._index):
-            raise ShardError(f"the shard has {len(self._index)} rows, no row {row}; pack the data again")
+            raise ShardError(
+                f"the shard has {len(self._index)} rows, no row {row}; pack the data again"
+            )
         entry = self._index[row]
-        size, offset = int(entry["size"]), int(entry["offset"])
-        parts, length = [], 0
+        size = int(entry["size"])
+        offset = int(entry["offset"])
+        parts = []
+        length = 0
         while length < size and (part := os.pread(self._file, size - length, offset + length)):
             parts.append(part)
             length += len(part)
@@ -125,7 +137,9 @@ class _Shard:
             valid = hashlib.sha256(data).digest() == entry["sha256"].tobytes()
         if not valid:
             fault = "cut short" if length < size else "damaged (its checksum does not match)"
-            raise ShardError(f"row {row} of the shard is {fault}; copy the shard again from where the data were packed")
+            raise ShardError(
+                f"row {row} of the shard is {fault}; copy the shard again from where the data were packed"
+            )
         return data
 
 
@@ -139,13 +153,23 @@ def read_shard_index(path: Path) -> np.ndarray:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
     except FileNotFoundError:
-        raise ShardError(f"there is no shard {path}; copy it from where the data were packed") from None
+        raise ShardError(
+            f"there is no shard {path}; copy it from where the data were packed"
+        ) from None
     except (zipfile.BadZipFile, ValueError, NotImplementedError, OSError) as error:
-        raise ShardError(f"{path} is damaged: {error}; copy it again from where the data were packed") from None
-    if any(entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_BYTES for entry in entries):
+        raise ShardError(
+            f"{path} is damaged: {error}; copy it again from where the data were packed"
+        ) from None
+    if any(
+        entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_BYTES
+        for entry in entries
+    ):
         raise ShardError(f"{path} is not a shard made by anytouch data pack")
     # `pack` writes ASCII names and no extra fields, so a local header is 30 bytes and the name.
-    places = [(entry.header_offset + 30 + len(entry.filename), entry.file_size, entry.CRC) for entry in entries]
+    places = [
+        (entry.header_offset + 30 + len(entry.filename), entry.file_size, entry.CRC)
+        for entry in entries
+    ]
     return np.array(places, SHARD_INDEX)
 
 
@@ -153,11 +177,17 @@ def tar_members(path: Path, file: BinaryIO | None = None) -> list[tuple[str, int
     """Return (name, offset, size) of the files in a plain tar, or in `file`, by its headers. Raises ShardError."""
     try:
         with tarfile.open(path, "r:", fileobj=file) as archive:
-            members = [(member.name, member.offset_data, member.size) for member in archive if member.isreg()]
+            members = [
+                (member.name, member.offset_data, member.size)
+                for member in archive
+                if member.isreg()
+            ]
     except FileNotFoundError:
         raise ShardError(f"there is no shard {path}; copy it from where the data are") from None
     except (tarfile.TarError, ValueError, OSError, OverflowError) as error:
-        raise ShardError(f"{path} is no whole tar without compression: {error}; download it again") from None
+        raise ShardError(
+            f"{path} is no whole tar without compression: {error}; download it again"
+        ) from None
     if any(size > MAX_BYTES for *_, size in members):
         raise ShardError(f"{path} has a file of more than {MAX_BYTES} bytes")
     return members
@@ -168,28 +198,41 @@ class _Column:
 
     def __init__(self, path: Path, name: str) -> None:
         try:
-            self._file, self._name = pa.parquet.ParquetFile(path), name
+            self._file = pa.parquet.ParquetFile(path)
+            self._name = name
         except FileNotFoundError:
             raise ShardError(f"there is no shard {path}; copy it from where the data are") from None
         except (pa.ArrowException, OSError) as error:
-            raise ShardError(f"{path} is no whole Parquet file: {error}; download it again") from None
+            raise ShardError(
+                f"{path} is no whole Parquet file: {error}; download it again"
+            ) from None
         if name not in self._file.schema_arrow.names:
             raise ShardError(f"{path} has no column {name!r}; index the data again")
         groups = self._file.metadata
-        self._starts = np.cumsum([0, *(groups.row_group(i).num_rows for i in range(groups.num_row_groups))])
-        self._lock, self._held = threading.Lock(), dict[int, pa.ChunkedArray]()
+        self._starts = np.cumsum(
+            [0, *(groups.row_group(i).num_rows for i in range(groups.num_row_groups))]
+        )
+        self._lock = threading.Lock()
+        self._held = dict[int, pa.ChunkedArray]()
 
     def read(self, row: int) -> bytes:
         if row >= self._starts[-1]:
-            raise ShardError(f"the shard has {self._starts[-1]} rows, no row {row}; index the data again")
+            raise ShardError(
+                f"the shard has {self._starts[-1]} rows, no row {row}; index the data again"
+            )
         group = int(np.searchsorted(self._starts, row, "right")) - 1
         with self._lock:
             if group not in self._held:
                 try:
                     table = self._file.read_row_group(group, [self._name], use_threads=False)
                 except (pa.ArrowException, OSError) as error:
-                    raise ShardError(f"row group {group} of the shard is damaged: {error}; download it again") from None
-                while self._held and sum(held.nbytes for held in self._held.values()) + table.nbytes > _HELD:
+                    raise ShardError(
+                        f"row group {group} of the shard is damaged: {error}; download it again"
+                    ) from None
+                while (
+                    self._held
+                    and sum(held.nbytes for held in self._held.values()) + table.nbytes > _HELD
+                ):
                     self._held.pop(next(iter(self._held)))
                 self._held[group] = table[self._name]
             cells = self._held[group]
@@ -205,7 +248,9 @@ def _parquet_index(path: Path) -> np.ndarray:
     try:
         index = unpack_npy(_read_loose(path))
     except FileNotFoundError:
-        raise ShardError(f"there is no {path}, the shard's index; copy it from where the data were packed") from None
+        raise ShardError(
+            f"there is no {path}, the shard's index; copy it from where the data were packed"
+        ) from None
     except (OSError, ValueError) as error:
         raise ShardError(f"{path}, the index of the shard, is damaged: {error}") from None
     is_index = index.dtype == _PARQUET_INDEX and index.ndim == 1
@@ -227,12 +272,16 @@ def unpack_npy(data: bytes) -> np.ndarray:
         raise ValueError("it holds Python objects")
     if stream.tell() + math.prod(shape) * dtype.itemsize > len(data):
         raise ValueError("the file is cut short")
-    return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(shape, order="F" if fortran else "C")
+    return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(
+        shape, order="F" if fortran else "C"
+    )
 
 
-_cached_index = lru_cache(None)(read_shard_index)  # 20 bytes a file; parsing takes about 5 us a file
+# 20 bytes a file; parsing takes about 5 us a file
+_cached_index = lru_cache(None)(read_shard_index)
 _column = lru_cache(16)(_Column)
-_shard = lru_cache(_OPEN)(_Shard)  # the least recently used one closes when its last reader is done
+# the least recently used one closes when its last reader is done
+_shard = lru_cache(_OPEN)(_Shard)
 
 
 PROTOCOLS = ("s3", "gs", "az", "hf", "http", "https", "memory")
@@ -257,7 +306,9 @@ def local_copy(address: str) -> Path:
         with _LOCKS[hash(target) % len(_LOCKS)]:
             if not target.exists():
                 _fetch(file, target)
-    return target / entry if entry else target
+    if entry:
+        return target / entry
+    return target
 
 
 def _split(address: str) -> tuple[str, str]:
@@ -279,7 +330,9 @@ def open_store(address: str) -> tuple[Any, str]:
 
         system, path = fsspec.core.url_to_fs(address)
     except (ImportError, ValueError) as error:
-        raise UserError(f"{address} cannot be read: {error}; install the package for it (s3fs for s3)") from None
+        raise UserError(
+            f"{address} cannot be read: {error}; install the package for it (s3fs for s3)"
+        ) from None
     return system, path
 
 
@@ -289,20 +342,32 @@ def _fetch(file: str, target: Path) -> None:
     try:
         size = int(system.size(path) or 0)
         _make_room(size, target)
-        with atomic_path(target) as part, system.open(path, "rb") as source, part.open("wb") as copy:
+        with (
+            atomic_path(target) as part,
+            system.open(path, "rb") as source,
+            part.open("wb") as copy,
+        ):
             shutil.copyfileobj(source, copy, 1 << 20)
     except FileNotFoundError:
-        raise UserError(f"there is no {file}; correct the manifest, or put the file there") from None
+        raise UserError(
+            f"there is no {file}; correct the manifest, or put the file there"
+        ) from None
     except Exception as error:  # each store has its own kinds, as of httpx and botocore
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise UserError(f"{file} cannot be copied to {target.parent}: {reason}; check access and free space") from None
+        raise UserError(
+            f"{file} cannot be copied to {target.parent}: {reason}; check access and free space"
+        ) from None
 
 
 def _make_room(size: int, target: Path) -> None:
     """Remove the copies that were not used for the longest until `size` more bytes fit."""
     limit = int(float(os.environ.get("ANYTOUCH_CACHE_GB", "20")) * 1e9)
     with _EVICTION:
-        copies = [(file.stat(), file) for file in _folder().glob("*/*") if file.is_file() and file != target]
+        copies = [
+            (file.stat(), file)
+            for file in _folder().glob("*/*")
+            if file.is_file() and file != target
+        ]
         total = sum(state.st_size for state, _ in copies) + size
         for state, file in sorted(copies, key=lambda copy: copy[0].st_mtime_ns):
             if total <= limit:

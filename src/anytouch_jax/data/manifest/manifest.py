@@ -21,7 +21,13 @@ import pyarrow.parquet
 
 from anytouch_jax.config import FIELD_SENSORS, ModelConfig, SpellingError, check_spelling
 from anytouch_jax.data.manifest import schema
-from anytouch_jax.data.manifest.content import Summary, clip_windows, content_digest, summarise, table_blocks
+from anytouch_jax.data.manifest.content import (
+    Summary,
+    clip_windows,
+    content_digest,
+    summarise,
+    table_blocks,
+)
 from anytouch_jax.data.manifest.files import is_remote, local_copy
 from anytouch_jax.data.manifest.schema import PATHS, SCHEMA, SPLITS, ManifestError, listed, shown
 from anytouch_jax.errors import ConfigError
@@ -51,13 +57,19 @@ class Manifest:
     def __repr__(self) -> str:
         counts = {}
         for name in ("split", "sensor"):
-            most = sorted(pc.value_counts(self.column(name)).to_pylist(), key=lambda entry: -entry["counts"])
-            counts[f"{name}s"] = listed([f"{entry['values']} {entry['counts']:,}" for entry in most])
+            most = sorted(
+                pc.value_counts(self.column(name)).to_pylist(), key=lambda entry: -entry["counts"]
+            )
+            counts[f"{name}s"] = listed(
+                [f"{entry['values']} {entry['counts']:,}" for entry in most]
+            )
         recordings = len(np.unique(self.codes("sequence", own=True)))
         return described(
-            f"Manifest {self._name}", rows=f"{len(self):,} in {recordings:,} recordings", **counts,
+            f"Manifest {self._name}",
+            rows=f"{len(self):,} in {recordings:,} recordings",
+            **counts,
             columns=listed(self.table.column_names),
-        )  # fmt: skip
+        )
 
     def where(self, row: int) -> str:
         """Return "line 5 of /data/m.csv", or "row 3 of /data/m.parquet", for errors."""
@@ -70,12 +82,16 @@ class Manifest:
         if name in SCHEMA:
             fill = pa.scalar(1 if name == "stride" else None, SCHEMA[name])
             return pa.chunked_array([pa.repeat(fill, len(self))])
-        raise ManifestError(f"{self._name} has no column {name!r}; it has {listed(self.table.column_names)}")
+        raise ManifestError(
+            f"{self._name} has no column {name!r}; it has {listed(self.table.column_names)}"
+        )
 
     def value(self, row: int, name: str) -> Any:
         """Return one cell as a Python value, None if it is null or the column is absent."""
         column = self._cells.get(name)
-        return None if column is None else column[int(row)].as_py()
+        if column is None:
+            return None
+        return column[int(row)].as_py()
 
     def present(self, name: str) -> np.ndarray:
         """Return which rows have a value in column `name`, bool (rows,)."""
@@ -83,7 +99,9 @@ class Manifest:
 
     def text_column(self, name: str) -> np.ndarray:
         """Return a column as strings (rows,), "" for null."""
-        return np.array(["" if value is None else str(value) for value in self.column(name).to_pylist()])
+        return np.array(
+            ["" if value is None else str(value) for value in self.column(name).to_pylist()]
+        )
 
     def number_column(self, name: str) -> np.ndarray:
         """Return a column as f64 (rows,), NaN where it is empty or missing. Raises ManifestError for text."""
@@ -117,7 +135,9 @@ class Manifest:
         rows = np.flatnonzero(np.asarray(pc.equal(self.table["split"], split)))
         if not rows.size:
             splits = ", ".join(sorted(pc.unique(self.table["split"]).to_pylist()))
-            raise ManifestError(f"{self._name}: column 'split' has no row {split!r}; it has {splits}")
+            raise ManifestError(
+                f"{self._name}: column 'split' has no row {split!r}; it has {splits}"
+            )
         return rows
 
     def clips(self, length: int, split: str | None = None) -> np.ndarray:
@@ -126,21 +146,27 @@ class Manifest:
         A clip is rows of one sequence and one split whose frame_index values are exactly `stride` (of the last row)
         apart. `split` selects the clips of that split. Raises ManifestError if a sequence repeats a frame.
         """
-        table, ends = self.table, None if split is None else np.zeros(len(self), bool)
+        table = self.table
+        ends = None if split is None else np.zeros(len(self), bool)
         if split is not None and ends is not None:
             ends[self.rows_of(split)] = True
         sequence = self.codes("sequence", own=True)
         sequence *= len(SPLITS)
         sequence += self.codes("split")
         has_stride = "stride" in table.column_names
-        stride = np.asarray(table["stride"]) if has_stride else np.broadcast_to(np.int64(1), len(self))
+        stride = (
+            np.asarray(table["stride"]) if has_stride else np.broadcast_to(np.int64(1), len(self))
+        )
 
         def repeats(first: int, second: int) -> ManifestError:
-            frame, name = self.value(second, "frame_index"), self.value(second, "sequence")
+            frame = self.value(second, "frame_index")
+            name = self.value(second, "sequence")
             return _repeats(self.where(first), self.where(second), frame, name)
 
         try:
-            return clip_windows(sequence, np.asarray(table["frame_index"]), stride, length, repeats, ends)
+            return clip_windows(
+                sequence, np.asarray(table["frame_index"]), stride, length, repeats, ends
+            )
         except OverflowError as error:
             raise ManifestError(f"{self._name}: {error}") from None
 
@@ -153,7 +179,10 @@ class Manifest:
     def _cells(self) -> dict[str, Any]:
         # A table makes a list of its names and a new column object at each look-up.
         columns = {name: self.table[name] for name in self.table.column_names}
-        return {name: column.chunk(0) if column.num_chunks == 1 else column for name, column in columns.items()}
+        return {
+            name: column.chunk(0) if column.num_chunks == 1 else column
+            for name, column in columns.items()
+        }
 
     @cached_property
     def _roots(self) -> tuple[str, ...]:
@@ -188,10 +217,16 @@ def summarise_file(path: str | Path, length: int = 3) -> Summary:
         names, blocks = schema.parquet_blocks(file)
     else:
         table = read(path).table
-        names, blocks = table.column_names, table_blocks(table)
+        names = table.column_names
+        blocks = table_blocks(table)
     try:
         place = partial(schema.place_of, file)
-        return summarise(names, blocks, length, lambda first, second, *it: _repeats(place(first), place(second), *it))
+        return summarise(
+            names,
+            blocks,
+            length,
+            lambda first, second, *it: _repeats(place(first), place(second), *it),
+        )
     except OverflowError as error:
         raise ManifestError(f"{file}: {error}") from None
 
@@ -219,12 +254,17 @@ def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
 
 def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
     kinds: dict[str, set[bool]] = {}
-    for field in (field for table in tables for field in table.schema if not pa.types.is_null(field.type)):
+    for field in (
+        field for table in tables for field in table.schema if not pa.types.is_null(field.type)
+    ):
         kinds.setdefault(field.name, set()).add(schema.is_text(field.type))
     try:
         # A label that is a number in one manifest and text in another becomes text in all of them.
         for name in (name for name, several in kinds.items() if len(several) > 1):
-            tables = [_with_column(t, name, t[name].cast(pa.string())) if name in t.column_names else t for t in tables]
+            tables = [
+                _with_column(t, name, t[name].cast(pa.string())) if name in t.column_names else t
+                for t in tables
+            ]
         table = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
         raise ManifestError(f"{', '.join(map(str, files))} cannot be joined: {error}") from None
@@ -262,7 +302,8 @@ def write(manifest: Manifest, path: str | Path) -> None:
 
 def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
     """Return the path of a manifest to be written, and its table for that folder. Raises ManifestError."""
-    target, table = Path(path).expanduser().resolve(), manifest.table
+    target = Path(path).expanduser().resolve()
+    table = manifest.table
     schema.table_suffix(target)
     folder = target.parent
 
@@ -279,7 +320,9 @@ def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
 
     if any(file.parent != folder for file in manifest.files):
         for name in set(PATHS) & set(table.column_names):
-            cells = [cell and relative(row, cell) for row, cell in enumerate(table[name].to_pylist())]
+            cells = [
+                cell and relative(row, cell) for row, cell in enumerate(table[name].to_pylist())
+            ]
             table = _with_column(table, name, pa.array(cells, pa.string()))
     return target, table
 
@@ -289,47 +332,68 @@ def with_distinct_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
     for name in KEYS if len(manifest.files) > 1 else ():
         if name not in table.column_names:
             continue
-        codes, column = manifest.codes(name), manifest.table[name]
+        codes = manifest.codes(name)
+        column = manifest.table[name]
         known = codes >= 0
-        pairs = np.unique(np.stack([codes[known], manifest.source[known].astype(np.int64)], 1), axis=0)
+        pairs = np.unique(
+            np.stack([codes[known], manifest.source[known].astype(np.int64)], 1), axis=0
+        )
         if len(pairs) > len(np.unique(pairs[:, 0])):
-            prefix = pa.array([f"{number}/" for number in range(len(manifest.files))]).take(pa.array(manifest.source))
-            cells = pc.binary_join_element_wise(prefix, column.combine_chunks().cast(pa.string()), "")
+            prefix = pa.array([f"{number}/" for number in range(len(manifest.files))]).take(
+                pa.array(manifest.source)
+            )
+            cells = pc.binary_join_element_wise(
+                prefix, column.combine_chunks().cast(pa.string()), ""
+            )
             table = _with_column(table, name, pa.chunked_array([cells]))
     return table
 
 
 def sensor_rows(
-    manifest: Manifest, model: ModelConfig, rows: np.ndarray | None = None, *,
+    manifest: Manifest,
+    model: ModelConfig,
+    rows: np.ndarray | None = None,
+    *,
     unknown: Literal["error", "skip", "universal"] = "error",
-) -> tuple[np.ndarray, list[str]]:  # fmt: skip
+) -> tuple[np.ndarray, list[str]]:
     """Return the sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out, and notes.
 
     Only `rows` (default: all) are considered. Force fields are left out. A sensor outside `model.sensors` is an error,
     is left out (`skip`), or uses the universal tokens (`universal`). Raises ManifestError, which names the first row.
     """
     ids = np.full(len(manifest), -1, np.int32)
-    rows, notes = np.arange(len(manifest)) if rows is None else np.unique(rows), []
+    rows = np.arange(len(manifest)) if rows is None else np.unique(rows)
+    notes = []
     for same in group_rows(rows, manifest.codes("sensor")[rows]):
         name = manifest.value(same[0], "sensor")
         try:
             ids[same] = model.sensor_row(name)
         except ConfigError as error:
             if name in FIELD_SENSORS:
-                notes.append(f"left out {len(same)} rows of {name}: it measures a force field and has no images")
+                notes.append(
+                    f"left out {len(same)} rows of {name}: it measures a force field and has no images"
+                )
             elif unknown == "error" or isinstance(error, SpellingError):
-                raise ManifestError(f"{manifest.where(same[0])}, column 'sensor': {error}") from None
+                raise ManifestError(
+                    f"{manifest.where(same[0])}, column 'sensor': {error}"
+                ) from None
             elif unknown == "skip":
                 notes.append(f"left out {len(same)} rows of the unknown sensor {shown(name)}")
             else:
                 ids[same] = model.universal_row
-                notes.append(f"sensor {shown(name)} is unknown: its {len(same)} rows use the universal sensor tokens")
+                notes.append(
+                    f"sensor {shown(name)} is unknown: its {len(same)} rows use the universal sensor tokens"
+                )
     return ids, notes
 
 
-def misspelt_sensors(manifest: Manifest) -> Iterator[tuple[Literal["error", "warning"], str, np.ndarray]]:
+def misspelt_sensors(
+    manifest: Manifest,
+) -> Iterator[tuple[Literal["error", "warning"], str, np.ndarray]]:
     """Yield (level, sentence, row ids i64) for sensor names that are nearly known names. New names are no fault."""
-    for rows in sorted(manifest.groups("sensor"), key=lambda rows: str(manifest.value(rows[0], "sensor"))):
+    for rows in sorted(
+        manifest.groups("sensor"), key=lambda rows: str(manifest.value(rows[0], "sensor"))
+    ):
         try:
             check_spelling(str(manifest.value(rows[0], "sensor")))
         except SpellingError as error:
@@ -342,7 +406,8 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
         raise ManifestError("the path is empty")
     if is_remote(relative):
         return local_copy(relative)
-    root, text = str(root), shown(relative)
+    root = str(root)
+    text = shown(relative)
     if "\0" in relative or len(relative) > _LONGEST_PATH:
         raise ManifestError(f"the path {text} is not a file name")
     head, _, name = relative.rpartition("/")
@@ -356,7 +421,9 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
             "slashes (touch/0.png)"
         )
     if relative[0] == "/":
-        raise ManifestError(f"the path {text} is absolute; write it relative to the manifest's folder, {root}")
+        raise ManifestError(
+            f"the path {text} is absolute; write it relative to the manifest's folder, {root}"
+        )
     if not path.startswith(root if root[-1] == "/" else f"{root}/"):
         link = ", by a link; put the files there, or move the manifest next to them"
         raise ManifestError(
@@ -368,16 +435,25 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
 @lru_cache(4096)
 def _real_folder(root: str, head: str) -> str:
     folder = os.path.realpath(os.path.join(root, head))
-    return "" if folder == "/" else folder
+    if folder == "/":
+        return ""
+    return folder
 
 
 def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
     """Return the manifest of `rows` (ids i64) in the order given; errors still name the rows of the original files."""
     rows = np.asarray(rows, np.int64)
-    return Manifest(manifest.table.take(pa.array(rows)), manifest.files, manifest.source[rows], manifest.number[rows])
+    return Manifest(
+        manifest.table.take(pa.array(rows)),
+        manifest.files,
+        manifest.source[rows],
+        manifest.number[rows],
+    )
 
 
-def group_rows(rows: np.ndarray, keys: np.ndarray, order: np.ndarray | None = None) -> list[np.ndarray]:
+def group_rows(
+    rows: np.ndarray, keys: np.ndarray, order: np.ndarray | None = None
+) -> list[np.ndarray]:
     """Return `rows` (ids i64) by equal `keys` (rows,) or (rows, k), in the order of keys, then of `order` and row."""
     if not len(rows):
         return []
@@ -388,7 +464,11 @@ def group_rows(rows: np.ndarray, keys: np.ndarray, order: np.ndarray | None = No
 
 def replace_column(manifest: Manifest, name: str, values: Any) -> Manifest:
     """Return the manifest with column `name` set to `values` (rows,), appended if it was absent."""
-    column = pa.array(values, SCHEMA.get(name)) if not isinstance(values, pa.Array | pa.ChunkedArray) else values
+    column = (
+        pa.array(values, SCHEMA.get(name))
+        if not isinstance(values, pa.Array | pa.ChunkedArray)
+        else values
+    )
     return replace(manifest, table=_with_column(manifest.table, name, column))
 
 
@@ -407,9 +487,13 @@ def distinct_files(manifest: Manifest, columns: Sequence[str] = PATHS) -> Files:
     """Return the files of the path columns `columns`, each once (by its written path and its manifest)."""
     columns = [name for name in columns if name in manifest.table.column_names]
     rows = len(manifest)
-    cells = pa.chunked_array([chunk for name in columns for chunk in manifest.table[name].chunks], pa.string())
+    cells = pa.chunked_array(
+        [chunk for name in columns for chunk in manifest.table[name].chunks], pa.string()
+    )
     encoded = cells.dictionary_encode().unify_dictionaries()
-    number = np.concatenate([np.asarray(pc.fill_null(chunk.indices, -1)) for chunk in encoded.chunks]).astype(np.int64)
+    number = np.concatenate(
+        [np.asarray(pc.fill_null(chunk.indices, -1)) for chunk in encoded.chunks]
+    ).astype(np.int64)
     key = number * len(manifest.files) + np.tile(manifest.source.astype(np.int64), len(columns))
     known = np.flatnonzero(number >= 0)
     _, first, code = np.unique(key[known], return_index=True, return_inverse=True)

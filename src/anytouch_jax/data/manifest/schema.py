@@ -33,11 +33,15 @@ MAX_TEXT = 10_000  # bytes of a text cell in the columns that are used
 _SPACES = r"[\s\p{Z}\x{200B}\x{FEFF}]+"
 NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 _READERS = 2  # parts of a Parquet file that are read at once: more need more memory
-_PART = 1 << 22  # cells of a part: a large table is read column by column, so that it is never in memory twice
+# cells of a part: a large table is read column by column, so that it is never in memory twice
+_PART = 1 << 22
 BLOCK = 1 << 19  # rows that are read at once where a table is not needed whole
-_TEXT, _WHOLE, _FLAG = pa.string(), pa.int64(), pa.bool_()
+_TEXT = pa.string()
+_WHOLE = pa.int64()
+_FLAG = pa.bool_()
 _TEXT_COLUMNS = (*REQUIRED, *PATHS, "dataset", "unit", "touch", "object", "text", "license")
-_NAMES = ("dataset", "unit", "object", "license")  # text columns with values that a hand-written table may misspell
+# text columns with values that a hand-written table may misspell
+_NAMES = ("dataset", "unit", "object", "license")
 SCHEMA: dict[str, pa.DataType] = dict.fromkeys(_TEXT_COLUMNS, _TEXT)
 SCHEMA |= {"frame_index": _WHOLE, "stride": _WHOLE, "commercial": _FLAG}
 
@@ -51,7 +55,11 @@ class ManifestError(UserError):
 def is_manifest(path: Path) -> bool:
     """Return whether the file in `path` has the columns of a manifest; its values are not checked."""
     try:
-        names = pa.parquet.read_schema(path).names if path.suffix.lower() == ".parquet" else _csv_names(path)
+        names = (
+            pa.parquet.read_schema(path).names
+            if path.suffix.lower() == ".parquet"
+            else _csv_names(path)
+        )
     except (pa.ArrowException, UnicodeDecodeError, csv.Error):
         return False
     return set(REQUIRED) <= {name.strip() for name in names}
@@ -88,7 +96,9 @@ def load_table(path: Path) -> pa.Table:
 def shown(value: object) -> str:
     """Return a value for a message: at most 200 characters of its form in Python."""
     text = repr(value[:200] if isinstance(value, str | bytes) else value)
-    return text if len(text) <= 200 else f"{text[:197]}..."
+    if len(text) <= 200:
+        return text
+    return f"{text[:197]}..."
 
 
 def listed(names: Sequence[str], count: int | None = None) -> str:
@@ -106,7 +116,9 @@ def reading(path: Path) -> Iterator[None]:
             raise ManifestError(f"{path} is {kind}")
         yield
     except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
-        reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0][:500]
+        reason = (
+            getattr(error, "strerror", None) or str(error) or type(error).__name__
+        ).splitlines()[0][:500]
         kind = path.suffix.lower()[1:]
         raise ManifestError(f"{path} cannot be read as a {kind} table: {reason}") from None
 
@@ -116,12 +128,18 @@ def read_text_csv(path: Path) -> pa.Table:
     with reading(path):
         names = _csv_names(path)
         types = dict.fromkeys(names, _TEXT)
-        convert = pa.csv.ConvertOptions(column_types=types, strings_can_be_null=True, null_values=[""])
+        convert = pa.csv.ConvertOptions(
+            column_types=types, strings_can_be_null=True, null_values=[""]
+        )
         parse = pa.csv.ParseOptions(newlines_in_values=True)
         try:
             table = pa.csv.read_csv(path, convert_options=convert, parse_options=parse)
-            if any(pc.any(pc.match_substring_regex(column, r"[\r\n]")).as_py() for column in table.columns):
-                deque(csv_lines(path), 0)  # Arrow takes the rows after a quote that is not closed for its text
+            if any(
+                pc.any(pc.match_substring_regex(column, r"[\r\n]")).as_py()
+                for column in table.columns
+            ):
+                # Arrow takes the rows after a quote that is not closed for its text
+                deque(csv_lines(path), 0)
             return table.rename_columns([name.strip() for name in table.column_names])
         except pa.ArrowInvalid:
             odd = ((line, cells) for line, cells in csv_lines(path) if len(cells) != len(names))
@@ -154,15 +172,21 @@ def _csv_line_numbers(path: Path, changed: int) -> np.ndarray:
 
 def _load_parquet(path: Path) -> pa.Table:
     with pa.parquet.ParquetFile(path) as file:
-        names, rows = file.schema_arrow.names, file.metadata.num_rows
+        names = file.schema_arrow.names
+        rows = file.metadata.num_rows
     _check_names(names, rows, path)
     size = max(1, _PART // rows)
 
     def load(start: int) -> list[pa.ChunkedArray]:
         part = names[start : start + size]
-        with pa.parquet.ParquetFile(path) as file:  # two threads cannot share a file
+        # two threads cannot share a file
+        with pa.parquet.ParquetFile(path) as file:
             table = file.read(part, use_threads=False)
-        return pa.table({name: _checked(name, table[name], path) for name in part}).combine_chunks().columns
+        return (
+            pa.table({name: _checked(name, table[name], path) for name in part})
+            .combine_chunks()
+            .columns
+        )
 
     with ThreadPoolExecutor(_READERS) as pool:
         columns = [column for part in pool.map(load, range(0, len(names), size)) for column in part]
@@ -196,10 +220,14 @@ def typed(table: pa.Table, path: Path) -> pa.Table:
     many rows or none.
     """
     _check_names(table.column_names, table.num_rows, path)
-    return pa.table({name: _checked(name, table[name], path) for name in table.column_names}).combine_chunks()
+    return pa.table(
+        {name: _checked(name, table[name], path) for name in table.column_names}
+    ).combine_chunks()
 
 
-def typed_label(column: pa.ChunkedArray, name: str = "", where: Callable[[int], str] | None = None) -> pa.ChunkedArray:
+def typed_label(
+    column: pa.ChunkedArray, name: str = "", where: Callable[[int], str] | None = None
+) -> pa.ChunkedArray:
     """Return a text column as numbers or truth values if all cells are; 007 stays text, because its zeros matter.
 
     With `where`, which names a row, raises ManifestError for a class in two spellings, or a text among nine times as
@@ -217,7 +245,9 @@ def typed_label(column: pa.ChunkedArray, name: str = "", where: Callable[[int], 
 
 def clean_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return a text column in Unicode form NFC with single spaces, where every spelling of EMPTY is null."""
-    column = pc.utf8_trim(pc.replace_substring_regex(pc.utf8_normalize(column, "NFC"), _SPACES, " "), " ")
+    column = pc.utf8_trim(
+        pc.replace_substring_regex(pc.utf8_normalize(column, "NFC"), _SPACES, " "), " "
+    )
     is_empty = pc.is_in(pc.utf8_lower(column), value_set=pa.array(EMPTY))
     return pc.if_else(is_empty, pa.scalar(None, _TEXT), column)
 
@@ -226,7 +256,9 @@ def spellings(values: Iterable[str]) -> list[list[str]]:
     """Return the groups of values that differ by spaces, letter case or Unicode form only."""
     groups: dict[str, list[str]] = {}
     for value in dict.fromkeys(values):
-        groups.setdefault(" ".join(unicodedata.normalize("NFKC", value).casefold().split()), []).append(value)
+        groups.setdefault(
+            " ".join(unicodedata.normalize("NFKC", value).casefold().split()), []
+        ).append(value)
     return [group for group in groups.values() if len(group) > 1]
 
 
@@ -243,7 +275,9 @@ def _check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]
     is_name = pc.any(pc.match_substring_regex(column, r"^0\d")).as_py()
     if words.size and is_number.sum() >= 9 * words.size and not is_name:
         cell = shown(column[int(words[0])].as_py())
-        raise ManifestError(f"{where(words[0])}: column {name!r} has {cell} among numbers; write a number or nothing")
+        raise ManifestError(
+            f"{where(words[0])}: column {name!r} has {cell} among numbers; write a number or nothing"
+        )
 
 
 def _check_names(names: Sequence[str], rows: int, path: Path) -> None:
@@ -254,16 +288,22 @@ def _check_names(names: Sequence[str], rows: int, path: Path) -> None:
     if len(names) == 1 and ";" in names[0]:
         raise ManifestError(f"{path} has semicolons between its columns; save it with commas")
     if missing:
-        raise ManifestError(f"{path} lacks the column {', '.join(map(repr, missing))}; it has {listed(names)}")
+        raise ManifestError(
+            f"{path} lacks the column {', '.join(map(repr, missing))}; it has {listed(names)}"
+        )
     if not rows:
         raise ManifestError(f"{path} has no rows")
     if rows > MAX_ROWS:
-        raise ManifestError(f"{path} has {rows:,} rows, more than {MAX_ROWS:,}; split it into several manifests")
+        raise ManifestError(
+            f"{path} has {rows:,} rows, more than {MAX_ROWS:,}; split it into several manifests"
+        )
 
 
 def is_text(kind: pa.DataType) -> bool:
     """Return whether a column of this type holds text."""
-    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
+    return (
+        pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
+    )
 
 
 def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> pa.ChunkedArray:
@@ -272,7 +312,9 @@ def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
         row = pc.index(bad, True).as_py()
         if row >= 0:
-            raise ManifestError(f"{place_of(path, first + row)}: column {shown(name)} {problem(row)}")
+            raise ManifestError(
+                f"{place_of(path, first + row)}: column {shown(name)} {problem(row)}"
+            )
 
     for cast, kind in ((_plain, "UTF-8 text"), _CASTS[SCHEMA.get(name)]):
         try:
@@ -280,22 +322,32 @@ def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> 
         except pa.ArrowInvalid:
             row = _first_invalid(column, cast)
             value = "" if cast is _plain else f", is {shown(column[row].as_py())}"
-            raise ManifestError(f"{place_of(path, first + row)}: column {shown(name)} must be {kind}{value}") from None
+            raise ManifestError(
+                f"{place_of(path, first + row)}: column {shown(name)} must be {kind}{value}"
+            ) from None
         except pa.ArrowTypeError:
-            raise ManifestError(f"{path}: column {name!r} must be {kind}, is {column.type}") from None
+            raise ManifestError(
+                f"{path}: column {name!r} must be {kind}, is {column.type}"
+            ) from None
     if name in REQUIRED:
         refuse(pc.is_null(column), lambda _: "is empty")
     if name.startswith("label.") and is_text(column.type):  # polars writes large_string
         column = column.cast(_TEXT)
     if pa.types.is_string(column.type) and (name in SCHEMA or name.startswith("label.")):
         length = pc.binary_length(column)
-        refuse(pc.greater(length, MAX_TEXT), lambda row: f"has a text of {length[row]} bytes, more than {MAX_TEXT:,}")
+        refuse(
+            pc.greater(length, MAX_TEXT),
+            lambda row: f"has a text of {length[row]} bytes, more than {MAX_TEXT:,}",
+        )
     if name == "split":
-        unknown, choices = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS))), ", ".join(SPLITS)
+        unknown = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS)))
+        choices = ", ".join(SPLITS)
 
         def problem(row: int) -> str:
             value = column[row].as_py()
-            near = difflib.get_close_matches(value[:50].strip().lower().replace("validation", "val"), SPLITS, 1)
+            near = difflib.get_close_matches(
+                value[:50].strip().lower().replace("validation", "val"), SPLITS, 1
+            )
             guess = f"; did you mean {near[0]}?" if near else ""
             return f"must be one of {choices}, is the unknown split {shown(value)}{guess}"
 
@@ -308,7 +360,9 @@ def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> 
 
 def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:
     column.validate(full=True)
-    return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
+    if pa.types.is_dictionary(column.type):
+        return column.cast(column.type.value_type)
+    return column
 
 
 def _cast_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -317,7 +371,9 @@ def _cast_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
     column = column.cast(_TEXT)
     blank = pc.or_(pc.equal(pc.binary_length(column), 0), pc.utf8_is_space(column))
     # Copying millions of strings takes longer than the check.
-    return pc.if_else(blank, pa.scalar(None, _TEXT), column) if pc.any(blank).as_py() else column
+    if pc.any(blank).as_py():
+        return pc.if_else(blank, pa.scalar(None, _TEXT), column)
+    return column
 
 
 def _decimal(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -333,25 +389,33 @@ def _cast_whole(column: pa.ChunkedArray) -> pa.ChunkedArray:
         column = _decimal(pc.utf8_trim_whitespace(_cast_text(column)))
     try:
         return column.cast(_WHOLE)
-    except pa.ArrowInvalid:  # a column of whole numbers with gaps is often stored as floats ("130.0")
+    except (
+        pa.ArrowInvalid
+    ):  # a column of whole numbers with gaps is often stored as floats ("130.0")
         return column.cast(pa.float64()).cast(_WHOLE)
 
 
 def _cast_flag(column: pa.ChunkedArray) -> pa.ChunkedArray:
     if pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
-        column = _cast_whole(column).cast(_TEXT)  # a number other than 0 and 1 is a mistake, not "true"
-    return column if pa.types.is_boolean(column.type) else pc.utf8_trim_whitespace(_cast_text(column)).cast(_FLAG)
+        # a number other than 0 and 1 is a mistake, not "true"
+        column = _cast_whole(column).cast(_TEXT)
+    if pa.types.is_boolean(column.type):
+        return column
+    return pc.utf8_trim_whitespace(_cast_text(column)).cast(_FLAG)
 
 
 _CASTS: dict[pa.DataType | None, tuple[Cast, str]] = {
-    None: (lambda column: column, ""), _TEXT: (_cast_text, "text"), _WHOLE: (_cast_whole, "a whole number"),
+    None: (lambda column: column, ""),
+    _TEXT: (_cast_text, "text"),
+    _WHOLE: (_cast_whole, "a whole number"),
     _FLAG: (_cast_flag, "a 0 or 1"),
-}  # fmt: skip
+}
 
 
 def _first_invalid(column: pa.ChunkedArray, cast: Cast) -> int:
     """Return the first row that `cast` refuses, by bisection."""
-    low, high = 0, len(column)
+    low = 0
+    high = len(column)
     while high - low > 1:
         middle = (low + high) // 2
         try:

@@ -39,9 +39,15 @@ _BAD_ANSWER_TRIES = 3
 _MAX_STREAK = 25  # failures in a row after which the run stops instead of paying for more
 _LONGEST_WAIT = 120.0  # seconds between two tries; the client obeys no longer Retry-After
 _TILE = 512  # an image costs a base price and a price for each tile of 512 pixels
-_BASE_TOKENS, _TILE_TOKENS, _ANSWER_TOKENS = 85, 170, 80
+_BASE_TOKENS = 85
+_TILE_TOKENS = 170
+_ANSWER_TOKENS = 80
 _LOCAL = ("localhost", "127.0.0.1", "::1")
-_REFUSED = {401: "the key is not accepted", 403: "access is denied", 404: "there is no such address or model"}
+_REFUSED = {
+    401: "the key is not accepted",
+    403: "access is denied",
+    404: "there is no such address or model",
+}
 _SHEET_SIDE = 256
 _SHEET_STYLE = (
     "body{font:15px/1.4 sans-serif;max-width:1000px;margin:2em auto}article{display:flex;gap:1em;margin:1em 0;"
@@ -111,7 +117,9 @@ class Endpoint:
     url: str
     model: str
     key_variable: str = "OPENAI_API_KEY"
-    timeout: Annotated[float, Range(math.ulp(0.0), 86_400, "above 0 seconds and at most 86,400")] = 60.0
+    timeout: Annotated[
+        float, Range(math.ulp(0.0), 86_400, "above 0 seconds and at most 86,400")
+    ] = 60.0
     tries: Count[int] = 5
     max_tokens: Count[int] = 200
     temperature: float | None = 0.0
@@ -122,14 +130,24 @@ class Endpoint:
         check(self, "--")
         try:
             parts = urllib.parse.urlsplit(self.url)
-            valid = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and self.url.isascii()
-            (parts.hostname or "").encode("idna")  # rejects names that the resolver would reject
+            valid = (
+                parts.scheme in ("http", "https")
+                and parts.hostname
+                and parts.port != 0
+                and self.url.isascii()
+            )
+            # rejects names that the resolver would reject
+            (parts.hostname or "").encode("idna")
         except ValueError:
             valid = False
         if not valid:
-            raise AnnotateError(f"{self.url!r} is not an http or https address, such as https://api.openai.com/v1")
+            raise AnnotateError(
+                f"{self.url!r} is not an http or https address, such as https://api.openai.com/v1"
+            )
         if parts.username or parts.password:
-            raise AnnotateError(f"Set the environment variable {self.key_variable} to the key. Remove it from --url.")
+            raise AnnotateError(
+                f"Set the environment variable {self.key_variable} to the key. Remove it from --url."
+            )
 
     @property
     def is_local(self) -> bool:
@@ -139,13 +157,19 @@ class Endpoint:
     @property
     def exposes_key(self) -> bool:
         """Whether a key is set and would travel unencrypted to another machine."""
-        return self.url.startswith("http:") and not self.is_local and bool(os.environ.get(self.key_variable))
+        return (
+            self.url.startswith("http:")
+            and not self.is_local
+            and bool(os.environ.get(self.key_variable))
+        )
 
     def read_key(self) -> str:
         """Return the key, "" if a local endpoint has none. Raises AnnotateError for a wrong key, and without openai."""
         key = os.environ.get(self.key_variable, "").strip()
         if not key and not self.is_local:
-            raise AnnotateError(f"set the environment variable {self.key_variable} to the key of {self.url}")
+            raise AnnotateError(
+                f"set the environment variable {self.key_variable} to the key of {self.url}"
+            )
         if key and not (key.isascii() and key.isprintable() and " " not in key):
             raise AnnotateError(f"the environment variable {self.key_variable} does not hold a key")
         try:
@@ -161,30 +185,40 @@ class _Client:
     """The openai client for one endpoint. The key is read once and removed from every message."""
 
     def __init__(self, endpoint: Endpoint, log: Callable[[str], None] = lambda _: None) -> None:
-        self.endpoint, self._key, self._log = endpoint, endpoint.read_key(), log
+        self.endpoint = endpoint
+        self._key = endpoint.read_key()
+        self._log = log
 
     def connect(self) -> openai.AsyncOpenAI:
         """Return a client. It follows no redirect, which would take the key to another host."""
         import openai
 
         return openai.AsyncOpenAI(
-            api_key=self._key or "none", base_url=self.endpoint.url.rstrip("/").removesuffix("/chat/completions"),
-            timeout=self.endpoint.timeout, max_retries=self.endpoint.tries - 1,
+            api_key=self._key or "none",
+            base_url=self.endpoint.url.rstrip("/").removesuffix("/chat/completions"),
+            timeout=self.endpoint.timeout,
+            max_retries=self.endpoint.tries - 1,
             http_client=openai.DefaultAsyncHttpxClient(
                 follow_redirects=False, event_hooks={"response": [self._report_wait]}
             ),
-        )  # fmt: skip
+        )
 
     async def _report_wait(self, response: Any) -> None:
         if response.status_code >= 400 and (wait := _asked_wait(response)):
             self._log(f"the endpoint answers {response.status_code}{wait}")
 
-    async def ask(self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]) -> tuple[str, str, int, int]:
+    async def ask(
+        self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]
+    ) -> tuple[str, str, int, int]:
         """Return text, finish reason, tokens in and out. Raises _QuestionError, BadAnswer or AnnotateError."""
         import openai
 
         end = self.endpoint
-        body: dict[str, Any] = {"model": end.model, "messages": messages, end.token_field: end.max_tokens}
+        body: dict[str, Any] = {
+            "model": end.model,
+            "messages": messages,
+            end.token_field: end.max_tokens,
+        }
         if end.temperature is not None:
             body["temperature"] = end.temperature
         if end.json_mode:
@@ -208,7 +242,9 @@ class _Client:
 
     def redact(self, text: str) -> str:
         """Return `text` without the key, which a server may quote."""
-        return text.replace(self._key, "[key]") if self._key else text
+        if self._key:
+            return text.replace(self._key, "[key]")
+        return text
 
     def _judge(self, error: openai.APIStatusError) -> str:
         """Return the reason of an error status. Raises AnnotateError for one that concerns every question."""
@@ -223,7 +259,9 @@ class _Client:
         if code in _REFUSED:
             raise AnnotateError(f"{self.endpoint.url}: {_REFUSED[code]}; {reason}")
         if 300 <= code < 400:
-            raise AnnotateError(f"{self.endpoint.url} redirects to another address; give that address")
+            raise AnnotateError(
+                f"{self.endpoint.url} redirects to another address; give that address"
+            )
         return reason + _asked_wait(error.response)
 
 
@@ -233,32 +271,51 @@ def _one_line(text: str) -> str:
 
 def _asked_wait(response: Any) -> str:
     wait = response.headers.get("retry-after")
-    return f" and asks to wait (Retry-After: {_one_line(wait)[:40]})" if wait else ""
+    if wait:
+        return f" and asks to wait (Retry-After: {_one_line(wait)[:40]})"
+    return ""
 
 
 def _parse_reply(reply: Any) -> tuple[str, str, int, int]:
     try:
         choice = reply["choices"][0]
-        message, usage = choice["message"], reply.get("usage")
-        text, refusal = message.get("content"), message.get("refusal")
+        message = choice["message"]
+        usage = reply.get("usage")
+        text = message.get("content")
+        refusal = message.get("refusal")
         if isinstance(text, list):  # some servers answer in parts
             text = "".join(str(part.get("text", "")) for part in text)
-        text, finish = str(refusal or text or ""), "refusal" if refusal else str(choice.get("finish_reason") or "")
+        text = str(refusal or text or "")
+        finish = "refusal" if refusal else str(choice.get("finish_reason") or "")
         text.encode()  # raises for half of a Unicode pair
     except (ValueError, KeyError, IndexError, TypeError, AttributeError):
         raise prompts.BadAnswer("not a chat completion") from None
-    counts = [usage.get(name) if isinstance(usage, dict) else 0 for name in ("prompt_tokens", "completion_tokens")]
+    counts = [
+        usage.get(name) if isinstance(usage, dict) else 0
+        for name in ("prompt_tokens", "completion_tokens")
+    ]
     # An answer with odd numbers is paid for too.
     tokens_in, tokens_out = (n if isinstance(n, int) and 0 <= n < 1 << 40 else 0 for n in counts)
     return text, finish, tokens_in, tokens_out
 
 
 def annotate(
-    manifest: Manifest, endpoint: Endpoint, folder: str | Path, *, confirm: Callable[[CostEstimate], bool],
-    price_in: float | None = None, price_out: float | None = None, threads: int = 4, side: int = 512,
-    split: str | None = None, families: Mapping[str, str] | None = None, overwrite: bool = False,
-    second_image: str = prompts.SECOND_IMAGE, limit: int | None = None, log: Callable[[str], None] = lambda _: None,
-) -> CaptionResult:  # fmt: skip
+    manifest: Manifest,
+    endpoint: Endpoint,
+    folder: str | Path,
+    *,
+    confirm: Callable[[CostEstimate], bool],
+    price_in: float | None = None,
+    price_out: float | None = None,
+    threads: int = 4,
+    side: int = 512,
+    split: str | None = None,
+    families: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+    second_image: str = prompts.SECOND_IMAGE,
+    limit: int | None = None,
+    log: Callable[[str], None] = lambda _: None,
+) -> CaptionResult:
     """Ask `endpoint` for every missing caption and return the manifest with all captions.
 
     Each touch, or each sequence without a touch, is one question; `threads` are open at a time. Answers and failures
@@ -269,10 +326,12 @@ def annotate(
     jobs, left_out = prompts.find_caption_jobs(
         manifest, split=split, families=families, overwrite=overwrite, second_image=second_image
     )
-    jobs, store = jobs[:limit], _AnswerStore(Path(folder).expanduser().resolve())
+    jobs = jobs[:limit]
+    store = _AnswerStore(Path(folder).expanduser().resolve())
     run = _Run(manifest, endpoint, store, side, log)
     keys = run.keys(jobs, threads)
-    missing: dict[str, prompts.CaptionJob] = {}  # equal questions about equal images are one
+    # equal questions about equal images are one
+    missing: dict[str, prompts.CaptionJob] = {}
     for job, key in zip(jobs, keys, strict=True):
         if key and key not in store.answers:
             missing.setdefault(key, job)
@@ -280,35 +339,61 @@ def annotate(
         log(f"the key travels unencrypted to {endpoint.url}; use https")
     cached = sum(key in store.answers for key in keys)
     image = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
-    tokens = [len(job.prompt.system + job.prompt.text) // 4 + image * len(job.images) + 20 for job in missing.values()]
-    tokens_in, tokens_out = sum(tokens), _ANSWER_TOKENS * len(missing)
-    cost = None if price_in is None or price_out is None else (tokens_in * price_in + tokens_out * price_out) / 1e6
+    tokens = [
+        len(job.prompt.system + job.prompt.text) // 4 + image * len(job.images) + 20
+        for job in missing.values()
+    ]
+    tokens_in = sum(tokens)
+    tokens_out = _ANSWER_TOKENS * len(missing)
+    cost = (
+        None
+        if price_in is None or price_out is None
+        else (tokens_in * price_in + tokens_out * price_out) / 1e6
+    )
     if not confirm(CostEstimate(len(missing), cached, tokens_in, tokens_out, cost)):
         raise AnnotateError("not confirmed: nothing was asked")
     with store.exclusive() if missing else nullcontext():
         try:
             questions = [(key, job) for key, job in missing.items() if key not in store.answers]
-            questions.sort(key=lambda question: question[0] in store.failed)  # earlier failures come last
+            # earlier failures come last
+            questions.sort(key=lambda question: question[0] in store.failed)
             if questions:
-                with ThreadPoolExecutor(1) as pool:  # a notebook runs a loop in this thread
-                    pool.submit(asyncio.run, run.ask(_Client(endpoint, log), questions, threads)).result()
+                # a notebook runs a loop in this thread
+                with ThreadPoolExecutor(1) as pool:
+                    pool.submit(
+                        asyncio.run, run.ask(_Client(endpoint, log), questions, threads)
+                    ).result()
         finally:
             store.write_failures(run.failures, keys)
     answers = ((job, store.answers.get(key)) for job, key in zip(jobs, keys, strict=True))
-    captions = tuple(Caption(job, answer["caption"], answer["object"]) for job, answer in answers if answer)
+    captions = tuple(
+        Caption(job, answer["caption"], answer["object"]) for job, answer in answers if answer
+    )
     annotated = _attach(manifest, captions)
-    return CaptionResult(annotated, captions, tuple(run.failures), left_out, run.requests, *run.tokens)
+    return CaptionResult(
+        annotated, captions, tuple(run.failures), left_out, run.requests, *run.tokens
+    )
 
 
 class _Run:
     """One pass over the questions. `failures` and the counts grow during the pass."""
 
     def __init__(
-        self, manifest: Manifest, endpoint: Endpoint, store: _AnswerStore, side: int, log: Callable[[str], None]
+        self,
+        manifest: Manifest,
+        endpoint: Endpoint,
+        store: _AnswerStore,
+        side: int,
+        log: Callable[[str], None],
     ) -> None:
-        self.manifest, self.endpoint, self.store, self.side, self.log = manifest, endpoint, store, side, log
+        self.manifest = manifest
+        self.endpoint = endpoint
+        self.store = store
+        self.side = side
+        self.log = log
         self.failures: list[CaptionFailure] = []
-        self.requests, self.tokens = 0, [0, 0]
+        self.requests = 0
+        self.tokens = [0, 0]
         self.done = self.streak = 0
 
     def keys(self, jobs: list[prompts.CaptionJob], threads: int) -> list[str]:
@@ -330,7 +415,8 @@ class _Run:
 
     def _images(self, job: prompts.CaptionJob) -> tuple[str, list[bytes]]:
         """Return the key of a job's answer, and its images as JPEG. Raises UserError for an unreadable image."""
-        end, jpegs = self.endpoint, []
+        end = self.endpoint
+        jpegs = []
         parts = [end.model, job.prompt.fingerprint(), self.side, end.max_tokens]
         digest = hashlib.sha256(json.dumps(parts).encode())
         for row, column in job.images:
@@ -339,11 +425,15 @@ class _Run:
                 jpegs.append(prompts.small_jpeg(data, column, self.side))
             except (OSError, ValueError) as error:
                 reason = getattr(error, "strerror", None) or error
-                raise UserError(f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}") from None
+                raise UserError(
+                    f"{column} {self.manifest.value(row, column)!r} cannot be read: {reason}"
+                ) from None
             digest.update(hashlib.sha256(data).digest())
         return digest.hexdigest()[:32], jpegs
 
-    async def ask(self, client: _Client, questions: list[tuple[str, prompts.CaptionJob]], workers: int) -> None:
+    async def ask(
+        self, client: _Client, questions: list[tuple[str, prompts.CaptionJob]], workers: int
+    ) -> None:
         """Ask all questions. The first error of a worker ends the others."""
         queue = iter(questions)
 
@@ -356,12 +446,18 @@ class _Run:
                     self._fail(job, key, reason)
                 if self.streak >= _MAX_STREAK:
                     if not self.store.answers:
-                        raise AnnotateError(f"{self.streak} questions in a row failed, the last one: {reason}")
+                        raise AnnotateError(
+                            f"{self.streak} questions in a row failed, the last one: {reason}"
+                        )
                     for later_key, later_job in queue:
-                        self._fail(later_job, later_key, f"not asked: {_MAX_STREAK} before it failed")
+                        self._fail(
+                            later_job, later_key, f"not asked: {_MAX_STREAK} before it failed"
+                        )
                 advance(self.done)
                 if self.done % 100 == 0 or self.done == len(questions):
-                    self.log(f"{self.done} of {len(questions)} questions, {len(self.failures)} failed")
+                    self.log(
+                        f"{self.done} of {len(questions)} questions, {len(self.failures)} failed"
+                    )
 
         try:
             with bar(len(questions), "captions") as advance:
@@ -371,7 +467,9 @@ class _Run:
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
 
-    async def _ask_one(self, client: _Client, connection: openai.AsyncOpenAI, job: prompts.CaptionJob, key: str) -> str:
+    async def _ask_one(
+        self, client: _Client, connection: openai.AsyncOpenAI, job: prompts.CaptionJob, key: str
+    ) -> str:
         """Get and store one answer. Returns the reason if there is none, else ""."""
         try:
             _, jpegs = await asyncio.to_thread(self._images, job)
@@ -390,25 +488,39 @@ class _Run:
             except prompts.BadAnswer as error:
                 reason = f"bad answer ({error}): {text[:100]!r}"
                 continue
-            self.store.add(key, {
-                "model": self.endpoint.model, "prompt": job.prompt.fingerprint(), "family": job.prompt.family,
-                "caption": caption, "object": named, "tokens_in": tokens[0], "tokens_out": tokens[1],
-            })  # fmt: skip
+            self.store.add(
+                key,
+                {
+                    "model": self.endpoint.model,
+                    "prompt": job.prompt.fingerprint(),
+                    "family": job.prompt.family,
+                    "caption": caption,
+                    "object": named,
+                    "tokens_in": tokens[0],
+                    "tokens_out": tokens[1],
+                },
+            )
             return ""
         return f"{reason} ({_BAD_ANSWER_TRIES} times)"
 
     def _fail(self, job: prompts.CaptionJob, key: str, reason: str) -> None:
-        self.failures.append(CaptionFailure(self.manifest.where(int(job.rows[0])), len(job.rows), reason, key))
+        self.failures.append(
+            CaptionFailure(self.manifest.where(int(job.rows[0])), len(job.rows), reason, key)
+        )
 
 
 class _AnswerStore:
     """The answers of a folder, one JSON line each. A line that was cut off is asked for again."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self._path, self._line_break = folder, folder / "answers.jsonl", ""
+        self.folder = folder
+        self._path = folder / "answers.jsonl"
+        self._line_break = ""
         self.answers: dict[str, dict[str, Any]] = {}
         # The line of each failed question by its key.
-        self.failed = {str(entry.get("key")): line for line, entry in _entries(folder / "failures.jsonl")}
+        self.failed = {
+            str(entry.get("key")): line for line, entry in _entries(folder / "failures.jsonl")
+        }
         self._read_answers()
 
     @contextmanager
@@ -417,7 +529,9 @@ class _AnswerStore:
         self.folder.mkdir(parents=True, exist_ok=True)
         with lock(self.folder / ".lock") as free:
             if not free:
-                raise AnnotateError(f"another process asks for {self.folder}: wait for it, or name another --answers")
+                raise AnnotateError(
+                    f"another process asks for {self.folder}: wait for it, or name another --answers"
+                )
             self._read_answers()
             yield
 
@@ -439,7 +553,11 @@ class _AnswerStore:
         """Write failures.jsonl: the new failures, and earlier ones among `keys` that are still open."""
         closed = {failure.key for failure in failures} | self.answers.keys() | {""}
         lines = [json.dumps(failure._asdict(), ensure_ascii=False) for failure in failures]
-        lines += [self.failed[key].strip() for key in dict.fromkeys(keys) if key in self.failed and key not in closed]
+        lines += [
+            self.failed[key].strip()
+            for key in dict.fromkeys(keys)
+            if key in self.failed and key not in closed
+        ]
         if lines or self.failed:
             atomic_write(self.folder / "failures.jsonl", "".join(f"{line}\n" for line in lines))
 
@@ -457,18 +575,23 @@ def _entries(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:
-    texts, phrases = [one.text for one in captions], [one.job.phrase for one in captions]
+    texts = [one.text for one in captions]
+    phrases = [one.job.phrase for one in captions]
     for name, words in (("text", texts), (prompts.PHRASE, phrases)):
         if any(word is not None for word in words):
             known = name in manifest.table.column_names
-            cells = np.array(manifest.column(name).to_pylist() if known else [None] * len(manifest), object)
+            cells = np.array(
+                manifest.column(name).to_pylist() if known else [None] * len(manifest), object
+            )
             for caption, word in zip(captions, words, strict=True):
                 cells[caption.job.rows] = cells[caption.job.rows] if word is None else word
             manifest = replace_column(manifest, name, pa.array(cells, pa.string()))
     return manifest
 
 
-def sample_sheet(manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40) -> Path:
+def sample_sheet(
+    manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40
+) -> Path:
     """Write an HTML page of `count` random captions with their images. Raises UserError without captions."""
     if not captions:
         raise UserError("there are no captions to look at; leave out --sheet, or ask for some")
@@ -492,14 +615,25 @@ def _article(manifest: Manifest, caption: Caption, number: int) -> str:
     for image_row, column in images:
         word = "touch" if column == "path" else "photograph"
         try:
-            jpeg = prompts.small_jpeg(prompts.image_bytes(manifest, image_row, column), column, _SHEET_SIDE)
+            jpeg = prompts.small_jpeg(
+                prompts.image_bytes(manifest, image_row, column), column, _SHEET_SIDE
+            )
         except (OSError, ValueError) as error:
             parts.append(f"<p>{html.escape(str(error))}</p>")
             continue
         data = base64.b64encode(jpeg).decode()
-        parts.append(f'<figure><img src="data:image/jpeg;base64,{data}" alt="{word}"><figcaption>{word}</figure>')
+        parts.append(
+            f'<figure><img src="data:image/jpeg;base64,{data}" alt="{word}"><figcaption>{word}</figure>'
+        )
     notes = [f"phrase: {job.phrase}"] if job.phrase else []
-    notes += [f"{manifest.value(row, 'dataset')}, {manifest.where(row)}, {len(job.rows)} rows share it"]
-    parts += [f"<div><p><label><input type=checkbox> {number}. <b>{html.escape(caption.object)}</b></label></p>"]
-    parts += [f"<p>{html.escape(caption.text)}</p>", *(f"<p><small>{html.escape(note)}</small></p>" for note in notes)]
+    notes += [
+        f"{manifest.value(row, 'dataset')}, {manifest.where(row)}, {len(job.rows)} rows share it"
+    ]
+    parts += [
+        f"<div><p><label><input type=checkbox> {number}. <b>{html.escape(caption.object)}</b></label></p>"
+    ]
+    parts += [
+        f"<p>{html.escape(caption.text)}</p>",
+        *(f"<p><small>{html.escape(note)}</small></p>" for note in notes),
+    ]
     return f"<article>{''.join(parts)}</div></article>"

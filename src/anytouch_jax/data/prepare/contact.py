@@ -44,7 +44,9 @@ from anytouch_jax.data.prepare.untouched_gel import (
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 
-_MAX_FRAMES, _MAX_RECORDINGS = 48, 48  # of a recording, and of a unit, from which the untouched gel is estimated
+# of a recording, and of a unit, from which the untouched gel is estimated
+_MAX_FRAMES = 48
+_MAX_RECORDINGS = 48
 _MANY = 3  # recordings of a unit whose median shows where nothing presses
 _MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
 _Scored = tuple[int, float, str]  # row, score, reason
@@ -53,11 +55,22 @@ _Pictures = Callable[[np.ndarray], list[np.ndarray]]  # some frames of rows
 # Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without dots), gelslim and
 # gelsight. The one of 9dtact is below its one light press. The default of the other sensors is untested.
 DEFAULT_THRESHOLD = 6.5
-THRESHOLDS: Mapping[str, float] = {"gelsight_mini": 6.5, "gelslim": 6.5, "gelsight": 6.5, "9dtact": 4.0}
+THRESHOLDS: Mapping[str, float] = {
+    "gelsight_mini": 6.5,
+    "gelslim": 6.5,
+    "gelsight": 6.5,
+    "9dtact": 4.0,
+}
 # Columns that report contact, in order of preference, and the value above which they do.
-REFERENCES: Mapping[str, float] = {"label.force": 0.0, "label.contact": 0.5, "label.contact_score": 7.0}
+REFERENCES: Mapping[str, float] = {
+    "label.force": 0.0,
+    "label.contact": 0.5,
+    "label.contact_score": 7.0,
+}
 _CONTACT_WORDS = {"true": 1.0, "false": 0.0, "none": np.nan, "": np.nan}
-TILE, PER_ROW = 120, 10  # of contact_sheet
+# of contact_sheet
+TILE = 120
+PER_ROW = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,18 +110,29 @@ class ContactReport:
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
         limits = ", ".join(f"{sensor} {limit:g}" for sensor, limit in self.thresholds.items())
-        labelled = f"; {self.labelled:,} rows keep the label.contact that they had" if self.labelled else ""
+        labelled = (
+            f"; {self.labelled:,} rows keep the label.contact that they had"
+            if self.labelled
+            else ""
+        )
         lines = [
             f"{len(self.scores.score):,} rows: contact {self.contact:,}, no contact {self.free:,}, "
             f"unknown {self.unknown:,}; dropped {self.dropped:,}",
-            "background: " + ", ".join(f"{reason} {count:,}" for reason, count in self.scores.counts.items()),
+            "background: "
+            + ", ".join(f"{reason} {count:,}" for reason, count in self.scores.counts.items()),
         ]
         if faults := self.scores.faults:
             more = ["  (and more: `anytouch data verify` names them)"] * (len(faults) > EXAMPLES)
-            lines += ["pictures that cannot be used:", *(f"  {fault}" for fault in faults[:EXAMPLES]), *more]
+            lines += [
+                "pictures that cannot be used:",
+                *(f"  {fault}" for fault in faults[:EXAMPLES]),
+                *more,
+            ]
         if all_of := self.scores.recordings:
             decided = self.scores.decided
-            lines += [f"untouched gel estimated for {decided:,} of {all_of:,} recordings ({decided / all_of:.0%})"]
+            lines += [
+                f"untouched gel estimated for {decided:,} of {all_of:,} recordings ({decided / all_of:.0%})"
+            ]
             if decided < all_of:
                 lines[-1] += (
                     ". The labels of the others stay empty. To decide them, pass --background with a picture of the "
@@ -144,15 +168,21 @@ class ContactQuality:
             f"contact by {self.reference} > {self.above:g} on {self.positives:,} of {self.rows:,} rows "
             f"({self.skipped:,} without reference or score): precision {self.precision:.3f}, recall {self.recall:.3f}, "
             f"correlation {self.correlation:.3f}",
-            *(f"  {name}: {rows:,} rows, precision {precision:.3f}, recall {recall:.3f}"
-              for name, (rows, precision, recall) in self.parts.items()),
-        ]  # fmt: skip
+            *(
+                f"  {name}: {rows:,} rows, precision {precision:.3f}, recall {recall:.3f}"
+                for name, (rows, precision, recall) in self.parts.items()
+            ),
+        ]
 
 
 def contact_scores(
-    manifest: Manifest, rows: np.ndarray | None = None, *, backgrounds: Mapping[str, UntouchedGel] | None = None,
-    gels: UnitGels | None = None, workers: int = 2,
-) -> ContactScores:  # fmt: skip
+    manifest: Manifest,
+    rows: np.ndarray | None = None,
+    *,
+    backgrounds: Mapping[str, UntouchedGel] | None = None,
+    gels: UnitGels | None = None,
+    workers: int = 2,
+) -> ContactScores:
     """Return the score of every row, or of `rows` only. Frames are read by `workers` threads.
 
     `backgrounds` are pictures from `read_backgrounds` for rows without one. With `gels`, the pictures of the rule in
@@ -172,9 +202,11 @@ def contact_scores(
         pictures = partial(_pictures, manifest, pool, faults)
 
         def assign(score_row: Callable[[int], _Scored], some: np.ndarray) -> None:
-            for start in range(0, len(some), 1024):  # millions of rows must not wait in memory
+            # millions of rows must not wait in memory
+            for start in range(0, len(some), 1024):
                 for row, value, reason in pool.map(score_row, some[start : start + 1024].tolist()):
-                    score[row], reasons[row] = value, reason
+                    score[row] = value
+                    reasons[row] = reason
 
         if gels is not None:
             has_background = gels.has(rows)
@@ -195,7 +227,9 @@ def contact_scores(
                 else:
                     found.append((recording, gel))
                     assign(partial(_score_row, manifest, faults, gel, source), recording)
-    sentences = tuple(f"{manifest.where(row)}: {faults[row]}" for row in sorted(faults)[: EXAMPLES + 1])
+    sentences = tuple(
+        f"{manifest.where(row)}: {faults[row]}" for row in sorted(faults)[: EXAMPLES + 1]
+    )
     return ContactScores(score, reasons, recordings, decided, tuple(found), sentences)
 
 
@@ -207,25 +241,32 @@ def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -
         name = folder / f"{sha256(gel.picture.tobytes()).hexdigest()[:16]}.png"
         atomic_write(name, encode(gel.picture))
         for row in rows[~is_free[rows]].tolist():
-            cells[row] = Path(os.path.relpath(name, manifest.files[manifest.source[row]].parent)).as_posix()
+            cells[row] = Path(
+                os.path.relpath(name, manifest.files[manifest.source[row]].parent)
+            ).as_posix()
     return replace_column(manifest, "background_path", cells)
 
 
 def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, UntouchedGel]:
     """Return the pictures of --background, FILE (unit "") or UNIT=FILE words, by unit. Raises UserError."""
     waiting = np.flatnonzero(~manifest.present("background_path"))
-    units, sensors = manifest.text_column("unit"), manifest.codes("sensor")
+    units = manifest.text_column("unit")
+    sensors = manifest.codes("sensor")
     gels: dict[str, UntouchedGel] = {}
     for word in words:
         is_file = "=" not in word or (len(words) == 1 and Path(word).exists())
         unit, _, file = ("", "", word) if is_file else word.partition("=")
         if unit in gels or (not unit and len(words) > 1):
-            raise UserError(f"--background {word}: give one picture for all recordings, or one UNIT=FILE for each unit")
+            raise UserError(
+                f"--background {word}: give one picture for all recordings, or one UNIT=FILE for each unit"
+            )
         gel = gels[unit] = UntouchedGel(decode(Path(file).expanduser()))
         rows = waiting[units[waiting] == unit] if unit else waiting
         if not len(rows):
             kind = f"of unit {unit} " if unit else ""
-            raise UserError(f"--background {word}: the manifest has no row {kind}without a background picture")
+            raise UserError(
+                f"--background {word}: the manifest has no row {kind}without a background picture"
+            )
         for row in rows[np.unique(sensors[rows], return_index=True)[1]]:
             picture = _load_or_none(manifest, {}, row)
             try:
@@ -240,7 +281,11 @@ def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, Unto
 
 
 def _score_row(
-    manifest: Manifest, faults: dict[int, str], gel: UntouchedGel | Callable[[int], UntouchedGel], source: str, row: int
+    manifest: Manifest,
+    faults: dict[int, str],
+    gel: UntouchedGel | Callable[[int], UntouchedGel],
+    source: str,
+    row: int,
 ) -> _Scored:
     try:
         frame = decode(manifest.file(row))
@@ -248,20 +293,36 @@ def _score_row(
     except (UserError, ValueError) as error:
         is_read = not isinstance(error, UserError)
         if len(faults) < _MAX_FAULTS:
-            faults[row] = f"{shown(manifest.value(row, 'path'))}: {error}" if is_read else str(error)
-        return row, np.nan, f"none: {error if is_read else 'the frame or its background cannot be read'}"
+            faults[row] = (
+                f"{shown(manifest.value(row, 'path'))}: {error}" if is_read else str(error)
+            )
+        return (
+            row,
+            np.nan,
+            f"none: {error if is_read else 'the frame or its background cannot be read'}",
+        )
 
 
 def _groups(manifest: Manifest, rows: np.ndarray) -> list[np.ndarray]:
     """Return `rows` by unit of one dataset and sensor if a unit is named, else by sequence, each in row order."""
-    unit, sequence = manifest.codes("unit", own=True), manifest.codes("sequence", own=True)
-    no_unit, dataset = unit < 0, manifest.codes("dataset")
-    keys = [no_unit, np.where(no_unit, sequence, unit), np.where(no_unit, 0, dataset), manifest.codes("sensor")]
+    unit = manifest.codes("unit", own=True)
+    sequence = manifest.codes("sequence", own=True)
+    no_unit = unit < 0
+    dataset = manifest.codes("dataset")
+    keys = [
+        no_unit,
+        np.where(no_unit, sequence, unit),
+        np.where(no_unit, 0, dataset),
+        manifest.codes("sensor"),
+    ]
     return group_rows(rows, np.stack(keys, 1)[rows])
 
 
 def _gel_of_group(
-    manifest: Manifest, group: np.ndarray, pictures: _Pictures, backgrounds: Mapping[str, UntouchedGel]
+    manifest: Manifest,
+    group: np.ndarray,
+    pictures: _Pictures,
+    backgrounds: Mapping[str, UntouchedGel],
 ) -> tuple[UntouchedGel | None, str]:
     """Return the untouched gel by rows of the split `background`, or else by `backgrounds`."""
     free = group[np.asarray(pc.equal(manifest.table["split"].take(group), "background"))]
@@ -309,7 +370,11 @@ def _pictures(
 ) -> list[np.ndarray]:
     """Return at most _MAX_FRAMES evenly spaced frames from `scale_picture`, those of the most common shape."""
     loaded = pool.map(partial(_load_or_none, manifest, faults), spread(rows, _MAX_FRAMES).tolist())
-    pictures = [picture for picture in loaded if picture is not None and min(picture.shape[:2]) > 2 * EDGE + 2]
+    pictures = [
+        picture
+        for picture in loaded
+        if picture is not None and min(picture.shape[:2]) > 2 * EDGE + 2
+    ]
     shapes = Counter(picture.shape for picture in pictures)
     return [picture for picture in pictures if picture.shape == shapes.most_common(1)[0][0]]
 
@@ -324,9 +389,13 @@ def _load_or_none(manifest: Manifest, faults: dict[int, str], row: int) -> np.nd
 
 
 def mark_contact(
-    manifest: Manifest, scores: ContactScores, *, thresholds: Mapping[str, float] | None = None, share: float = 0.0,
+    manifest: Manifest,
+    scores: ContactScores,
+    *,
+    thresholds: Mapping[str, float] | None = None,
+    share: float = 0.0,
     drop: bool = False,
-) -> tuple[Manifest, ContactReport]:  # fmt: skip
+) -> tuple[Manifest, ContactReport]:
     """Return the manifest with `label.contact_score` and `label.contact` (1, 0 or null if unknown), and a report.
 
     An existing `label.contact` is kept. An existing score column is renamed to `<name>_given`. `thresholds` replaces
@@ -334,20 +403,28 @@ def mark_contact(
     excludes the start and the end of contact. `drop` removes frames without contact, but never the split `background`
     nor frames of unknown contact. Raises UserError if nothing would be left.
     """
-    limits, known = threshold_of_rows(manifest, thresholds, share), known_contact(manifest)
-    score, sequence = scores.score, manifest.codes("sequence", own=True)
+    limits = threshold_of_rows(manifest, thresholds, share)
+    known = known_contact(manifest)
+    score = scores.score
+    sequence = manifest.codes("sequence", own=True)
     highest = np.zeros(sequence.max() + 1)
     np.fmax.at(highest, sequence, score)
-    contact = np.where(np.isnan(score), np.nan, (score > limits) & (score >= share * highest[sequence]))
+    contact = np.where(
+        np.isnan(score), np.nan, (score > limits) & (score >= share * highest[sequence])
+    )
     background = manifest.text_column("split") == "background"
     contact[background] = 0
     contact = np.where(np.isnan(known), contact, known > 0)
     free = contact == 0
-    table, name, renamed = manifest.table, "label.contact_score", "label.contact_score_given"
+    table = manifest.table
+    name = "label.contact_score"
+    renamed = "label.contact_score_given"
     if name in table.column_names:
         table = table.select([column for column in table.column_names if column != renamed])
         table = table.append_column(renamed, table[name])
-    marked = replace_column(replace(manifest, table=table), name, pa.array(score, pa.float32(), mask=np.isnan(score)))
+    marked = replace_column(
+        replace(manifest, table=table), name, pa.array(score, pa.float32(), mask=np.isnan(score))
+    )
     column = pa.array(np.nan_to_num(contact).astype(np.int64), pa.int64(), mask=np.isnan(contact))
     marked = replace_column(marked, "label.contact", column)
     stays = ~free | background if drop else np.ones(len(manifest), bool)
@@ -357,16 +434,27 @@ def mark_contact(
             "Lower --threshold or --share, or leave out --drop"
         )
     used = dict(sorted(zip(manifest.table["sensor"].to_pylist(), limits.tolist(), strict=True)))
-    masks = {"contact": contact == 1, "free": free, "unknown": np.isnan(contact), "dropped": ~stays,
-             "labelled": np.isfinite(known)}  # fmt: skip
-    report = ContactReport(scores, thresholds=used, **{name: int(mask.sum()) for name, mask in masks.items()})
+    masks = {
+        "contact": contact == 1,
+        "free": free,
+        "unknown": np.isnan(contact),
+        "dropped": ~stays,
+        "labelled": np.isfinite(known),
+    }
+    report = ContactReport(
+        scores, thresholds=used, **{name: int(mask.sum()) for name, mask in masks.items()}
+    )
     return select_rows(marked, np.flatnonzero(stays)), report
 
 
-def threshold_of_rows(manifest: Manifest, thresholds: Mapping[str, float] | None, share: float) -> np.ndarray:
+def threshold_of_rows(
+    manifest: Manifest, thresholds: Mapping[str, float] | None, share: float
+) -> np.ndarray:
     """Return the threshold of every row, f64. Raises UserError for thresholds or a `share` that cannot be used."""
     if not 0 <= share <= 1:
-        raise UserError(f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}")
+        raise UserError(
+            f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}"
+        )
     table = {**THRESHOLDS, **(thresholds or {})}
     sensors = manifest.table["sensor"].to_pylist()
     for name in thresholds or {}:
@@ -382,7 +470,11 @@ def threshold_of_rows(manifest: Manifest, thresholds: Mapping[str, float] | None
 def known_contact(manifest: Manifest) -> np.ndarray:
     """Return `label.contact` of every row, f64 (rows,), NaN if unknown. Raises UserError for another word."""
     contact = np.full(len(manifest), np.nan)
-    cells = manifest.table["label.contact"].to_pylist() if "label.contact" in manifest.table.column_names else []
+    cells = (
+        manifest.table["label.contact"].to_pylist()
+        if "label.contact" in manifest.table.column_names
+        else []
+    )
     for row, value in enumerate(cells):
         word = str(value).strip().lower()
         try:
@@ -393,7 +485,9 @@ def known_contact(manifest: Manifest) -> np.ndarray:
     return contact
 
 
-def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple[str, npt.NDArray[np.float64]]:
+def reference_contact(
+    manifest: Manifest, reference: str | None = None
+) -> tuple[str, npt.NDArray[np.float64]]:
     """Return the column that reports contact (default: first of REFERENCES) and its numbers. Raises UserError."""
     columns = manifest.table.column_names
     name = reference or next((column for column in REFERENCES if column in columns), None)
@@ -402,13 +496,19 @@ def reference_contact(manifest: Manifest, reference: str | None = None) -> tuple
             f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with; "
             "name one with --reference"
         )
-    return name, known_contact(manifest) if name == "label.contact" else manifest.number_column(name)
+    return name, known_contact(manifest) if name == "label.contact" else manifest.number_column(
+        name
+    )
 
 
 def contact_quality(
-    manifest: Manifest, scores: ContactScores, *, reference: str | None = None, above: float | None = None,
+    manifest: Manifest,
+    scores: ContactScores,
+    *,
+    reference: str | None = None,
+    above: float | None = None,
     thresholds: Mapping[str, float] | None = None,
-) -> ContactQuality:  # fmt: skip
+) -> ContactQuality:
     """Compare the filter with column `reference` > `above` (default: the first existing one of REFERENCES).
 
     Rows with a value and a score are compared, except the split `background`. `thresholds` replaces entries of
@@ -423,12 +523,21 @@ def contact_quality(
             f"no row has both a value in {name} and a score; name another column with --reference, or give a picture "
             "of the untouched gel with --background"
         )
-    score, sources, sensors = scores.score[used], scores.reasons[used], manifest.text_column("sensor")[used]
-    predicted, positive = score > threshold_of_rows(manifest, thresholds, 0.0)[used], truth[used] > limit
+    score = scores.score[used]
+    sources = scores.reasons[used]
+    sensors = manifest.text_column("sensor")[used]
+    predicted = score > threshold_of_rows(manifest, thresholds, 0.0)[used]
+    positive = truth[used] > limit
 
     def figures(members: np.ndarray) -> tuple[int, float, float]:
-        hits, found, real = (int(part[members].sum()) for part in (positive & predicted, predicted, positive))
-        return int(members.sum()), hits / found if found else np.nan, hits / real if real else np.nan
+        hits, found, real = (
+            int(part[members].sum()) for part in (positive & predicted, predicted, positive)
+        )
+        return (
+            int(members.sum()),
+            hits / found if found else np.nan,
+            hits / real if real else np.nan,
+        )
 
     parts = {f"sensor {sensor}": figures(sensors == sensor) for sensor in sorted(set(sensors))}
     parts |= {f"background {source}": figures(sources == source) for source in sorted(set(sources))}
@@ -436,13 +545,28 @@ def contact_quality(
     correlation = np.nan if constant else float(np.corrcoef(score, truth[used])[0, 1])
     rows, precision, recall = figures(np.ones(len(used), bool))
     return ContactQuality(
-        name, limit, rows, int(relevant.sum()) - rows, int(positive.sum()), int(predicted.sum()),
-        int((positive & predicted).sum()), precision, recall, correlation, parts,
-    )  # fmt: skip
+        name,
+        limit,
+        rows,
+        int(relevant.sum()) - rows,
+        int(positive.sum()),
+        int(predicted.sum()),
+        int((positive & predicted).sum()),
+        precision,
+        recall,
+        correlation,
+        parts,
+    )
 
 
-def contact_sheet(manifest: Manifest, scores: ContactScores, path: str | Path, *,
-                  thresholds: Mapping[str, float] | None = None, rows: int = 4) -> Path:  # fmt: skip
+def contact_sheet(
+    manifest: Manifest,
+    scores: ContactScores,
+    path: str | Path,
+    *,
+    thresholds: Mapping[str, float] | None = None,
+    rows: int = 4,
+) -> Path:
     """Write a PNG with `rows` rows of frames without contact (red) and as many with contact (green), by rising score.
 
     Frames are spread evenly over the scores of each side, so the doubtful ones are next to each other. Raises
@@ -450,17 +574,25 @@ def contact_sheet(manifest: Manifest, scores: ContactScores, path: str | Path, *
     """
     is_scored = ~np.isnan(scores.score) & (manifest.text_column("split") != "background")
     if not is_scored.any():
-        raise UserError("no frame has a contact score, so there is nothing to show; leave out --picture")
+        raise UserError(
+            "no frame has a contact score, so there is nothing to show; leave out --picture"
+        )
     contact = scores.score > threshold_of_rows(manifest, thresholds, 0.0)
     bands = []
-    for title, members, colour in (("no contact", ~contact, (60, 60, 230)), ("contact", contact, (80, 180, 60))):
+    for title, members, colour in (
+        ("no contact", ~contact, (60, 60, 230)),
+        ("contact", contact, (80, 180, 60)),
+    ):
         side = np.flatnonzero(is_scored & members)
         chosen = spread(side[np.argsort(scores.score[side], kind="stable")], rows * PER_ROW)
         tiles = [_tile(manifest, row, float(scores.score[row]), colour) for row in chosen]
         tiles += [np.full((TILE, TILE, 3), 255, np.uint8)] * (-len(tiles) % PER_ROW)
         head = np.full((28, TILE * PER_ROW, 3), 255, np.uint8)
         _write(head, f"{title}: {len(side)} frames", (6, 20), 0.55, colour)
-        bands += [head, *(np.hstack(tiles[start : start + PER_ROW]) for start in range(0, len(tiles), PER_ROW))]
+        bands += [
+            head,
+            *(np.hstack(tiles[start : start + PER_ROW]) for start in range(0, len(tiles), PER_ROW)),
+        ]
     atomic_write(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())
     return Path(path)
 
@@ -481,10 +613,14 @@ def _tile(manifest: Manifest, row: int, score: float, colour: tuple[int, int, in
     return tile
 
 
-def _write(picture: np.ndarray, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int]) -> None:
+def _write(
+    picture: np.ndarray, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int]
+) -> None:
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 
 def spread(items: np.ndarray, most: int) -> np.ndarray:
     """Return at most `most` evenly spread ones of `items` (n,)."""
-    return items[np.unique(np.linspace(0, len(items) - 1, most).astype(int))] if len(items) else items
+    if len(items):
+        return items[np.unique(np.linspace(0, len(items) - 1, most).astype(int))]
+    return items

@@ -36,13 +36,19 @@ from anytouch_jax.errors import UserError
 Family = Literal["photograph", "object", "phrase"]
 PHRASE = "phrase"  # the column that stores the words that were expanded
 SECOND_IMAGE = "image2_path"  # a manifest need not have this column
-_MIN_WORDS, _MAX_WORDS = 3, 60  # CLIP reads 77 tokens
+# CLIP reads 77 tokens
+_MIN_WORDS = 3
+_MAX_WORDS = 60
 
 # Answers are stored under a hash of the prompt: another wording asks, and pays for, every question again.
 FAMILIES: dict[str, Family] = {
-    "touch_and_go": "photograph", "tacquad": "photograph", "objectfolder_real": "object", "tvl": "phrase",
-    "ssvtp": "phrase", "octopi": "phrase",
-}  # fmt: skip
+    "touch_and_go": "photograph",
+    "tacquad": "photograph",
+    "objectfolder_real": "object",
+    "tvl": "phrase",
+    "ssvtp": "phrase",
+    "octopi": "phrase",
+}
 
 _SYSTEM = (
     "You describe how surfaces feel to the touch. You look at what you are given, name the material, and say what a "
@@ -91,7 +97,9 @@ class Prompt(NamedTuple):
 
     def messages(self, jpegs: list[bytes]) -> list[dict[str, Any]]:
         """Return the chat messages with JPEG images as data URLs."""
-        urls = [f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}" for jpeg in jpegs]
+        urls = [
+            f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}" for jpeg in jpegs
+        ]
         parts: list[dict[str, Any]] = [{"type": "text", "text": self.text}]
         parts += [{"type": "image_url", "image_url": {"url": url}} for url in urls]
         return [{"role": "system", "content": self.system}, {"role": "user", "content": parts}]
@@ -156,9 +164,13 @@ class CaptionJob(NamedTuple):
 
 
 def find_caption_jobs(
-    manifest: Manifest, *, split: str | None = None, families: Mapping[str, str] | None = None,
-    overwrite: bool = False, second_image: str = SECOND_IMAGE,
-) -> tuple[list[CaptionJob], dict[str, int]]:  # fmt: skip
+    manifest: Manifest,
+    *,
+    split: str | None = None,
+    families: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+    second_image: str = SECOND_IMAGE,
+) -> tuple[list[CaptionJob], dict[str, int]]:
     """Return the captions to get, and the number of rows left out for each reason.
 
     Rows of one touch share a caption. Rows without a touch share it by sequence. The photograph of a group is that of
@@ -169,9 +181,12 @@ def find_caption_jobs(
     if second_image not in (SECOND_IMAGE, *names):
         raise UserError(f"The manifest has no column {second_image!r}. It has {', '.join(names)}.")
     rows_to_ask, family, left_out = _rows_to_ask(manifest, split, families, overwrite)
-    touch, sequence = manifest.codes("touch", own=True), manifest.codes("sequence", own=True)
+    touch = manifest.codes("touch", own=True)
+    sequence = manifest.codes("sequence", own=True)
     text = np.where(family == "phrase", manifest.codes("text"), -1)
-    key = np.stack([touch, np.where(touch < 0, sequence, -1), text, manifest.codes("dataset")], 1)[rows_to_ask]
+    key = np.stack([touch, np.where(touch < 0, sequence, -1), text, manifest.codes("dataset")], 1)[
+        rows_to_ask
+    ]
     groups = group_rows(rows_to_ask, key, np.asarray(manifest.table["frame_index"])[rows_to_ask])
     jobs: list[CaptionJob] = []
     for rows in sorted(groups, key=np.min):
@@ -182,7 +197,9 @@ def find_caption_jobs(
             jobs.append(job)
     if not jobs:
         reasons = "; ".join(f"{count} rows: {reason}" for reason, count in left_out.items())
-        raise UserError(f"{manifest.files[0]}: there is nothing to annotate ({reasons or 'no rows'})")
+        raise UserError(
+            f"{manifest.files[0]}: there is nothing to annotate ({reasons or 'no rows'})"
+        )
     return jobs, dict(left_out)
 
 
@@ -206,8 +223,13 @@ def _rows_to_ask(
                 remedy = f"give it one, such as --family {shlex.quote(name)} photograph{known}"
             left_out[f"dataset {name!r} has no prompt: {remedy}"] = int(selected[rows].sum())
     selected &= family != None  # noqa: E711 - elementwise
-    has_text, is_phrase = manifest.present("text"), family == "phrase"
-    expanded = manifest.present(PHRASE) if PHRASE in manifest.table.column_names else np.zeros(len(manifest), bool)
+    has_text = manifest.present("text")
+    is_phrase = family == "phrase"
+    expanded = (
+        manifest.present(PHRASE)
+        if PHRASE in manifest.table.column_names
+        else np.zeros(len(manifest), bool)
+    )
     for reason, excluded in (
         ("no phrase to expand", is_phrase & ~has_text),
         ("expanded before", is_phrase & expanded & (not overwrite)),
@@ -218,7 +240,9 @@ def _rows_to_ask(
     return np.flatnonzero(selected), family, +left_out
 
 
-def _make_job(manifest: Manifest, rows: np.ndarray, family: Family, second_image: str) -> CaptionJob | None:
+def _make_job(
+    manifest: Manifest, rows: np.ndarray, family: Family, second_image: str
+) -> CaptionJob | None:
     with_photograph = [int(row) for row in rows if manifest.value(row, "image_path") is not None]
     if not with_photograph and family != "phrase":
         return None
@@ -239,7 +263,9 @@ def _make_job(manifest: Manifest, rows: np.ndarray, family: Family, second_image
 
 def image_bytes(manifest: Manifest, row: int, column: str) -> bytes:
     """Return the encoded image that a cell names. Raises UserError, OSError or ValueError."""
-    return read_file(resolve_path(manifest.files[manifest.source[row]].parent, manifest.value(row, column)))
+    return read_file(
+        resolve_path(manifest.files[manifest.source[row]].parent, manifest.value(row, column))
+    )
 
 
 def small_jpeg(data: bytes, name: str, side: int) -> bytes:
@@ -250,7 +276,12 @@ def small_jpeg(data: bytes, name: str, side: int) -> bytes:
 
 
 def attach_text(
-    manifest: Manifest, captions: str | Path, *, key: str | None = None, text: str = "text", overwrite: bool = False
+    manifest: Manifest,
+    captions: str | Path,
+    *,
+    key: str | None = None,
+    text: str = "text",
+    overwrite: bool = False,
 ) -> tuple[Manifest, list[str]]:
     """Add captions from a table (.csv or .parquet) with a key column and the column `text`; also return notes.
 
@@ -262,7 +293,8 @@ def attach_text(
     keys = _text_of(manifest.column(key), f"{manifest.files[0]}: the key {key!r}")
     at = pc.index_in(keys, value_set=pa.array(list(caption_of), pa.string())).combine_chunks()
     new = pa.chunked_array([pa.array(list(caption_of.values()), pa.string()).take(at)])
-    old, matched = manifest.column("text"), len(at) - at.null_count
+    old = manifest.column("text")
+    matched = len(at) - at.null_count
     if not matched:
         raise UserError(
             f"{path}: no key {key!r} of it is in the manifest; its first one is {shown(next(iter(caption_of), None))}; "
@@ -272,15 +304,25 @@ def attach_text(
     unused = len(caption_of) - len(at.drop_null().unique())
     notes = [f"{matched - kept} rows got a caption by {key!r}"]
     notes += [f"{kept} rows already had a caption"] if kept else []
-    notes += [f"{unused} of {len(caption_of)} keys of {path.name} are not in the manifest"] if unused else []
-    return replace_column(manifest, "text", pc.coalesce(new, old) if overwrite else pc.coalesce(old, new)), notes
+    notes += (
+        [f"{unused} of {len(caption_of)} keys of {path.name} are not in the manifest"]
+        if unused
+        else []
+    )
+    return replace_column(
+        manifest, "text", pc.coalesce(new, old) if overwrite else pc.coalesce(old, new)
+    ), notes
 
 
 def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, str], str]:
     """Return the captions of a table by key, and the name of its key column."""
     suffix = schema.table_suffix(path, "a table of captions")
     with schema.reading(path):
-        table = schema.read_text_csv(path) if suffix == ".csv" else pa.parquet.read_table(path, partitioning=None)
+        table = (
+            schema.read_text_csv(path)
+            if suffix == ".csv"
+            else pa.parquet.read_table(path, partitioning=None)
+        )
         table.validate(full=True)
     names = table.column_names
     others = [name for name in names if name != text]
@@ -291,7 +333,8 @@ def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, st
         if names.count(name) != 1 or key == text:
             fault = "twice the" if name in names else "no"
             raise UserError(f"{path} has {fault} column {name!r}; it has {listed(names)}")
-    keys, texts = _text_of(table[key], f"{path}: {key!r}"), _text_of(table[text], f"{path}: {text!r}")
+    keys = _text_of(table[key], f"{path}: {key!r}")
+    texts = _text_of(table[text], f"{path}: {text!r}")
     place = partial(schema.place_of, path)
     captions: dict[str, str] = {}
     for row, (name, caption) in enumerate(zip(keys.to_pylist(), texts.to_pylist(), strict=True)):
@@ -299,7 +342,9 @@ def _read_captions(path: Path, key: str | None, text: str) -> tuple[dict[str, st
         if name is None and caption:
             raise UserError(f"{place(row)}: a caption without {key}; fill it in")
         if name is not None and caption and captions.setdefault(name, caption) != caption:
-            raise UserError(f"{place(row)}: {key} {shown(name)} has another caption in an earlier row; keep one")
+            raise UserError(
+                f"{place(row)}: {key} {shown(name)} has another caption in an earlier row; keep one"
+            )
     return captions, key
 
 

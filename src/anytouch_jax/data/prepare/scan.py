@@ -84,7 +84,13 @@ class Finding(NamedTuple):
 
 
 def finding(
-    manifest: Manifest, kind: str, level: Level, rows: np.ndarray, words: str, *columns: str, column: str | None = None
+    manifest: Manifest,
+    kind: str,
+    level: Level,
+    rows: np.ndarray,
+    words: str,
+    *columns: str,
+    column: str | None = None,
 ) -> Iterator[Finding]:
     """Yield a finding of `rows` if there are any: their number and `words`, with their values in `columns`."""
     if rows.size:
@@ -92,7 +98,9 @@ def finding(
             f"{manifest.where(row)}: {', '.join(shown(manifest.value(row, name)) for name in columns)}"
             for row in rows[:EXAMPLES]
         )
-        yield Finding(kind, level, f"{rows.size} {words}", rows, tuple(examples), column or columns[0])
+        yield Finding(
+            kind, level, f"{rows.size} {words}", rows, tuple(examples), column or columns[0]
+        )
 
 
 class _FileState(NamedTuple):
@@ -111,14 +119,23 @@ def scan(manifest: Manifest, *, decode: bool = True, threads: int = 4) -> Scan:
     files = distinct_files(manifest)
     count = len(files)
     result = Scan(
-        files, np.zeros(count, np.uint8), np.zeros((count, 2), np.int32), np.zeros(count, "S32"),
-        np.zeros((count, 3 * FIELDS * FIELDS), np.uint8), np.zeros((count, 5), np.float32),
-        np.zeros(count, np.uint32), np.zeros(count, np.uint8), {},
-    )  # fmt: skip
+        files,
+        np.zeros(count, np.uint8),
+        np.zeros((count, 2), np.int32),
+        np.zeros(count, "S32"),
+        np.zeros((count, 3 * FIELDS * FIELDS), np.uint8),
+        np.zeros((count, 5), np.float32),
+        np.zeros(count, np.uint32),
+        np.zeros(count, np.uint8),
+        {},
+    )
 
     def inspect(file: int) -> _FileState:
-        row, column = int(files.row[file]), str(files.column[file])
-        is_field = column == "field_path" or (column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS)
+        row = int(files.row[file])
+        column = str(files.column[file])
+        is_field = column == "field_path" or (
+            column == "path" and manifest.value(row, "sensor") in FIELD_SENSORS
+        )
         try:
             path = manifest.file(row, column)
         except UserError as error:
@@ -131,7 +148,9 @@ def scan(manifest: Manifest, *, decode: bool = True, threads: int = 4) -> Scan:
             return _FileState("missing")
         except (OSError, ValueError, MemoryError) as error:
             return _FileState("unreadable", reason=str(getattr(error, "strerror", None) or error))
-        return _judge(data, path, decode and not is_field) if data else _FileState("empty")
+        if data:
+            return _judge(data, path, decode and not is_field)
+        return _FileState("empty")
 
     with closing(bounded_map(inspect, range(count), threads, 8 * max(threads, 1))) as states:
         for file, state in enumerate(tracked(states, "files checked", count)):
@@ -154,12 +173,19 @@ def _judge(data: bytes, path: Path, is_image: bool) -> _FileState:
         pixels = to_rgb(stored, path)
     except ImageError as error:
         reason = str(error).removeprefix(f"{path} ").removeprefix("cannot be read: ")
-        return _FileState("truncated" if "cut short" in reason else "unreadable", digest=digest, reason=reason)
+        return _FileState(
+            "truncated" if "cut short" in reason else "unreadable", digest=digest, reason=reason
+        )
     height, width = pixels.shape[:2]
-    colour = stored[..., :3] if stored.ndim == 3 else stored  # alpha is full
-    bits = int(colour.max()).bit_length() if stored.dtype.kind == "u" and stored.itemsize == 2 else 0
+    # alpha is full
+    colour = stored[..., :3] if stored.ndim == 3 else stored
+    bits = (
+        int(colour.max()).bit_length() if stored.dtype.kind == "u" and stored.itemsize == 2 else 0
+    )
     colours = cv2.resize(pixels, (FIELDS, FIELDS), interpolation=cv2.INTER_AREA).reshape(-1)
-    return _FileState("ok", (width, height), digest, colours, _looks(pixels), zlib.crc32(pixels.data), bits)
+    return _FileState(
+        "ok", (width, height), digest, colours, _looks(pixels), zlib.crc32(pixels.data), bits
+    )
 
 
 def _looks(pixels: np.ndarray) -> np.ndarray:
@@ -178,12 +204,17 @@ def _looks(pixels: np.ndarray) -> np.ndarray:
     same = ((rows == pixels[-1, 0]) & (least == pixels[-1, 0])).all(axis=1)
     bottom = 0.0 if black[1] else _leading(same[::-1])
     height, width = pixels.shape[:2]
-    top, left = max(0, (height - _CROP) // 2), max(0, (width - _CROP) // 2)
-    grey = cv2.cvtColor(pixels[top : top + _CROP, left : left + _CROP], cv2.COLOR_RGB2GRAY).astype(np.float32)
+    top = max(0, (height - _CROP) // 2)
+    left = max(0, (width - _CROP) // 2)
+    grey = cv2.cvtColor(pixels[top : top + _CROP, left : left + _CROP], cv2.COLOR_RGB2GRAY).astype(
+        np.float32
+    )
     variance = float(grey.var())
     noise = 0.0
     if variance > 100 and min(grey.shape) > 1:
-        noise = min(float((np.diff(grey, axis=axis) ** 2).mean()) / (2 * variance) for axis in (0, 1))
+        noise = min(
+            float((np.diff(grey, axis=axis) ** 2).mean()) / (2 * variance) for axis in (0, 1)
+        )
     spread = float(cv2.meanStdDev(pixels)[1].max())
     red, green, blue = cv2.split(pixels)
     ranges = cv2.subtract(cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue))
@@ -203,9 +234,11 @@ _NARROW = 14  # bits of 16: more may be all that a dark picture uses
 _FROZEN = 3  # equal pictures in a row: cameras have noise
 _LAGS = (2, 3, 4)  # pictures of so many sensors may take turns in a sequence
 _ALONE = (
-    ("flat", "of one colour"), ("cut", "of one colour from some row to the bottom, as a file is that was cut"),
-    ("border", "with a black border"), ("noise", "of noise only"),
-)  # fmt: skip
+    ("flat", "of one colour"),
+    ("cut", "of one colour from some row to the bottom, as a file is that was cut"),
+    ("border", "with a black border"),
+    ("noise", "of noise only"),
+)
 _IN_SEQUENCE = (
     ("frozen", f"equal to the frames before ({_FROZEN} or more in a row)"),
     ("alternating", "in sequences that jump between the pictures of several sensors"),
@@ -219,7 +252,8 @@ _IN_SEQUENCE = (
 
 def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield the kinds of pictures that cannot be right."""
-    looks, narrow = scanned.looks, np.zeros(len(scanned.bits), bool)
+    looks = scanned.looks
+    narrow = np.zeros(len(scanned.bits), bool)
     source = np.stack([manifest.codes("dataset"), manifest.codes("sensor")], 1)
     for column, code in scanned.files.code.items():
         rows = np.flatnonzero((code >= 0) & (scanned.bits[code] > 0))
@@ -233,14 +267,20 @@ def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
                 yield from finding(manifest, "bits", "warning", group, words, column)
     flat = (looks[:, SPREAD] < 1) & ~narrow
     alone = {
-        "flat": flat, "cut": looks[:, BOTTOM] > 0.1, "border": looks[:, BORDER] > 0.03, "noise": looks[:, NOISE] > 0.6
-    }  # fmt: skip
+        "flat": flat,
+        "cut": looks[:, BOTTOM] > 0.1,
+        "border": looks[:, BORDER] > 0.03,
+        "noise": looks[:, NOISE] > 0.6,
+    }
     alone = {kind: wrong & ~narrow & (~flat | (kind == "flat")) for kind, wrong in alone.items()}
     for column, code in scanned.files.code.items():
         for kind, words in _ALONE:
             rows = np.flatnonzero((code >= 0) & (scanned.decoded & alone[kind])[code])
-            yield from finding(manifest, kind, "warning", rows, f"rows whose {column} is {words}", column)
-    files, frame = scanned.files.code["path"], np.asarray(manifest.table["frame_index"])
+            yield from finding(
+                manifest, kind, "warning", rows, f"rows whose {column} is {words}", column
+            )
+    files = scanned.files.code["path"]
+    frame = np.asarray(manifest.table["frame_index"])
     faults: dict[str, list[np.ndarray]] = {kind: [] for kind, _ in _IN_SEQUENCE}
     rows = np.flatnonzero((scanned.decoded & ~np.any([*alone.values()], axis=0))[files])
     for members in group_rows(rows, manifest.codes("sequence", own=True)[rows], frame[rows]):
@@ -265,14 +305,16 @@ def _faults_of_sequence(scanned: Scan, files: np.ndarray) -> dict[str, np.ndarra
     faults["alternating"] = np.full(len(files), _alternates(colours))
     if faults["alternating"].any():
         return faults
-    usual, chroma = np.median(colours, axis=0), scanned.looks[files, CHROMA]
+    usual = np.median(colours, axis=0)
+    chroma = scanned.looks[files, CHROMA]
     faults["grey"] = (chroma < 1.5) & (np.median(chroma) > 6)
     faults["dark"] = (colours.mean(axis=1) < usual.mean() / 4) & (usual.mean() > 20)
     away = np.abs(colours - usual).mean(axis=1)
     spread = float(np.median(away))
     for at in np.flatnonzero((away > max(6.0, 3 * spread)) & ~faults["grey"] & ~faults["dark"]):
         kind, near = min(
-            ((kind, float(np.abs(other - usual).mean())) for kind, other in _variants(colours[at])), key=lambda p: p[1]
+            ((kind, float(np.abs(other - usual).mean())) for kind, other in _variants(colours[at])),
+            key=lambda p: p[1],
         )
         if near < min(away[at] / 3, max(3.0, 2 * spread)):
             faults.setdefault(kind, np.zeros(len(files), bool))[at] = True
@@ -285,7 +327,8 @@ def _alternates(colours: np.ndarray) -> bool:
         return False
     step = np.median(np.abs(np.diff(colours, axis=0)).mean(axis=1))
     return step > 2 and any(
-        len(colours) >= 3 * lag and 4 * np.median(np.abs(colours[lag:] - colours[:-lag]).mean(axis=1)) < step
+        len(colours) >= 3 * lag
+        and 4 * np.median(np.abs(colours[lag:] - colours[:-lag]).mean(axis=1)) < step
         for lag in _LAGS
     )
 
@@ -303,7 +346,8 @@ def _variants(colours: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 # Folders of touch images and photographs that are swapped.
 _MIN_PAIRS = 8  # different pairs of images that are needed for an opinion on swapped folders
 _WIDER = 1.5  # touch images may spread this much more than photographs before they are suspect
-_CERTAIN = 0.95  # share of the rows that must resemble the background images to call a dataset swapped
+# share of the rows that must resemble the background images to call a dataset swapped
+_CERTAIN = 0.95
 
 
 class SwapVerdict(NamedTuple):
@@ -322,9 +366,12 @@ def swap_verdicts(manifest: Manifest, scanned: Scan) -> list[SwapVerdict]:
     code = scanned.files.code
     if "image_path" not in code or not scanned.colours.any():
         return []
-    touch, vision = code["path"], code["image_path"]
+    touch = code["path"]
+    vision = code["image_path"]
     background = np.asarray(pc.equal(manifest.table["split"], "background"))
-    usable = np.flatnonzero((vision >= 0) & scanned.decoded[touch] & scanned.decoded[vision] & ~background)
+    usable = np.flatnonzero(
+        (vision >= 0) & scanned.decoded[touch] & scanned.decoded[vision] & ~background
+    )
     source = np.stack([manifest.codes("dataset"), manifest.codes("sensor")], 1)
     result = []
     for rows in group_rows(usable, source[usable]):
@@ -341,11 +388,16 @@ def swap_verdicts(manifest: Manifest, scanned: Scan) -> list[SwapVerdict]:
 
 def in_touch_folder(manifest: Manifest, column: str) -> np.ndarray:
     """Return which rows name a file in `column` that lies in the folder of their touch image, bool (rows,)."""
-    folders = [pc.replace_substring_regex(manifest.column(name), r"[^/]*$", "") for name in (column, "path")]
+    folders = [
+        pc.replace_substring_regex(manifest.column(name), r"[^/]*$", "")
+        for name in (column, "path")
+    ]
     return np.asarray(pc.fill_null(pc.equal(*folders), False))
 
 
-def _background_colours(manifest: Manifest, scanned: Scan, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _background_colours(
+    manifest: Manifest, scanned: Scan, others: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
     """Return the colours f32 (k, 48) of the sensor's background images, k = 0 if it has none.
 
     They are of `others`, background rows without a photograph, and of `rows`, but for those in the folder of the touch
@@ -354,21 +406,28 @@ def _background_colours(manifest: Manifest, scanned: Scan, others: np.ndarray, r
     code = scanned.files.code
     files = [code["path"][others]]
     if "background_path" in code:
-        files.append(code["background_path"][rows[~in_touch_folder(manifest, "background_path")[rows]]])
+        files.append(
+            code["background_path"][rows[~in_touch_folder(manifest, "background_path")[rows]]]
+        )
     # A background that is also a photograph would confirm anything.
     ids = np.setdiff1d(np.concatenate(files), [-1, *np.unique(code["image_path"])])
     return scanned.colours[ids[scanned.decoded[ids]][:64]].astype(np.float32)
 
 
 def _judge_swap(
-    colours: np.ndarray, rows: np.ndarray, touch: np.ndarray, vision: np.ndarray, backgrounds: np.ndarray
+    colours: np.ndarray,
+    rows: np.ndarray,
+    touch: np.ndarray,
+    vision: np.ndarray,
+    backgrounds: np.ndarray,
 ) -> tuple[np.ndarray, bool]:
     """Return the rows that look swapped, and whether the whole dataset does; `touch` and `vision` are their files."""
     if len(backgrounds):
         bad = _distance(colours[vision], backgrounds) < _distance(colours[touch], backgrounds)
         whole = bool(bad.mean() >= _CERTAIN)
         return rows if whole else rows[bad], whole
-    each = [colours[np.unique(files)] for files in (touch, vision)]  # one photograph may serve many rows
+    # one photograph may serve many rows
+    each = [colours[np.unique(files)] for files in (touch, vision)]
     centre, other = (np.median(part, axis=0)[None] for part in each)
     spreads = [
         float(np.median(_distance(part, middle))) if len(part) >= _MIN_PAIRS else 0.0
@@ -376,22 +435,37 @@ def _judge_swap(
     ]
     if spreads[1] and spreads[0] > _WIDER * spreads[1]:
         return rows, True
-    far, near = _distance(colours[touch], centre), _distance(colours[vision], centre)
+    far = _distance(colours[touch], centre)
+    near = _distance(colours[vision], centre)
     return rows[(far > 3 * max(spreads[0], 1.0)) & (near < far / 2)], False
 
 
 def _distance(colours: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """Return the mean absolute difference f32 (n,) of colours u8 (n, 48) to the nearest of centres (k, 48)."""
-    return np.min([np.abs(colours.astype(np.float32) - centre).mean(axis=1) for centre in centres], axis=0)
+    return np.min(
+        [np.abs(colours.astype(np.float32) - centre).mean(axis=1) for centre in centres], axis=0
+    )
 
 
 def swapped_folders(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield data sets and rows whose touch images and photographs look swapped."""
     for verdict in swap_verdicts(manifest, scanned):
-        name = f"dataset {shown(verdict.dataset)}" if verdict.dataset else "the rows without a dataset"
-        reason = "the background frames show it" if verdict.confirmed else "suspected from the colours; look at some"
-        what = "all touch images and photographs are" if verdict.whole else f"{verdict.swapped.size} rows are"
+        name = (
+            f"dataset {shown(verdict.dataset)}" if verdict.dataset else "the rows without a dataset"
+        )
+        reason = (
+            "the background frames show it"
+            if verdict.confirmed
+            else "suspected from the colours; look at some"
+        )
+        what = (
+            "all touch images and photographs are"
+            if verdict.whole
+            else f"{verdict.swapped.size} rows are"
+        )
         kind = "swapped" if verdict.whole else "swapped_rows"
         level: Level = "error" if verdict.confirmed else "warning"
-        for fault in finding(manifest, kind, level, verdict.swapped, "", "path", "image_path", column="image_path"):
+        for fault in finding(
+            manifest, kind, level, verdict.swapped, "", "path", "image_path", column="image_path"
+        ):
             yield fault._replace(sentence=f"{name}: {what} swapped ({reason})")

@@ -26,8 +26,20 @@ from anytouch_jax.bars import tracked
 from anytouch_jax.config.parsing import parse_json
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.manifest.files import ShardError, close_shards, read_file, read_shard_index, split_shard_path
-from anytouch_jax.data.manifest.manifest import Files, Manifest, distinct_files, replace_column, with_distinct_keys
+from anytouch_jax.data.manifest.files import (
+    ShardError,
+    close_shards,
+    read_file,
+    read_shard_index,
+    split_shard_path,
+)
+from anytouch_jax.data.manifest.manifest import (
+    Files,
+    Manifest,
+    distinct_files,
+    replace_column,
+    with_distinct_keys,
+)
 from anytouch_jax.data.manifest.schema import PATHS
 from anytouch_jax.data.prepare.verify import licences
 from anytouch_jax.errors import UserError
@@ -44,9 +56,13 @@ class PackError(UserError):
 
 
 def pack(
-    manifest: Manifest, out: str | Path, *, shard_bytes: int = SHARD_BYTES, threads: int = 4,
+    manifest: Manifest,
+    out: str | Path,
+    *,
+    shard_bytes: int = SHARD_BYTES,
+    threads: int = 4,
     log: Callable[[str], None] = lambda _: None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Store all files of a manifest in shards of about `shard_bytes` in the folder `out`, and return its manifest.
 
     Files are stored unchanged and once each, so a loader reads the same batches. The same call continues after an
@@ -66,14 +82,17 @@ def pack(
         if not finished:
             raise  # now, rather than after hours of packing the others
         fingerprint = None
-    _is_same_pack(folder, plan, fingerprint, finished)  # before a lock is made in a foreign folder
+    # before a lock is made in a foreign folder
+    _is_same_pack(folder, plan, fingerprint, finished)
     if finished:
         log(f"{folder} is already packed; it was not changed")
         return target
     folder.mkdir(parents=True, exist_ok=True)
     with lock(folder / ".lock") as free:
         if not free:
-            raise PackError(f"another process packs into {folder}: wait for it, or choose another folder")
+            raise PackError(
+                f"another process packs into {folder}: wait for it, or choose another folder"
+            )
         if not _is_same_pack(folder, plan, fingerprint, finished):
             atomic_write(folder / "pack.json", json.dumps(plan | {"files": fingerprint}))
         _pack(manifest, files, folder, shard_bytes, threads, log)
@@ -82,14 +101,22 @@ def pack(
 
 
 def _pack(
-    manifest: Manifest, files: Files, folder: Path, shard_bytes: int, threads: int, log: Callable[[str], None]
+    manifest: Manifest,
+    files: Files,
+    folder: Path,
+    shard_bytes: int,
+    threads: int,
+    log: Callable[[str], None],
 ) -> None:
     """Write the shards, the manifest and, last, the README."""
-    cells = np.empty(len(files), object)  # where each file lies, as the manifest names it
+    # where each file lies, as the manifest names it
+    cells = np.empty(len(files), object)
     sums: dict[str, str] = {}
     for group, ids in _group_files(manifest, files).items():
         done = 0
-        for number, rows in enumerate(_write_shards(manifest, files, ids, folder / group, shard_bytes, threads)):
+        for number, rows in enumerate(
+            _write_shards(manifest, files, ids, folder / group, shard_bytes, threads)
+        ):
             name = f"{group}/{number:05d}.zip"
             cells[ids[done : done + rows]] = [f"{name}/{row}" for row in range(rows)]
             with (folder / name).open("rb") as file:
@@ -97,10 +124,16 @@ def _pack(
             done += rows
             log(f"{name}: {done} of {len(ids)} files")
     close_shards()
-    atomic_write(folder / "SHA256SUMS", "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
-    target, packed = folder / "manifest.parquet", manifest
+    atomic_write(
+        folder / "SHA256SUMS",
+        "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())),
+    )
+    target = folder / "manifest.parquet"
+    packed = manifest
     for name, code in files.code.items():
-        packed = replace_column(packed, name, pa.array(cells, pa.string()).take(pa.array(code, mask=code < 0)))
+        packed = replace_column(
+            packed, name, pa.array(cells, pa.string()).take(pa.array(code, mask=code < 0))
+        )
     table = with_distinct_keys(manifest, packed.table)
     packed = Manifest(table, (target,), np.zeros(len(manifest), np.int32), np.arange(len(manifest)))
     manifests.write(packed, target)
@@ -118,7 +151,9 @@ def _fingerprint(manifest: Manifest, files: Files) -> str:
             raise _cannot_pack(manifest, int(row), str(column), "the file is missing") from None
         except (OSError, UserError) as error:
             raise _cannot_pack(manifest, int(row), str(column), str(error)) from None
-        digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\n".encode(errors="surrogateescape"))
+        digest.update(
+            f"{path}\0{status.st_size}\0{status.st_mtime_ns}\n".encode(errors="surrogateescape")
+        )
     return digest.hexdigest()
 
 
@@ -129,7 +164,9 @@ def _cannot_pack(manifest: Manifest, row: int, column: str, reason: str) -> Pack
     )
 
 
-def _is_same_pack(folder: Path, plan: dict[str, object], fingerprint: str | None, finished: bool) -> bool:
+def _is_same_pack(
+    folder: Path, plan: dict[str, object], fingerprint: str | None, finished: bool
+) -> bool:
     """Return whether the folder holds this pack, finished or not. Raises PackError if it cannot be taken for it."""
     record = folder / "pack.json"
     if record.is_file():
@@ -139,25 +176,39 @@ def _is_same_pack(folder: Path, plan: dict[str, object], fingerprint: str | None
             raise PackError(f"{record} is not of a pack; choose another folder") from None
         files = old.pop("files", None)
         if finished:
-            old["version"] = plan["version"]  # a finished pack of version 1 stays in use
+            # a finished pack of version 1 stays in use
+            old["version"] = plan["version"]
         if old == plan and (files in (fingerprint, None) or (finished and fingerprint is None)):
             return True
         if any([*folder.rglob("*.zip"), *folder.rglob("*.parquet")]):
             if old != plan:
-                raise PackError(f"{folder} holds a pack of another manifest or shard size; choose another folder")
-            raise PackError(f"the files of the manifest have changed since {folder} was begun; choose another folder")
-    elif folder.exists() and (not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())):
+                raise PackError(
+                    f"{folder} holds a pack of another manifest or shard size; choose another folder"
+                )
+            raise PackError(
+                f"the files of the manifest have changed since {folder} was begun; choose another folder"
+            )
+    elif folder.exists() and (
+        not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())
+    ):
         raise PackError(f"{folder} is not an empty folder; choose another one")
     return False
 
 
 def _group_files(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
     """Return the file ids of every group that has files, ordered by sequence and frame."""
-    frame, sequence = np.asarray(manifest.table["frame_index"]), manifest.codes("sequence")
+    frame = np.asarray(manifest.table["frame_index"])
+    sequence = manifest.codes("sequence")
     rank = np.empty(len(manifest), np.int64)
     rank[np.lexsort((frame, sequence, manifest.source))] = np.arange(len(manifest))
-    by_group = {group: np.flatnonzero(np.isin(files.column, members)) for group, members in _GROUPS.items()}
-    return {group: ids[np.argsort(rank[files.row[ids]], kind="stable")] for group, ids in by_group.items() if ids.size}
+    by_group = {
+        group: np.flatnonzero(np.isin(files.column, members)) for group, members in _GROUPS.items()
+    }
+    return {
+        group: ids[np.argsort(rank[files.row[ids]], kind="stable")]
+        for group, ids in by_group.items()
+        if ids.size
+    }
 
 
 def _write_shards(
@@ -171,10 +222,12 @@ def _write_shards(
         except ShardError:
             break  # damaged: it is written again
         yield rows
-        number, done = number + 1, done + rows
+        number = number + 1
+        done = done + rows
 
     def fetch(file: int) -> tuple[str, bytes]:  # the ending of its name, its content
-        row, column = int(files.row[file]), str(files.column[file])
+        row = int(files.row[file])
+        column = str(files.column[file])
         try:
             data = read_file(manifest.file(row, column))
         except FileNotFoundError:
@@ -190,12 +243,18 @@ def _write_shards(
         pieces = tracked(every, "files packed", len(ids) - done)
         piece = next(pieces, None)
         while piece is not None:
-            path, rows, size = folder / f"{number:05d}.zip", 0, 0
-            with atomic_path(path, part=path.with_suffix(".part")) as part, zipfile.ZipFile(part, "w") as archive:
+            path = folder / f"{number:05d}.zip"
+            rows = 0
+            size = 0
+            with (
+                atomic_path(path, part=path.with_suffix(".part")) as part,
+                zipfile.ZipFile(part, "w") as archive,
+            ):
                 while piece is not None and (not rows or size + len(piece[1]) <= shard_bytes):
                     # A fixed date makes equal packs equal to the byte.
                     archive.writestr(zipfile.ZipInfo(f"{rows:06d}{piece[0]}"), piece[1])
-                    rows, size = rows + 1, size + len(piece[1])
+                    rows = rows + 1
+                    size = size + len(piece[1])
                     piece = next(pieces, None)
             yield rows
             number += 1

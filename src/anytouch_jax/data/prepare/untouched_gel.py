@@ -14,14 +14,24 @@ import cv2
 import numpy as np
 
 LONG_SIDE = 160  # pixels of the long side on which all lengths below are measured
-DOT, DOT_DEPTH, FEWEST_DOTS = 13, 12, 20  # widest marker dot, its darkness in grey levels, dots that a marked gel shows
-BLUR, EDGE, PERCENTILE = 1.5, 4, 98  # of the difference image: blur, cut edge, score
+# widest marker dot, its darkness in grey levels, dots that a marked gel shows
+DOT = 13
+DOT_DEPTH = 12
+FEWEST_DOTS = 20
+# of the difference image: blur, cut edge, score
+BLUR = 1.5
+EDGE = 4
+PERCENTILE = 98
 FIT = 12  # cells of a side of the difference image, to which a change of light is fitted
 WIDE = 8  # blur of the gel's slow changes of light
-ALIKE, DIFFERENT = 3.0, 6.5  # grey levels: frames of one state, and frames of two
+# grey levels: frames of one state, and frames of two
+ALIKE = 3.0
+DIFFERENT = 6.5
 _AT = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
-_TERMS = np.stack([np.ones(FIT * FIT, np.float32), np.tile(_AT, FIT), np.repeat(_AT, FIT)], 1)  # of a plane, by cell
-MARGIN = 0.1  # least excess of structure, as a share of the sum; measured on real and simulated recordings
+# of a plane, by cell
+_TERMS = np.stack([np.ones(FIT * FIT, np.float32), np.tile(_AT, FIT), np.repeat(_AT, FIT)], 1)
+# least excess of structure, as a share of the sum; measured on real and simulated recordings
+MARGIN = 0.1
 
 
 def scale_picture(picture: np.ndarray, long_side: int = LONG_SIDE) -> np.ndarray:
@@ -29,12 +39,16 @@ def scale_picture(picture: np.ndarray, long_side: int = LONG_SIDE) -> np.ndarray
     height, width = picture.shape[:2]
     shrink = long_side / max(height, width)
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
+    return cv2.resize(
+        picture, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR
+    )
 
 
 def close_dots(picture: np.ndarray) -> np.ndarray:
     """Fill dark dots and thin dark lines, which shear moves without any change of contact."""
-    return cv2.morphologyEx(picture, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (DOT, DOT)))
+    return cv2.morphologyEx(
+        picture, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (DOT, DOT))
+    )
 
 
 def has_dots(picture: np.ndarray) -> bool:
@@ -57,13 +71,17 @@ def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BL
 def change_of_light(change: np.ndarray) -> np.ndarray:
     """Return the change of light f32 (h, w, 3), a plane a colour: lamps drift, and a press covers little."""
     small = cv2.resize(change, (FIT, FIT), interpolation=cv2.INTER_AREA).reshape(-1, 3)
-    most, fits = int(0.6 * len(small)), np.arange(len(small))
+    most = int(0.6 * len(small))
+    fits = np.arange(len(small))
     for _ in range(3):
         chosen = _TERMS[fits]
         plane = np.linalg.solve(chosen.T @ chosen, chosen.T @ small[fits])
         fits = np.argpartition(np.abs(small - _TERMS @ plane).max(1), most)[:most]
     height, width = change.shape[:2]
-    y, x = (((np.arange(size, dtype=np.float32) + 0.5) / size - 0.5)[:, None] for size in (height, width))
+    y, x = (
+        ((np.arange(size, dtype=np.float32) + 0.5) / size - 0.5)[:, None]
+        for size in (height, width)
+    )
     return np.asarray((plane[0] + y * plane[2])[:, None] + x * plane[1], np.float32)
 
 
@@ -94,7 +112,9 @@ class UntouchedGel:
 def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel | None, str]:
     """Return the untouched gel of scaled frames u8 (h, w, 3) of one recording, or None, and the reason."""
     group, reason = free_frames(pictures)
-    return (None, reason) if group is None else (UntouchedGel(_median([pictures[i] for i in group])), "estimated")
+    if group is None:
+        return (None, reason)
+    return (UntouchedGel(_median([pictures[i] for i in group])), "estimated")
 
 
 def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]:
@@ -126,7 +146,11 @@ def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:
     groups = _alike([gel.score(other.picture) for gel, other in combinations(gels, 2)])
     groups.sort(key=len, reverse=True)
     centres = [UntouchedGel(_median([gels[i].picture for i in group])) for group in groups]
-    rivals = [gel for gel, group in zip(centres[1:], groups[1:], strict=True) if len(group) == len(groups[0])]
+    rivals = [
+        gel
+        for gel, group in zip(centres[1:], groups[1:], strict=True)
+        if len(group) == len(groups[0])
+    ]
     if len(groups[0]) < 2 or any(centres[0].score(rival.picture) >= ALIKE for rival in rivals):
         return None
     return centres[0]
@@ -138,7 +162,8 @@ def _median(pictures: Sequence[np.ndarray]) -> np.ndarray:
 
 def _alike(distances: Sequence[float]) -> list[np.ndarray]:
     """Return groups of numbers within ALIKE of each other, from condensed distances."""
-    from scipy.cluster.hierarchy import fcluster, linkage  # 0.3 s, which training has no use for
+    # 0.3 s, which training has no use for
+    from scipy.cluster.hierarchy import fcluster, linkage
 
     labels = fcluster(linkage(np.asarray(distances), "complete"), ALIKE, "distance")
     return [np.flatnonzero(labels == label) for label in np.unique(labels)]
@@ -146,7 +171,9 @@ def _alike(distances: Sequence[float]) -> list[np.ndarray]:
 
 def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None, str]:
     """Return the frame numbers of the group that has less structure than all frames that differ from it."""
-    halves = [cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for frame in frames]
+    halves = [
+        cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for frame in frames
+    ]
     distances = [_distance(frame, other, BLUR / 2) for frame, other in combinations(halves, 2)]
     if not distances:
         return None, "fewer than two frames can be read"
@@ -154,7 +181,8 @@ def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None
         return None, "all frames are alike: always free, or always pressed"
     groups = _alike(distances)
     centres = [_median([frames[i] for i in group]) for group in groups]
-    best, best_margin = None, MARGIN
+    best = None
+    best_margin = MARGIN
     for number, group in enumerate(groups):
         if len(group) < 2:
             continue
@@ -165,7 +193,8 @@ def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None
                 if margin < best_margin:
                     break
         if best_margin <= margin < np.inf:
-            best, best_margin = group, margin
+            best = group
+            best_margin = margin
     if best is None:
         return None, "no frames stand out as the untouched gel"
     free = _median([frames[i] for i in best])
@@ -199,7 +228,9 @@ def _press_of(free: np.ndarray, pressed: np.ndarray) -> float:
     A press that gets deeper strengthens edges that are there already. Edges of the untouched gel are others.
     """
     region = _changed(free, pressed)
-    before, after = (_gradient(_smooth(picture) - _smooth(picture, WIDE))[region] for picture in (free, pressed))
+    before, after = (
+        _gradient(_smooth(picture) - _smooth(picture, WIDE))[region] for picture in (free, pressed)
+    )
     change = after - before
     return _distance(free, pressed) * float((before * change).sum() / ((change**2).sum() + 1e-6))
 

@@ -17,7 +17,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from anytouch_jax.data.manifest.manifest import Manifest, group_rows, misspelt_sensors, replace_column, select_rows
+from anytouch_jax.data.manifest.manifest import (
+    Manifest,
+    group_rows,
+    misspelt_sensors,
+    replace_column,
+    select_rows,
+)
 from anytouch_jax.data.manifest.schema import NUMBER, SPLITS, listed, shown, spellings
 from anytouch_jax.data.prepare import scan as scans
 from anytouch_jax.data.prepare.scan import EXAMPLES, OK, STATES, Finding, Level, Scan, finding
@@ -31,8 +37,13 @@ _FRAME = ("dataset", "sensor", "unit", "sequence", "frame_index", "split")
 _LEARNING = SPLITS[:3]  # the splits that must not share anything: train, val, test
 
 
-YES, NO, UNKNOWN = 1, 0, -1
-_NO = re.compile(r"\bnc\b|non-?\s?commercial|(research|academic|educational)[\s-]+(use[\s-]+)?only", re.IGNORECASE)
+YES = 1
+NO = 0
+UNKNOWN = -1
+_NO = re.compile(
+    r"\bnc\b|non-?\s?commercial|(research|academic|educational)[\s-]+(use[\s-]+)?only",
+    re.IGNORECASE,
+)
 _YES = re.compile(
     r"(mit|apache([\s-]2(\.0)?)?|bsd([\s-][0-9]-clause)?|isc|cc0([\s-]1\.0)?|cc[\s-]by([\s-]sa)?([\s-][0-9]\.[0-9])?|"
     r"public[\s-]domain|unlicense)(\s+licen[cs]e)?",
@@ -81,11 +92,22 @@ class VerifyReport:
 
     def to_json(self) -> str:
         """Return the report as JSON, with the row numbers and files of the first thousand rows of each finding."""
-        names = ("rows", "files", "decoded", "ok", "content_hash", "split_hash", "splits", "labels", "shares")
+        names = (
+            "rows",
+            "files",
+            "decoded",
+            "ok",
+            "content_hash",
+            "split_hash",
+            "splits",
+            "labels",
+            "shares",
+        )
         report: dict[str, Any] = {name: getattr(self, name) for name in names}
         report["licences"] = [licence._asdict() for licence in self.licences]
         report["findings"] = [
-            one._asdict() | {"count": len(one.rows), "rows": one.rows[:_LISTED].tolist()} for one in self.findings
+            one._asdict() | {"count": len(one.rows), "rows": one.rows[:_LISTED].tolist()}
+            for one in self.findings
         ]
         return json.dumps(report, indent=1, ensure_ascii=False) + "\n"
 
@@ -94,14 +116,24 @@ class VerifyReport:
         decoded = "every image decoded" if self.decoded else "images not decoded"
         splits = ", ".join(f"{name} {count}" for name, count in self.splits.items())
         lines = [
-            f"{self.rows} rows, {self.files} files ({decoded})", "",
-            f"content {self.content_hash[:16]}, splits {self.split_hash[:16]}: {splits}", "",
-        ]  # fmt: skip
+            f"{self.rows} rows, {self.files} files ({decoded})",
+            "",
+            f"content {self.content_hash[:16]}, splits {self.split_hash[:16]}: {splits}",
+            "",
+        ]
         if self.labels:
-            lines += [f"values of labels: {', '.join(f'{name} {count}' for name, count in self.labels.items())}", ""]
+            lines += [
+                f"values of labels: {', '.join(f'{name} {count}' for name, count in self.labels.items())}",
+                "",
+            ]
         for one in self.findings:
-            lines += [f"* **{one.level}** `{one.kind}`: {one.sentence}", *(f"  * {text}" for text in one.examples)]
-            lines += ["  * and more: `--out` names the files"] * (0 < len(one.examples) < len(one.files))
+            lines += [
+                f"* **{one.level}** `{one.kind}`: {one.sentence}",
+                *(f"  * {text}" for text in one.examples),
+            ]
+            lines += ["  * and more: `--out` names the files"] * (
+                0 < len(one.examples) < len(one.files)
+            )
         lines += ["" if self.findings else "No fault was found.\n"]
         lines += _table("dataset", *_SHARES)
         for name, share in self.shares.items():
@@ -121,7 +153,9 @@ def _table(*names: str) -> list[str]:
     return [*_row(*names), "|---" * len(names) + "|"]
 
 
-def verify(manifest: Manifest, *, decode: bool = True, objects: bool = False, threads: int = 4) -> VerifyReport:
+def verify(
+    manifest: Manifest, *, decode: bool = True, objects: bool = False, threads: int = 4
+) -> VerifyReport:
     """Check a manifest and every file that it names.
 
     Without `decode`, files must only exist and not be empty. With `objects`, an object in two learning splits is an
@@ -134,26 +168,46 @@ def verify(manifest: Manifest, *, decode: bool = True, objects: bool = False, th
         *(Finding("unknown_sensor", *fault, (), "sensor") for fault in misspelt_sensors(manifest)),
     ]
     levels = ("error", "warning", "info")
-    findings = sorted(map(partial(_with_files, manifest), findings), key=lambda one: levels.index(one.level))
-    counts = {entry["values"]: entry["counts"] for entry in pc.value_counts(manifest.table["split"]).to_pylist()}
+    findings = sorted(
+        map(partial(_with_files, manifest), findings), key=lambda one: levels.index(one.level)
+    )
+    counts = {
+        entry["values"]: entry["counts"]
+        for entry in pc.value_counts(manifest.table["split"]).to_pylist()
+    }
     splits = {name: counts[name] for name in SPLITS if name in counts}
     present = {name: manifest.present(name) for name in _SHARES}
     shares = {
-        str(manifest.value(rows[0], "dataset") or "-"): {name: float(has[rows].mean()) for name, has in present.items()}
+        str(manifest.value(rows[0], "dataset") or "-"): {
+            name: float(has[rows].mean()) for name, has in present.items()
+        }
         for rows in manifest.groups("dataset")
     }
     names = (name for name in manifest.table.column_names if name.startswith("label."))
     labels = {name: int(manifest.present(name).sum()) for name in names}
     return VerifyReport(
-        len(manifest), len(scanned.files), decode, tuple(findings), licences(manifest), shares, splits,
-        labels, split_hash(manifest), manifest.content_hash, scanned,
-    )  # fmt: skip
+        len(manifest),
+        len(scanned.files),
+        decode,
+        tuple(findings),
+        licences(manifest),
+        shares,
+        splits,
+        labels,
+        split_hash(manifest),
+        manifest.content_hash,
+        scanned,
+    )
 
 
 def _with_files(manifest: Manifest, one: Finding) -> Finding:
     """Return a finding with the files of its first rows, if it is about a column of files."""
     column = one.column or ""
-    rows = one.rows[:_LISTED] if column.endswith("path") and column in manifest.table.column_names else ()
+    rows = (
+        one.rows[:_LISTED]
+        if column.endswith("path") and column in manifest.table.column_names
+        else ()
+    )
     return one._replace(files=tuple(manifest.value(row, column) for row in rows))
 
 
@@ -166,8 +220,11 @@ def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding
             yield from _leak(manifest, codes, f"leak_{column}", level, column, column)
     yield from _frame_order(manifest)
     marked = np.asarray(pc.fill_null(manifest.column("commercial"), False))
-    rows, words = np.flatnonzero(marked & (commercial_use(manifest) == NO)), "rows are commercial, their licence is not"
-    yield from finding(manifest, "licence_conflict", "warning", rows, words, "license", column="commercial")
+    rows = np.flatnonzero(marked & (commercial_use(manifest) == NO))
+    words = "rows are commercial, their licence is not"
+    yield from finding(
+        manifest, "licence_conflict", "warning", rows, words, "license", column="commercial"
+    )
     yield from _label_spellings(manifest)
 
 
@@ -175,7 +232,9 @@ def split_hash(manifest: Manifest) -> str:
     """Return the SHA-256 of which frame (_FRAME) is in which split, in any order of rows and with any paths."""
     table = manifest.table
     nulls = pa.nulls(table.num_rows, pa.string())
-    columns = [table[name].cast(pa.string()) if name in table.column_names else nulls for name in _FRAME]
+    columns = [
+        table[name].cast(pa.string()) if name in table.column_names else nulls for name in _FRAME
+    ]
     # A tag before the value distinguishes a null from an empty text.
     parts = [pc.fill_null(pc.binary_join_element_wise("=", column, ""), "-") for column in columns]
     digest = hashlib.sha256()
@@ -190,7 +249,9 @@ def _bad_files(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
         states = scanned.states(column)
         for number, state in enumerate(STATES):
             rows = np.flatnonzero(states == number) if number != OK else np.empty(0, np.int64)
-            for fault in finding(manifest, state, "error", rows, f"rows whose {column} is {state}", column):
+            for fault in finding(
+                manifest, state, "error", rows, f"rows whose {column} is {state}", column
+            ):
                 reasons = [scanned.reasons.get(int(code[row]), state) for row in rows[:EXAMPLES]]
                 yield fault._replace(examples=tuple(map("{}: {}".format, fault.examples, reasons)))
 
@@ -198,9 +259,11 @@ def _bad_files(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 def _wrong_sizes(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield touch images of another size than most of their dataset, sensor and unit, or than their sequence."""
     size = scanned.size[scanned.files.code["path"]]
-    rows, usual = np.flatnonzero(size[:, 0] > 0), size.copy()
+    rows = np.flatnonzero(size[:, 0] > 0)
+    usual = size.copy()
     unit = np.stack([manifest.codes(name)[rows] for name in ("dataset", "sensor", "unit")], 1)
-    for keys in (manifest.codes("sequence", own=True)[rows], unit):  # the unit counts where both differ
+    # the unit counts where both differ
+    for keys in (manifest.codes("sequence", own=True)[rows], unit):
         for group in group_rows(rows, keys):
             sizes, counts = np.unique(size[group], axis=0, return_counts=True)
             main = sizes[counts.argmax()]
@@ -209,14 +272,19 @@ def _wrong_sizes(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     rows = np.flatnonzero((usual != size).any(axis=1))
     words = "touch images of another size than most of their dataset, sensor and unit, or sequence"
     for fault in finding(manifest, "wrong_size", "warning", rows, words, "path"):
-        reasons = (f" is {w} x {h}, where most of its sensor or sequence are {u} x {v}"
-                 for (w, h), (u, v) in zip(size[rows], usual[rows], strict=True))  # fmt: skip
-        yield fault._replace(examples=tuple(map("".join, zip(fault.examples, reasons, strict=False))))
+        reasons = (
+            f" is {w} x {h}, where most of its sensor or sequence are {u} x {v}"
+            for (w, h), (u, v) in zip(size[rows], usual[rows], strict=True)
+        )
+        yield fault._replace(
+            examples=tuple(map("".join, zip(fault.examples, reasons, strict=False)))
+        )
 
 
 def content_ids(scanned: Scan, column: str = "path") -> np.ndarray:
     """Return equal numbers i64 (rows,) for equal bytes, -1 for null. A file without a hash goes by its path."""
-    code, count = scanned.files.code[column], len(scanned.digest)
+    code = scanned.files.code[column]
+    count = len(scanned.digest)
     names = np.where(scanned.digest == b"", np.arange(count).astype("S32"), scanned.digest)
     return np.where(code < 0, -1, np.unique(names, return_inverse=True)[1][code])
 
@@ -237,12 +305,18 @@ def repeated_rows(manifest: Manifest, same: np.ndarray) -> np.ndarray:
 
 def _codes(column: pa.ChunkedArray) -> pa.Array:
     binary = pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type)
-    return (column if binary else column.cast(pa.string())).combine_chunks().dictionary_encode().indices
+    return (
+        (column if binary else column.cast(pa.string()))
+        .combine_chunks()
+        .dictionary_encode()
+        .indices
+    )
 
 
 def _background_forms(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield rows whose background has other proportions than the frame: encoders refuse them."""
-    frame, background = scanned.files.code["path"], scanned.files.code.get("background_path")
+    frame = scanned.files.code["path"]
+    background = scanned.files.code.get("background_path")
     if background is None:
         return
     rows = np.flatnonzero((frame >= 0) & (background >= 0))
@@ -250,9 +324,13 @@ def _background_forms(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     sizes = scanned.size[frame[rows]].astype(float), scanned.size[background[rows]].astype(float)
     scale = sizes[1].max(1) / sizes[0].max(1)
     odd = rows[np.abs(sizes[0] * scale[:, None] - sizes[1]).max(1) > sizes[1].max(1) / FORM]
-    words = "rows whose background_path has other proportions than the frame: it is turned or cropped"
+    words = (
+        "rows whose background_path has other proportions than the frame: it is turned or cropped"
+    )
     columns = "path", "background_path"
-    yield from finding(manifest, "background_form", "error", odd, words, *columns, column="background_path")
+    yield from finding(
+        manifest, "background_form", "error", odd, words, *columns, column="background_path"
+    )
 
 
 def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
@@ -265,14 +343,20 @@ def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     first = np.ones(len(same), bool)
     first[repeats] = False
     rows = np.flatnonzero(first & (np.bincount(same, weights=first)[same] > 1))
-    yield from finding(manifest, "duplicate", "warning", rows, "rows share the bytes of their touch image", "path")
+    yield from finding(
+        manifest, "duplicate", "warning", rows, "rows share the bytes of their touch image", "path"
+    )
     if "image_path" in scanned.files.code:
         rows = np.flatnonzero(same == content_ids(scanned, "image_path"))
         words = "rows whose touch image and photograph are the same"
-        yield from finding(manifest, "touch_is_picture", "error", rows, words, "path", column="image_path")
+        yield from finding(
+            manifest, "touch_is_picture", "error", rows, words, "path", column="image_path"
+        )
 
 
-def _leak(manifest: Manifest, codes: np.ndarray, kind: str, level: Level, what: str, column: str) -> Iterator[Finding]:
+def _leak(
+    manifest: Manifest, codes: np.ndarray, kind: str, level: Level, what: str, column: str
+) -> Iterator[Finding]:
     """Yield values (codes i64, -1 for null) that occur in two of the learning splits. Examples show `column`."""
     split = np.asarray(pc.index_in(manifest.table["split"], value_set=pa.array(SPLITS)))
     rows = np.flatnonzero((codes >= 0) & (split < len(_LEARNING)))
@@ -284,7 +368,9 @@ def _leak(manifest: Manifest, codes: np.ndarray, kind: str, level: Level, what: 
     _, first = np.unique(codes[rows], return_index=True)
     examples = []
     for row in rows[np.sort(first)[:EXAMPLES]]:
-        sides = ", ".join(SPLITS[side] for side in np.unique(split[rows[codes[rows] == codes[row]]]))
+        sides = ", ".join(
+            SPLITS[side] for side in np.unique(split[rows[codes[rows] == codes[row]]])
+        )
         examples.append(f"{what} {shown(manifest.value(row, column))} is in {sides}")
     sentence = f"{len(first)} values of {what} are in more than one of {', '.join(_LEARNING)} ({rows.size} rows)"
     yield Finding(kind, level, sentence, rows, tuple(examples))
@@ -294,15 +380,23 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
     """Yield sequences that repeat a frame, which allows no clips, or whose rows are not in frame order."""
     sequence = manifest.codes("sequence", own=True) * len(SPLITS) + manifest.codes("split")
     frame = np.asarray(manifest.table["frame_index"])
-    by_frame, by_row = np.lexsort((frame, sequence)), np.argsort(sequence, kind="stable")
+    by_frame = np.lexsort((frame, sequence))
+    by_row = np.argsort(sequence, kind="stable")
     twice = (np.diff(sequence[by_frame]) == 0) & (np.diff(frame[by_frame]) == 0)
     back = (np.diff(sequence[by_row]) == 0) & (frame[by_row][1:] < frame[by_row][:-1])
     faults: tuple[tuple[str, Level, np.ndarray, str], ...] = (
-        ("repeated_frame", "error", by_frame[1:][twice], "repeat a frame of their sequence, which allows no clips"),
+        (
+            "repeated_frame",
+            "error",
+            by_frame[1:][twice],
+            "repeat a frame of their sequence, which allows no clips",
+        ),
         ("frame_order", "warning", by_row[1:][back], "stand after a later frame of their sequence"),
     )
     for kind, level, rows, words in faults:
-        yield from finding(manifest, kind, level, np.sort(rows), f"rows {words}", "frame_index", "sequence")
+        yield from finding(
+            manifest, kind, level, np.sort(rows), f"rows {words}", "frame_index", "sequence"
+        )
 
 
 def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
@@ -310,15 +404,36 @@ def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
     for name in manifest.table.column_names:
         column = manifest.table[name]
         if name.startswith("label.") and pa.types.is_nested(column.type):
-            words = f"values of {name} are lists, which no probe reads; write a column for each number"
-            yield from finding(manifest, "list_label", "warning", np.flatnonzero(manifest.present(name)), words, name)
-        if not pa.types.is_string(column.type) or not (name in ("object", "unit") or name.startswith("label.")):
+            words = (
+                f"values of {name} are lists, which no probe reads; write a column for each number"
+            )
+            yield from finding(
+                manifest,
+                "list_label",
+                "warning",
+                np.flatnonzero(manifest.present(name)),
+                words,
+                name,
+            )
+        if not pa.types.is_string(column.type) or not (
+            name in ("object", "unit") or name.startswith("label.")
+        ):
             continue
         for group in spellings(column.unique().drop_null().to_pylist()):
-            rows = [np.flatnonzero(np.asarray(pc.fill_null(pc.equal(column, value), False))) for value in group]
-            several = " and ".join(f"{shown(value)} ({len(ids)} rows)" for value, ids in zip(group, rows, strict=True))
-            sentence = f"{name} has {several}, which differ only by spaces, letter case or Unicode form"
-            places = [f"{manifest.where(ids[0])}: {shown(value)}" for value, ids in zip(group, rows, strict=True)]
+            rows = [
+                np.flatnonzero(np.asarray(pc.fill_null(pc.equal(column, value), False)))
+                for value in group
+            ]
+            several = " and ".join(
+                f"{shown(value)} ({len(ids)} rows)" for value, ids in zip(group, rows, strict=True)
+            )
+            sentence = (
+                f"{name} has {several}, which differ only by spaces, letter case or Unicode form"
+            )
+            places = [
+                f"{manifest.where(ids[0])}: {shown(value)}"
+                for value, ids in zip(group, rows, strict=True)
+            ]
             every = np.sort(np.concatenate(rows))
             yield Finding("spelling", "warning", sentence, every, tuple(places[:EXAMPLES]), name)
         is_number = np.asarray(pc.fill_null(pc.match_substring_regex(column, NUMBER), False))
@@ -334,22 +449,30 @@ def allows(licence: str | None) -> int:
         return UNKNOWN
     if _NO.search(licence):
         return NO
-    return YES if _YES.fullmatch(licence.strip()) else UNKNOWN
+    if _YES.fullmatch(licence.strip()):
+        return YES
+    return UNKNOWN
 
 
 def commercial_use(manifest: Manifest) -> np.ndarray:
     """Return YES, NO or UNKNOWN, i8 (rows,): a NO by flag or licence decides, then the flag, then the licence."""
     codes = manifest.codes("license")
     names = pc.unique(manifest.column("license")).drop_null().to_pylist()
-    verdict = np.array([*(allows(name) for name in names), UNKNOWN], np.int8)[codes]  # code -1 is the last one
-    flag = np.asarray(pc.fill_null(manifest.column("commercial").cast("int8"), UNKNOWN)).astype(np.int8)
-    return np.where((flag == NO) | (verdict == NO), NO, np.where(flag == YES, YES, verdict)).astype(np.int8)
+    # code -1 is the last one
+    verdict = np.array([*(allows(name) for name in names), UNKNOWN], np.int8)[codes]
+    flag = np.asarray(pc.fill_null(manifest.column("commercial").cast("int8"), UNKNOWN)).astype(
+        np.int8
+    )
+    return np.where((flag == NO) | (verdict == NO), NO, np.where(flag == YES, YES, verdict)).astype(
+        np.int8
+    )
 
 
 def commercial_only(manifest: Manifest) -> Commercial:
     """Return the rows that may certainly be used commercially. Raises UserError if there is none."""
     use = commercial_use(manifest)
-    non_commercial, unknown = int((use == NO).sum()), int((use == UNKNOWN).sum())
+    non_commercial = int((use == NO).sum())
+    unknown = int((use == UNKNOWN).sum())
     if not (use == YES).any():
         files = ", ".join(map(str, manifest.files))
         raise UserError(
@@ -365,16 +488,25 @@ def licences(manifest: Manifest) -> tuple[Licence, ...]:
     result = []
     for rows in group_rows(np.arange(len(manifest)), np.stack([manifest.codes("license"), use], 1)):
         datasets = manifest.column("dataset").take(rows).unique().drop_null().to_pylist()
-        name, verdict = manifest.value(rows[0], "license"), int(use[rows[0]])
+        name = manifest.value(rows[0], "license")
+        verdict = int(use[rows[0]])
         result.append(Licence(name, verdict, tuple(sorted(datasets)), len(rows)))
     return tuple(sorted(result, key=lambda licence: -licence.rows))
 
 
-_FILE_CHECKS = (_bad_files, _wrong_sizes, _background_forms, _duplicates, scans.swapped_folders, scans.picture_faults)
+_FILE_CHECKS = (
+    _bad_files,
+    _wrong_sizes,
+    _background_forms,
+    _duplicates,
+    scans.swapped_folders,
+    scans.picture_faults,
+)
 
 
 _OF_ROWS = {f"leak_{name}" for name in ("sequence", "touch", "grasp_group", "object")}
-_OF_ROWS |= {"repeated_frame", "frame_order", "licence_conflict", "spelling"}  # faults that dropping rows can repair
+# faults that dropping rows can repair
+_OF_ROWS |= {"repeated_frame", "frame_order", "licence_conflict", "spelling"}
 
 
 class Repaired(NamedTuple):
@@ -407,16 +539,22 @@ def repair(manifest: Manifest, report: VerifyReport, *, swap: Collection[str] = 
         bad = states != OK
         if not bad.any():
             continue
-        counts = ", ".join(f"{int((states == n).sum())} {STATES[n]}" for n in np.unique(states[bad]))
+        counts = ", ".join(
+            f"{int((states == n).sum())} {STATES[n]}" for n in np.unique(states[bad])
+        )
         if column == "path":
             usable &= ~bad
-            done.append(f"dropped {int(bad.sum())} rows whose touch image cannot be used ({counts})")
+            done.append(
+                f"dropped {int(bad.sum())} rows whose touch image cannot be used ({counts})"
+            )
         else:
             result = _empty_cells(result, column, bad)
             done.append(f"emptied {column} in {int(bad.sum())} rows ({counts})")
     if not usable.any():
         folder = manifest.files[0].parent
-        raise UserError(f"no touch image of {manifest.files[0]} can be used; are the files really in {folder}?")
+        raise UserError(
+            f"no touch image of {manifest.files[0]} can be used; are the files really in {folder}?"
+        )
     repeats = repeated_rows(manifest, content_ids(scanned))
     repeats = repeats[usable[repeats]]
     if repeats.size:
@@ -459,22 +597,35 @@ def _exchange(
         chosen = np.array([name in swap for name in dataset]) & manifest.present("image_path")
         exchanged |= chosen
         rows = int(chosen.sum())
-        done.append(f"exchanged touch image and photograph in {rows} rows of {', '.join(sorted(swap))}, as requested")
+        done.append(
+            f"exchanged touch image and photograph in {rows} rows of {', '.join(sorted(swap))}, as requested"
+        )
     if not exchanged.any():
         return manifest, exchanged
-    touch, image = (manifest.table[name].combine_chunks().to_numpy(False) for name in ("path", "image_path"))
-    result = replace_column(manifest, "path", pa.array(np.where(exchanged, image, touch), pa.string()))
-    result = replace_column(result, "image_path", pa.array(np.where(exchanged, touch, image), pa.string()))
-    photographs = exchanged & scans.in_touch_folder(manifest, "background_path")  # its folder now holds photographs
+    touch, image = (
+        manifest.table[name].combine_chunks().to_numpy(False) for name in ("path", "image_path")
+    )
+    result = replace_column(
+        manifest, "path", pa.array(np.where(exchanged, image, touch), pa.string())
+    )
+    result = replace_column(
+        result, "image_path", pa.array(np.where(exchanged, touch, image), pa.string())
+    )
+    # its folder now holds photographs
+    photographs = exchanged & scans.in_touch_folder(manifest, "background_path")
     if photographs.any():
         result = _empty_cells(result, "background_path", photographs)
-        done.append(f"emptied background_path in {int(photographs.sum())} of them: it lay among the photographs")
+        done.append(
+            f"emptied background_path in {int(photographs.sum())} of them: it lay among the photographs"
+        )
     return result, exchanged
 
 
 def _background_rows(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
     """Return the background rows with a photograph of the dataset and sensor of `rows`. They are swapped too."""
-    selected = np.asarray(pc.equal(manifest.table["split"], "background")) & manifest.present("image_path")
+    selected = np.asarray(pc.equal(manifest.table["split"], "background")) & manifest.present(
+        "image_path"
+    )
     for name in ("dataset", "sensor"):
         code = manifest.codes(name)
         selected &= code == code[rows[0]]

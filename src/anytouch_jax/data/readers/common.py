@@ -29,22 +29,46 @@ from anytouch_jax.files import csv_lines
 Columns = dict[str, list[Any]]
 Frames = dict[int, str]  # frame number -> file name, by number
 Folder = tuple[str, list[str], list[str]]  # its path below a base, its folders, its files
-_WORDS = {"train": "train", "training": "train", "trn": "train", "val": "val", "valid": "val", "validation": "val",
-          "dev": "val", "test": "test", "testing": "test", "tst": "test", "eval": "test", "evaluation": "test",
-          "holdout": "test"}  # fmt: skip
-_MORE = r"(?:set|sets|split|data|dataset|images?|imgs?|frames|pictures|samples|seen|unseen)"  # around a word: train_set
-_SPLIT = re.compile(rf"[\W_]*(?:{_MORE}[\W_]+)?({'|'.join(_WORDS)})(?:20\d\d)?(?:[\W_]*{_MORE})*[\W_]*", re.IGNORECASE)
+_WORDS = {
+    "train": "train",
+    "training": "train",
+    "trn": "train",
+    "val": "val",
+    "valid": "val",
+    "validation": "val",
+    "dev": "val",
+    "test": "test",
+    "testing": "test",
+    "tst": "test",
+    "eval": "test",
+    "evaluation": "test",
+    "holdout": "test",
+}
+# around a word: train_set
+_MORE = r"(?:set|sets|split|data|dataset|images?|imgs?|frames|pictures|samples|seen|unseen)"
+_SPLIT = re.compile(
+    rf"[\W_]*(?:{_MORE}[\W_]+)?({'|'.join(_WORDS)})(?:20\d\d)?(?:[\W_]*{_MORE})*[\W_]*",
+    re.IGNORECASE,
+)
 MOST_LABELS = 1000  # of one value
-TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)  # in names of cameras and fields
+# in names of cameras and fields
+TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)
 PARTS = ("train", "val", "test")  # published splits
 NUMBERED = r"(\d+)\.(?:png|jpe?g)"
 EXPORT_RECORD = ".anytouch.json"  # in a folder of pictures that a reader has written
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini", "__MACOSX")
 _ALLOWED = {  # names in a pickle
-    ("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode"), ("collections", "OrderedDict"),
-    *((f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")),
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("_codecs", "encode"),
+    ("collections", "OrderedDict"),
+    *(
+        (f"numpy.{core}.multiarray", name)
+        for core in ("core", "_core")
+        for name in ("_reconstruct", "scalar")
+    ),
     *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
-}  # fmt: skip
+}
 
 
 class DatasetError(UserError):
@@ -73,7 +97,9 @@ class IndexOptions:
 
     def __post_init__(self) -> None:
         if not (0 <= self.val <= 1 and 0 <= self.test <= 1 and self.val + self.test <= 1):
-            raise UserError(f"val {self.val} and test {self.test} are shares: both at least 0, together at most 1")
+            raise UserError(
+                f"val {self.val} and test {self.test} are shares: both at least 0, together at most 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -103,11 +129,15 @@ class DatasetIndex:
     """
 
     def __init__(self, name: str, root: Path, options: IndexOptions | None = None) -> None:
-        self.name, self.root, self.options = name, root, options or IndexOptions()
+        self.name = name
+        self.root = root
+        self.options = options or IndexOptions()
         self.skipped: dict[str, tuple[int, str]] = {}
         self.notes: list[str] = []
-        self.keep_together = ["sequence", "object"]  # columns whose values stay in one split
-        self.contact: dict[str, list[str]] | None = None  # the authors' list of contact frames: path -> its cells
+        # columns whose values stay in one split
+        self.keep_together = ["sequence", "object"]
+        # the authors' list of contact frames: path -> its cells
+        self.contact: dict[str, list[str]] | None = None
         self._contact_rows = 0
         self.wanted: list[str] = []  # columns that the user asked for
         self.left_out = 0  # frames without a row
@@ -115,7 +145,9 @@ class DatasetIndex:
         self.table: Columns = {name: [] for name in REQUIRED}
 
     @staticmethod
-    def tracked(items: Iterable[Item], words: str = "folders read", total: int | None = None) -> Iterator[Item]:
+    def tracked(
+        items: Iterable[Item], words: str = "folders read", total: int | None = None
+    ) -> Iterator[Item]:
         """Yield items below a progress bar."""
         return tracked(items, words, total)
 
@@ -139,7 +171,9 @@ class DatasetIndex:
         for choice in choices:
             folder = self.root / choice
             if folder.is_dir() and any((folder / name).exists() for name in inside):
-                return f"{choice}/" if choice else ""
+                if choice:
+                    return f"{choice}/"
+                return ""
         return None
 
     def find_file(self, names: Collection[str], *folders: str) -> Path | None:
@@ -159,7 +193,8 @@ class DatasetIndex:
         except OSError as error:
             raise DatasetError(f"{self.root / folder} cannot be listed: {error.strerror}") from None
         for entry in entries:
-            name, reason = entry.name, None
+            name = entry.name
+            reason = None
             if name == EXPORT_RECORD:
                 continue
             is_text = name.encode(errors="ignore").decode() == name
@@ -184,7 +219,9 @@ class DatasetIndex:
 
     def paths(self, suffix: str, base: str = "") -> list[str]:
         """Return the paths of the files below a folder whose names end in `suffix`."""
-        found = (f"{folder}/{name}".lstrip("/") for folder, _, files in self.walk(base) for name in files)
+        found = (
+            f"{folder}/{name}".lstrip("/") for folder, _, files in self.walk(base) for name in files
+        )
         return [f"{base}{path}" for path in found if path.endswith(suffix)]
 
     def shards(self, suffix: str) -> Iterator[tuple[str, Callable[[], BinaryIO]]]:
@@ -199,7 +236,9 @@ class DatasetIndex:
         try:
             paths = sorted(path for path in system.find(base) if path.endswith(suffix))
         except Exception as error:  # each store has its own kinds
-            raise UserError(f"{url} cannot be listed: {' '.join(str(error).split())[:200]}; check access") from None
+            raise UserError(
+                f"{url} cannot be listed: {' '.join(str(error).split())[:200]}; check access"
+            ) from None
         for path in self.tracked(paths, "shards read"):
             yield f"{url}{path.removeprefix(base.rstrip('/'))}", partial(system.open, path, "rb")
 
@@ -207,17 +246,26 @@ class DatasetIndex:
         """Return the sensor of the option. Raises UserError without one."""
         known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
         if self.options.sensor is None or self.options.sensor in (*FIELD_SENSORS, UNIVERSAL):
-            raise UserError(f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new name")
+            raise UserError(
+                f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new name"
+            )
         check_spelling(self.options.sensor)
         return self.options.sensor
 
     def need_export(self, what: str) -> None:
         """Raise DatasetError without the option `export`: the pictures of `what` must be written as files."""
         if not self.options.export:
-            raise DatasetError(f"{self.root} has {what}; add --export to write their pictures next to them")
+            raise DatasetError(
+                f"{self.root} has {what}; add --export to write their pictures next to them"
+            )
 
     def frames(
-        self, folder: str, pattern: str = NUMBERED, files: Sequence[str] | None = None, *, count: bool = True
+        self,
+        folder: str,
+        pattern: str = NUMBERED,
+        files: Sequence[str] | None = None,
+        *,
+        count: bool = True,
     ) -> Frames:
         """Return the files whose whole name matches, by the number in its first group. Others are skipped."""
         files = self.listing(folder)[1] if files is None else files
@@ -233,7 +281,9 @@ class DatasetIndex:
                 frames[int(parts[1])] = name
         return dict(sorted(frames.items()))
 
-    def photographs(self, folder: str, names: Iterable[str], on_disk: Collection[str]) -> list[str | None]:
+    def photographs(
+        self, folder: str, names: Iterable[str], on_disk: Collection[str]
+    ) -> list[str | None]:
         """Return the path of each of `names` in `folder`, None for those that are not `on_disk`, which are counted."""
         paths = [f"{folder}/{name}" if name in on_disk else None for name in names]
         self.skip("photograph missing (kept without)", folder, paths.count(None))
@@ -243,7 +293,9 @@ class DatasetIndex:
         """Return the hash split of a group (an object or a recording) of this dataset."""
         return hash_split(self.name, group, self.options)
 
-    def read_captions(self, folder: str, key: Callable[[str], str]) -> tuple[set[str], dict[str, str]]:
+    def read_captions(
+        self, folder: str, key: Callable[[str], str]
+    ) -> tuple[set[str], dict[str, str]]:
         """Return the frames of test.csv, and the captions of train.csv and test.csv, by `key` of their `tactile`."""
         tests: set[str] = set()
         captions: dict[str, str] = {}
@@ -275,7 +327,8 @@ class DatasetIndex:
 
     def add(self, paths: Sequence[str], **cells: Any) -> None:
         """Add a row for each path; a cell is a list (a value for each row) or one value for all rows (None: null)."""
-        before, size = len(self.table["path"]), len(paths)
+        before = len(self.table["path"])
+        size = len(paths)
         for name, value in {"path": list(paths), **cells}.items():
             values = value if isinstance(value, list) else [value] * size
             if len(values) != size:
@@ -284,7 +337,9 @@ class DatasetIndex:
         for column in self.table.values():
             column.extend([None] * (before + size - len(column)))
 
-    def add_recording(self, frames: Frames, folder: str, *, split: str, key: str = "", **cells: Any) -> None:
+    def add_recording(
+        self, frames: Frames, folder: str, *, split: str, key: str = "", **cells: Any
+    ) -> None:
         """Add the frames of a recording; those that a contact list lacks, by `key`/name, get the split `unused`."""
         cells["split"] = split
         if self.contact is not None:
@@ -292,17 +347,29 @@ class DatasetIndex:
             self._contact_rows += sum(is_contact)
             cells |= {"label.contact": [int(touched) for touched in is_contact]}
             cells |= {"split": [split if touched else "unused" for touched in is_contact]}
-        self.add([f"{folder}/{name}".lstrip("/") for name in frames.values()], frame_index=list(frames), **cells)
+        self.add(
+            [f"{folder}/{name}".lstrip("/") for name in frames.values()],
+            frame_index=list(frames),
+            **cells,
+        )
 
     def columns(self) -> Columns:
         """Return the columns, without optional ones that are all null; report what was not matched."""
         if self.contact is not None:
             missing = len(self.contact) - self._contact_rows
             self.skip("listed contact frame that is not on disk", "see the contact list", missing)
-        has_value = {name: any(value is not None for value in column) for name, column in self.table.items()}
+        has_value = {
+            name: any(value is not None for value in column) for name, column in self.table.items()
+        }
         lost = [name for name in dict.fromkeys(self.wanted) if not has_value.get(name)]
-        self.notes += [f"no row has a value of {name}, so the manifest has no such column" for name in lost]
-        return {name: column for name, column in self.table.items() if name in REQUIRED or has_value[name]}
+        self.notes += [
+            f"no row has a value of {name}, so the manifest has no such column" for name in lost
+        ]
+        return {
+            name: column
+            for name, column in self.table.items()
+            if name in REQUIRED or has_value[name]
+        }
 
 
 def split_word(name: str) -> str | None:
@@ -316,7 +383,9 @@ def label_cells(name: str, values: list[Any]) -> dict[str, list[Any]]:
     rows = [dict(_flat(value)) for value in values]
     places = dict.fromkeys(place for row in rows for place in row)
     if len(places) > MOST_LABELS:
-        raise DatasetError(f"{name} has {len(places)} values a frame, too many for labels; choose another")
+        raise DatasetError(
+            f"{name} has {len(places)} values a frame, too many for labels; choose another"
+        )
     return {"_".join([name, *place]): [row.get(place) for row in rows] for place in places or [()]}
 
 
@@ -333,10 +402,16 @@ def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
     """Return val, test or train by the share of SHA-256(dataset/group) in its range. Other groups move none."""
     digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
     share = int.from_bytes(digest[:8], "big") / 2**64
-    return "val" if share < options.val else "test" if share < options.val + options.test else "train"
+    if share < options.val:
+        return "val"
+    if share < options.val + options.test:
+        return "test"
+    return "train"
 
 
-def published_splits(path: Path, lists: Mapping[str, Iterable[Any]], key: Callable[[Any], Any] = str) -> dict[Any, str]:
+def published_splits(
+    path: Path, lists: Mapping[str, Iterable[Any]], key: Callable[[Any], Any] = str
+) -> dict[Any, str]:
     """Return `key` of member -> split from the lists train, val, test of a file. Raises DatasetError for overlaps."""
     splits: dict[Any, str] = {}
     for part in PARTS:
@@ -364,7 +439,9 @@ def read_table(path: Path, column: str) -> list[dict[str, str]]:
     rows = [row for _, row in read_lines(path)]
     table = [dict(zip(rows[0], row, strict=False)) for row in rows[1:]]
     if any(column not in row for row in table):
-        raise DatasetError(f"{path}: expected a column {column!r} in every row, found {', '.join(rows[0])}")
+        raise DatasetError(
+            f"{path}: expected a column {column!r} in every row, found {', '.join(rows[0])}"
+        )
     return table
 
 
@@ -374,7 +451,9 @@ def read_json(path: Path, values: type = object) -> dict[str, Any]:
         content = parse_json(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, UserError) as error:
         raise DatasetError(f"{path} cannot be read as JSON: it {error}") from None
-    if not isinstance(content, dict) or not all(isinstance(value, values) for value in content.values()):
+    if not isinstance(content, dict) or not all(
+        isinstance(value, values) for value in content.values()
+    ):
         kind = "" if values is object else f" with a {values.__name__} for every name"
         raise DatasetError(f"{path}: expected a JSON object{kind}")
     return content
@@ -391,6 +470,10 @@ def read_pickle(path: Path) -> Any:
     """Return plain values and arrays of a pickle, or behind a .npy header. No code is run. Raises DatasetError."""
     try:
         data = path.read_bytes()
-        return _Unpickler(io.BytesIO(data.partition(b"\n")[2] if path.suffix == ".npy" else data)).load()
+        return _Unpickler(
+            io.BytesIO(data.partition(b"\n")[2] if path.suffix == ".npy" else data)
+        ).load()
     except Exception as error:  # a damaged pickle fails anywhere
-        raise DatasetError(f"{path} is no pickle of plain values and arrays: {error}; download it again") from None
+        raise DatasetError(
+            f"{path} is no pickle of plain values and arrays: {error}; download it again"
+        ) from None

@@ -24,35 +24,71 @@ from anytouch_jax.config import parse_json
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import ShardError, tar_members
 from anytouch_jax.data.manifest.schema import PATHS, typed_label
-from anytouch_jax.data.readers.common import TACTILE, DatasetError, DatasetIndex, DatasetReader, label_cells, split_word
+from anytouch_jax.data.readers.common import (
+    TACTILE,
+    DatasetError,
+    DatasetIndex,
+    DatasetReader,
+    label_cells,
+    split_word,
+)
 from anytouch_jax.data.readers.exports import exported
 from anytouch_jax.errors import UserError
 
-_CC_BY, _TACTILE_MNIST = "CC-BY-4.0", "CC-BY-2.0"
+_CC_BY = "CC-BY-4.0"
+_TACTILE_MNIST = "CC-BY-2.0"
 SOURCES = {  # of gelsight-mini-pretrain, and the licence of each by its read-me
-    "fota_labeled": "MIT", "fota_unlabeled": "MIT", "threedcal": _CC_BY, "feats": "MIT", "gelslam": "MIT",
-    "tactile_tracking": "MIT", "real_tactile_mnist": _TACTILE_MNIST, "feelanyforce": _CC_BY, "unit": "BSD-3-Clause",
-    "tacquad": _CC_BY, "sim_tactile_mnist": _TACTILE_MNIST, "sim_starstruck": _TACTILE_MNIST,
+    "fota_labeled": "MIT",
+    "fota_unlabeled": "MIT",
+    "threedcal": _CC_BY,
+    "feats": "MIT",
+    "gelslam": "MIT",
+    "tactile_tracking": "MIT",
+    "real_tactile_mnist": _TACTILE_MNIST,
+    "feelanyforce": _CC_BY,
+    "unit": "BSD-3-Clause",
+    "tacquad": _CC_BY,
+    "sim_tactile_mnist": _TACTILE_MNIST,
+    "sim_starstruck": _TACTILE_MNIST,
     "sparsh": "CC-BY-NC-4.0",
-}  # fmt: skip
+}
 _LABELS = {
-    "markered": "markered", "domain": "domain", "indenter": "indenter", "indenter_param": "indenter_param",
-    "digit_class": "digit", "f_x": "force_x", "f_y": "force_y", "f_z": "force_z",
+    "markered": "markered",
+    "domain": "domain",
+    "indenter": "indenter",
+    "indenter_param": "indenter_param",
+    "digit_class": "digit",
+    "f_x": "force_x",
+    "f_y": "force_y",
+    "f_z": "force_z",
     **{name: name for name in ("x_mm", "y_mm", "z_mm", "quat_x", "quat_y", "quat_z", "quat_w")},
-}  # fmt: skip
+}
 _PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 _TEXTS = ("txt", "text", "cls")
 _CAPTION = re.compile(r"caption|text|prompt|sentence|instruction|description", re.IGNORECASE)
-_BACKGROUND = re.compile(r"background|untouched|no_?contact|reference|(?<![a-z])(?:bg|ref)(?![a-z])", re.IGNORECASE)
+_BACKGROUND = re.compile(
+    r"background|untouched|no_?contact|reference|(?<![a-z])(?:bg|ref)(?![a-z])", re.IGNORECASE
+)
 _DERIVED = re.compile(r"depth|mask|seg|normal|flow|marker|diff|label", re.IGNORECASE)
-_PHOTO = re.compile(r"photo|rgb|vision|visual|colou?r|camera|(?<![a-z])cam|scene|image|img|wrist|head|kinect|realsense|"
-                    r"third|overhead|front", re.IGNORECASE)  # fmt: skip
-_SIDE = re.compile(r"^(?:\d+|[a-d]|l|r|left|right|thumb|index|middle|ring|little|pinky|finger_?\d*)$", re.IGNORECASE)
+_PHOTO = re.compile(
+    r"photo|rgb|vision|visual|colou?r|camera|(?<![a-z])cam|scene|image|img|wrist|head|kinect|realsense|"
+    r"third|overhead|front",
+    re.IGNORECASE,
+)
+_SIDE = re.compile(
+    r"^(?:\d+|[a-d]|l|r|left|right|thumb|index|middle|ring|little|pinky|finger_?\d*)$",
+    re.IGNORECASE,
+)
 _SENSORS = {
-    "gelsight_mini": r"mini", "digit": r"digit|tvl", "gelsight_wedge": r"wedge", "gelsight_svelte": r"svelte",
-    "gelsight_finray": r"finray", "densetact": r"densetact", "gelslim": r"objectfolder",
+    "gelsight_mini": r"mini",
+    "digit": r"digit|tvl",
+    "gelsight_wedge": r"wedge",
+    "gelsight_svelte": r"svelte",
+    "gelsight_finray": r"finray",
+    "densetact": r"densetact",
+    "gelslim": r"objectfolder",
     "gelsight": r"visgel|yuan|calandra|ycb|touch_?and_?go|cloth",
-}  # fmt: skip
+}
 
 
 def _gelsight_mini(index: DatasetIndex) -> None:
@@ -72,27 +108,45 @@ def _gelsight_mini(index: DatasetIndex) -> None:
                 wanted = {"source", "capture", "split", "frame_idx", "obj_name", "side", *_LABELS}
                 rows = table.read(sorted(wanted & {*names})).to_pylist()
             except (pa.ArrowException, OSError) as error:
-                raise DatasetError(f"{path} is no whole Parquet file: {error}; download it again") from None
+                raise DatasetError(
+                    f"{path} is no whole Parquet file: {error}; download it again"
+                ) from None
         counts = Counter((row["capture"], row.get("side"), row.get("frame_idx")) for row in rows)
         for number, row in enumerate(rows):
-            source, side, frame = str(row["source"]), row.get("side"), row.get("frame_idx")
+            source = str(row["source"])
+            side = row.get("side")
+            frame = row.get("frame_idx")
             base = next((name for name in SOURCES if source.startswith(name)), None)
             if base is None:
                 index.skip("row of an unknown source (licence not stated)", source)
             licence = SOURCES.get(base or "", "not stated")
-            capture = "/".join(str(part) for part in (source, row["capture"], side) if part is not None)
+            capture = "/".join(
+                str(part) for part in (source, row["capture"], side) if part is not None
+            )
             is_film = frame is not None and counts[row["capture"], side, frame] == 1
             split = str(row.get("split") or Path(path).name.split("-")[0])
             index.add(
-                [f"{path}/image/{number}"], sensor="gelsight_mini", dataset=f"gelsight_mini_pretrain/{source}",
+                [f"{path}/image/{number}"],
+                sensor="gelsight_mini",
+                dataset=f"gelsight_mini_pretrain/{source}",
                 sequence=capture if is_film else f"{capture}/{Path(path).stem}/{number}",
-                frame_index=frame if is_film else 0, object=row.get("obj_name"), unit=side,
-                split=split if split in ("train", "val") else "test" if split.startswith("test")
+                frame_index=frame if is_film else 0,
+                object=row.get("obj_name"),
+                unit=side,
+                split=split
+                if split in ("train", "val")
+                else "test"
+                if split.startswith("test")
                 else index.split_of(capture),
-                license=licence, commercial=licence != "not stated" and "NC" not in licence,
-                **{f"label.{ours}": int(value) if isinstance(value := row.get(name), bool) else value
-                   for name, ours in _LABELS.items()},
-            )  # fmt: skip
+                license=licence,
+                commercial=licence != "not stated" and "NC" not in licence,
+                **{
+                    f"label.{ours}": int(value)
+                    if isinstance(value := row.get(name), bool)
+                    else value
+                    for name, ours in _LABELS.items()
+                },
+            )
 
 
 def _webdataset(index: DatasetIndex) -> None:
@@ -111,9 +165,14 @@ def _fota(index: DatasetIndex) -> None:
 
     def sensor_of(path: str) -> str:
         name = "/".join(path.lower().split("/")[:-2]) or path.lower()
-        found = next((sensor for sensor, words in _SENSORS.items() if re.search(words, name)), index.options.sensor)
+        found = next(
+            (sensor for sensor, words in _SENSORS.items() if re.search(words, name)),
+            index.options.sensor,
+        )
         if found is None:
-            raise DatasetError(f"the name {name} says nothing about the sensor; name it with --sensor")
+            raise DatasetError(
+                f"the name {name} says nothing about the sensor; name it with --sensor"
+            )
         return found
 
     _tars(index, sensor_of)
@@ -123,7 +182,8 @@ def _tars(index: DatasetIndex, sensor_of: Any) -> None:
     shards: dict[tuple[str, str], str] = {}  # the shard of a sample's key
     for path, opened in index.shards(".tar"):
         inside = path.removeprefix(index.options.url or "").lstrip("/")
-        sensor, folders = sensor_of(inside), inside.split("/")[:-1]
+        sensor = sensor_of(inside)
+        folders = inside.split("/")[:-1]
         words = [*reversed(folders), *re.split(r"[\W\d_]+", Path(inside).stem)]
         part = next((split for word in words if (split := split_word(word))), None)
         dataset = "/".join(name for name in folders if split_word(name) is None) or index.name
@@ -132,36 +192,60 @@ def _tars(index: DatasetIndex, sensor_of: Any) -> None:
                 members = tar_members(Path(path), file)
             except ShardError as error:
                 raise DatasetError(str(error)) from None
-            samples: dict[str, dict[str, int]] = {}  # key -> field -> number of the file in the tar
+            # key -> field -> number of the file in the tar
+            samples: dict[str, dict[str, int]] = {}
             for number, (name, *_) in enumerate(members):
                 folder, _, base = name.removeprefix("./").rpartition("/")
                 key, _, field = base.partition(".")
-                samples.setdefault(f"{folder}/{key}".strip("/"), {}).setdefault(field.lower(), number)
+                samples.setdefault(f"{folder}/{key}".strip("/"), {}).setdefault(
+                    field.lower(), number
+                )
             texts = {
                 (key, field): _read_text(file, path, members[number])
-                for key, fields in samples.items() for field, number in fields.items()
+                for key, fields in samples.items()
+                for field, number in fields.items()
                 if field.rpartition(".")[2] in ("json", *_TEXTS)
-            }  # fmt: skip
+            }
         for key, fields in samples.items():
-            shown = dataset if shards.setdefault((f"{dataset}/{part}", key), path) == path else f"{dataset}/{inside}"
+            shown = (
+                dataset
+                if shards.setdefault((f"{dataset}/{part}", key), path) == path
+                else f"{dataset}/{inside}"
+            )
             own = {field: texts[key, field] for field in fields if (key, field) in texts}
             place = f"{shown}/{part or ''}/{key}"
-            _add_sample(index, path, place, fields, own, sensor=sensor, dataset=dataset, split=part, key=key)
+            _add_sample(
+                index, path, place, fields, own, sensor=sensor, dataset=dataset, split=part, key=key
+            )
     _one_type(index)
 
 
 def _add_sample(
-    index: DatasetIndex, path: str, place: str, fields: dict[str, int], texts: dict[str, Any], *, split: str | None,
-    key: str, **cells: Any,
-) -> None:  # fmt: skip
+    index: DatasetIndex,
+    path: str,
+    place: str,
+    fields: dict[str, int],
+    texts: dict[str, Any],
+    *,
+    split: str | None,
+    key: str,
+    **cells: Any,
+) -> None:
     """Add a row for each tactile picture of a sample; its other files are photographs, captions and labels."""
-    pictures = {field: kind_of_picture(field, index.options.keys) for field in fields
-                if f".{field.rpartition('.')[2]}" in _PICTURES}  # fmt: skip
+    pictures = {
+        field: kind_of_picture(field, index.options.keys)
+        for field in fields
+        if f".{field.rpartition('.')[2]}" in _PICTURES
+    }
     is_named = "touch" in {pictures[field] for field in pictures if "." in field}
-    touches = [field for field, kind in pictures.items()
-               if kind == "touch" and ("." in field or not is_named or field in index.options.keys)]  # fmt: skip
+    touches = [
+        field
+        for field, kind in pictures.items()
+        if kind == "touch" and ("." in field or not is_named or field in index.options.keys)
+    ]
     for field in fields:
-        kind, where = pictures.get(field), f"{path}/{key}.{field}"
+        kind = pictures.get(field)
+        where = f"{path}/{key}.{field}"
         if kind == "other" or (kind == "touch" and field not in touches):
             index.leave_out("picture that no word calls tactile (--keys names its field)", where)
         elif kind is None and field not in texts:
@@ -182,27 +266,49 @@ def _add_sample(
     obj = values.pop("object", values.pop("object_name", None))
     labels: dict[str, Any] = {}
     for name, value in values.items():
-        labels |= {f"label.{one.removeprefix('has_')}": cell[0] for one, cell in label_cells(name, [value]).items()}
+        labels |= {
+            f"label.{one.removeprefix('has_')}": cell[0]
+            for one, cell in label_cells(name, [value]).items()
+        }
     others = {kind: f"{path}/{fields[field]}" for field, kind in reversed(pictures.items())}
     if not touches:
         index.skip("sample without a tactile picture", f"{path}/{key}")
     for field in touches:
         unit = field.rpartition(".")[0] or None
         index.add(
-            [f"{path}/{fields[field]}"], sequence=place if len(touches) == 1 else f"{place}/{unit or field}",
-            unit=unit if len(touches) > 1 else None, frame_index=0, object=None if obj is None else str(obj),
-            text=" ".join(captions) or None, image_path=others.get("photo"), background_path=others.get("background"),
-            split=split or stated or index.split_of(str(obj or key)), **cells, **labels,
-        )  # fmt: skip
+            [f"{path}/{fields[field]}"],
+            sequence=place if len(touches) == 1 else f"{place}/{unit or field}",
+            unit=unit if len(touches) > 1 else None,
+            frame_index=0,
+            object=None if obj is None else str(obj),
+            text=" ".join(captions) or None,
+            image_path=others.get("photo"),
+            background_path=others.get("background"),
+            split=split or stated or index.split_of(str(obj or key)),
+            **cells,
+            **labels,
+        )
 
 
 def kind_of_picture(field: str, keys: Sequence[str] = ()) -> str:
     """Return touch, photo, background or other for a field. No name, as jpg, and a side, as left.jpg, are touch."""
     name = field.rpartition(".")[0]
     if keys:
-        return "touch" if field in keys or name in keys else "photo" if _PHOTO.search(name) else "other"
-    kinds = (("background", _BACKGROUND), ("other", _DERIVED), ("touch", TACTILE), ("photo", _PHOTO), ("touch", _SIDE))
-    return next((kind for kind, words in kinds if words.search(name)), "other") if name else "touch"
+        if field in keys or name in keys:
+            return "touch"
+        if _PHOTO.search(name):
+            return "photo"
+        return "other"
+    kinds = (
+        ("background", _BACKGROUND),
+        ("other", _DERIVED),
+        ("touch", TACTILE),
+        ("photo", _PHOTO),
+        ("touch", _SIDE),
+    )
+    if name:
+        return next((kind for kind, words in kinds if words.search(name)), "other")
+    return "touch"
 
 
 def _read_text(file: Any, path: str, member: tuple[str, int, int]) -> Any:
@@ -215,19 +321,26 @@ def _read_text(file: Any, path: str, member: tuple[str, int, int]) -> Any:
     try:
         text = data.decode("utf-8-sig").strip()
     except UnicodeDecodeError:
-        raise DatasetError(f"{path}, {name} is not text in UTF-8; correct it or download it again") from None
-    return typed_label(pa.chunked_array([pa.array([text])]))[0].as_py() if name.lower().endswith(".cls") else text
+        raise DatasetError(
+            f"{path}, {name} is not text in UTF-8; correct it or download it again"
+        ) from None
+    if name.lower().endswith(".cls"):
+        return typed_label(pa.chunked_array([pa.array([text])]))[0].as_py()
+    return text
 
 
 def _parsed(data: bytes, where: str) -> dict[str, Any]:
     """Return a JSON object, or its value under the name `value`. Raises DatasetError."""
     try:
         values = parse_json(data)
-        while isinstance(values, str):  # T3's writer encodes twice
+        # T3's writer encodes twice
+        while isinstance(values, str):
             values = parse_json(values)
     except UserError as error:
         raise DatasetError(f"{where} {error}; correct it or download it again") from None
-    return {str(name): value for name, value in values.items()} if isinstance(values, dict) else {"value": values}
+    if isinstance(values, dict):
+        return {str(name): value for name, value in values.items()}
+    return {"value": values}
 
 
 def _one_type(index: DatasetIndex) -> None:
@@ -244,7 +357,11 @@ def _real_touch(index: DatasetIndex) -> None:
     if not (index.root / "manifest.csv").is_file():
         return
     table = manifests.read(index.root / "manifest.csv").table
-    on_disk = {f"{folder}/{name}".lstrip("/") for folder, _, files in index.walk(count=False) for name in files}
+    on_disk = {
+        f"{folder}/{name}".lstrip("/")
+        for folder, _, files in index.walk(count=False)
+        for name in files
+    }
     exists = [path in on_disk for path in table["path"].to_pylist()]
     gone = [path for path in table["path"].to_pylist() if path not in on_disk]
     index.skip_all("file of the manifest that is not on disk", gone)
@@ -252,7 +369,9 @@ def _real_touch(index: DatasetIndex) -> None:
     for name in set(PATHS[1:]) & columns.keys():
         missing = [path is not None and path not in on_disk for path in columns[name]]
         index.skip(f"{name} that is not on disk (kept without)", name, sum(missing))
-        columns[name] = [None if gone else path for gone, path in zip(missing, columns[name], strict=True)]
+        columns[name] = [
+            None if gone else path for gone, path in zip(missing, columns[name], strict=True)
+        ]
     index.add(columns.pop("path"), **columns)
 
 
@@ -268,15 +387,20 @@ def _taxim_presses(index: DatasetIndex) -> None:
         try:
             calib = Path(str(importlib.metadata.distribution("taxim").locate_file("taxim/calib")))
         except importlib.metadata.PackageNotFoundError:
-            raise DatasetError("the package taxim is not installed; run pip install taxim") from None
+            raise DatasetError(
+                "the package taxim is not installed; run pip install taxim"
+            ) from None
     for sensor in ("gelsight", "gelsight_mini"):
-        path, place = calib / sensor / "dataPack.npz", f"taxim_presses/{sensor}"
+        path = calib / sensor / "dataPack.npz"
+        place = f"taxim_presses/{sensor}"
         if not path.is_file():
             index.skip("sensor without dataPack.npz", str(path))
             continue
         try:
             with np.load(path, allow_pickle=False) as pack:
-                gel, images, centres, radii = (pack[key] for key in ("f0", "imgs", "touch_center", "touch_radius"))
+                gel, images, centres, radii = (
+                    pack[key] for key in ("f0", "imgs", "touch_center", "touch_radius")
+                )
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DatasetError(f"{path} is not a calibration pack of taxim: {error}") from None
         names = [f"press_{i:02d}" for i in range(len(images))]
@@ -286,39 +410,62 @@ def _taxim_presses(index: DatasetIndex) -> None:
         place = pictures.folder
         cells = {"sensor": sensor, "unit": f"taxim/{sensor}", "frame_index": 0}
         index.add(
-            [f"{place}/{name}.png" for name in names], **cells, object="ball",
+            [f"{place}/{name}.png" for name in names],
+            **cells,
+            object="ball",
             sequence=[f"{sensor}/{name}" for name in names],
             split=[index.split_of(f"{sensor}/{name}") for name in names],
             background_path=f"{place}/background.png",
-            **{"label.contact": 1, "label.radius_px": [float(r) for r in radii],
-               "label.x_px": [float(x) for x, _ in centres], "label.y_px": [float(y) for _, y in centres]},
-        )  # fmt: skip
-        index.add([f"{place}/background.png"], **cells, sequence=f"{sensor}/background", split="background",
-                  **{"label.contact": 0})  # fmt: skip
+            **{
+                "label.contact": 1,
+                "label.radius_px": [float(r) for r in radii],
+                "label.x_px": [float(x) for x, _ in centres],
+                "label.y_px": [float(y) for _, y in centres],
+            },
+        )
+        index.add(
+            [f"{place}/background.png"],
+            **cells,
+            sequence=f"{sensor}/background",
+            split="background",
+            **{"label.contact": 0},
+        )
 
 
 READERS = {
     "gelsight_mini_pretrain": DatasetReader(
-        _gelsight_mini, "<source>/train-00000.parquet",
-        "the data set card of yxma/gelsight-mini-pretrain, and each source", "by row",
-        "https://huggingface.co/datasets/yxma/gelsight-mini-pretrain", uses=("val", "test", "url"),
+        _gelsight_mini,
+        "<source>/train-00000.parquet",
+        "the data set card of yxma/gelsight-mini-pretrain, and each source",
+        "by row",
+        "https://huggingface.co/datasets/yxma/gelsight-mini-pretrain",
+        uses=("val", "test", "url"),
     ),
     "fota": DatasetReader(
-        _fota, "<data set>/train/data-000000.tar",
+        _fota,
+        "<data set>/train/data-000000.tar",
         "Zhao et al., Transferable Tactile Transformers for Representation Learning Across Diverse Sensors and Tasks, "
-        "CoRL 2024", "MIT",
-        "https://huggingface.co/datasets/alanz-mit/FoundationTactile", uses=("val", "test", "url", "sensor"),
+        "CoRL 2024",
+        "MIT",
+        "https://huggingface.co/datasets/alanz-mit/FoundationTactile",
+        uses=("val", "test", "url", "sensor"),
     ),
     "webdataset": DatasetReader(
-        _webdataset, "<folder>/000000.tar", "nothing, unless their owner asks for it", "as their owner says",
+        _webdataset,
+        "<folder>/000000.tar",
+        "nothing, unless their owner asks for it",
+        "as their owner says",
         uses=("val", "test", "url", "sensor", "keys"),
     ),
     "real_touch": DatasetReader(
         _real_touch, "manifest.csv", "the sources named in the pack's read-me", "by row", uses=()
     ),
     "taxim_presses": DatasetReader(
-        _taxim_presses, "dataPack.npz in the folder calib of the package taxim",
-        "Si and Yuan, Taxim: An Example-Based Simulation Model for GelSight Tactile Sensors, RA-L 2022", "MIT",
-        "https://pypi.org/project/taxim", uses=("val", "test", "lists"),
+        _taxim_presses,
+        "dataPack.npz in the folder calib of the package taxim",
+        "Si and Yuan, Taxim: An Example-Based Simulation Model for GelSight Tactile Sensors, RA-L 2022",
+        "MIT",
+        "https://pypi.org/project/taxim",
+        uses=("val", "test", "lists"),
     ),
-}  # fmt: skip
+}

@@ -31,7 +31,9 @@ class Export:
     """The pictures of a stream in `folder`, which is final when `exported` ends; `is_new` if they must be written."""
 
     def __init__(self, folder: str, is_new: bool, place: Path) -> None:
-        self.folder, self.is_new, self.names = folder, is_new, list[str]()
+        self.folder = folder
+        self.is_new = is_new
+        self.names = list[str]()
         self._place = place
 
     def save(self, name: str, picture: np.ndarray | bytes) -> None:
@@ -54,13 +56,17 @@ def exported(
     """
     place, record = find_export(index.root, folder, stream)
     is_new = record is None or not _is_same(record, sources, which)
-    part = part_path(index.root / f"{folder}.{zlib.crc32(stream.encode()):08x}")  # two may be open at once
+    # two may be open at once
+    part = part_path(index.root / f"{folder}.{zlib.crc32(stream.encode()):08x}")
     export = Export(place or folder, is_new, part if is_new else index.root / str(place))
     try:
         yield export
         if is_new and export.names:
             states = [(one, one.stat()) for one in sources]
-            files = [(one.name, status.st_size, status.st_mtime_ns, _digest(one)) for one, status in states]
+            files = [
+                (one.name, status.st_size, status.st_mtime_ns, _digest(one))
+                for one, status in states
+            ]
             state = {"stream": stream, "part": which, "sources": files, "pictures": export.names}
             part.joinpath(EXPORT_RECORD).write_text(json.dumps(state), encoding="utf-8")
             export.folder = _move(index, part, folder, place, record, export.names)
@@ -105,7 +111,9 @@ def is_current(record: dict[str, Any], sources: Sequence[Path]) -> bool:
 def _is_same(record: dict[str, Any], sources: Sequence[Path], part: object) -> bool:
     """Return whether sources have the sizes and times of a record, or else its sizes and content."""
     old = record["sources"]
-    if json.dumps(part) != json.dumps(record["part"]) or [name for name, *_ in old] != [one.name for one in sources]:
+    if json.dumps(part) != json.dumps(record["part"]) or [name for name, *_ in old] != [
+        one.name for one in sources
+    ]:
         return False
     for (_, size, time, digest), file in zip(old, sources, strict=True):
         status = file.stat()
@@ -120,14 +128,22 @@ def _digest(file: Path) -> str:
 
 
 def _move(
-    index: DatasetIndex, part: Path, folder: str, place: str | None, record: dict[str, Any] | None, names: list[str]
+    index: DatasetIndex,
+    part: Path,
+    folder: str,
+    place: str | None,
+    record: dict[str, Any] | None,
+    names: list[str],
 ) -> str:
     """Move new pictures to their folder, and return it. Files of the user in a replaced folder stay in it."""
     if place is not None and record is not None:
-        old, ours = index.root / place, {EXPORT_RECORD, *record["pictures"]}
+        old = index.root / place
+        ours = {EXPORT_RECORD, *record["pictures"]}
         own = [entry.name for entry in os.scandir(old) if entry.name not in ours]
         if both := sorted({*own} & {*names}):
-            raise DatasetError(f"{old / both[0]} is a file of yours where a picture has to go; move it elsewhere")
+            raise DatasetError(
+                f"{old / both[0]} is a file of yours where a picture has to go; move it elsewhere"
+            )
         aside = part_path(old.with_name(f"{old.name}.old"))
         os.replace(old, aside)
         os.replace(part, old)
@@ -142,7 +158,9 @@ def _move(
         if not target.exists():
             os.replace(part, target)
             break
-        if target.is_dir() and _record(target) is None and _has_same(target, part, names):  # of an older version
+        if (
+            target.is_dir() and _record(target) is None and _has_same(target, part, names)
+        ):  # of an older version
             os.replace(part / EXPORT_RECORD, target / EXPORT_RECORD)
             break
     if name != folder:
@@ -161,8 +179,14 @@ def export_video(index: DatasetIndex, video: str) -> str:
     with exported(index, video.removesuffix(file.suffix), file.name, [file]) as pictures:
         if pictures.is_new:
             declared = count_frames(file)
-            for count, frame in enumerate(tracked(frames_from_video(file), "frames written", declared or None)):
+            for count, frame in enumerate(
+                tracked(frames_from_video(file), "frames written", declared or None)
+            ):
                 pictures.save(f"{count:06d}.png", frame)
-            if 0.98 * declared > (count := len(pictures.names)) + 2:  # some containers only estimate it
-                index.notes.append(f"{video} declares {declared} frames and {count} could be read; is it whole?")
+            if (
+                0.98 * declared > (count := len(pictures.names)) + 2
+            ):  # some containers only estimate it
+                index.notes.append(
+                    f"{video} declares {declared} frames and {count} could be read; is it whole?"
+                )
     return pictures.folder

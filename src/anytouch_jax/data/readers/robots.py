@@ -22,18 +22,40 @@ from anytouch_jax.data.readers import common
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 from anytouch_jax.files import atomic_write
 
-VISGEL = ("images/touch/", "touch/", "data_seen/touch/", "data_unseen/touch/", "images/data_seen/touch/",
-          "images/data_unseen/touch/")  # fmt: skip
+VISGEL = (
+    "images/touch/",
+    "touch/",
+    "data_seen/touch/",
+    "data_unseen/touch/",
+    "images/data_seen/touch/",
+    "images/data_unseen/touch/",
+)
 CLOTH_FRAMES = ("gelsight_frame", "gsframes")
-CLOTH_PROPERTIES = ("fuzziness", "thickness", "smoothness", "wool", "stretchiness", "endurance", "softness",
-                    "wind_resistance", "season", "wash_method", "textile_type")  # fmt: skip
+CLOTH_PROPERTIES = (
+    "fuzziness",
+    "thickness",
+    "smoothness",
+    "wool",
+    "stretchiness",
+    "endurance",
+    "softness",
+    "wind_resistance",
+    "season",
+    "wash_method",
+    "textile_type",
+)
 LAST_OF_1 = 100
 PLACES = ("obj1.0/", "obj2.0/touch/", "touch/", "")
-Views = dict[str, list[tuple[str, list[str]]]]  # folder -> (folder, files) of the camera views in it
+# folder -> (folder, files) of the camera views in it
+Views = dict[str, list[tuple[str, list[str]]]]
 PHASES = ("before", "during", "after")
 PICTURES = {
     **{f"kinectA_rgb_{phase}": (f"vision_{phase}", "") for phase in PHASES},
-    **{f"gelsight{finger}_{phase}": (f"touch_{phase}", f"_{finger}") for phase in PHASES for finger in "AB"},
+    **{
+        f"gelsight{finger}_{phase}": (f"touch_{phase}", f"_{finger}")
+        for phase in PHASES
+        for finger in "AB"
+    },
 }
 
 
@@ -47,19 +69,27 @@ def _visgel(index: DatasetIndex) -> None:
     index.read_contact_list(("contact_visgel.csv", "images/contact_visgel.csv"), "touch")
     for place in VISGEL:
         for inside, folders, files in index.walk(place):
-            folder, vision = f"{place}{inside}", f"{place.removesuffix('touch/')}vision/{inside}"
+            folder = f"{place}{inside}"
+            vision = f"{place.removesuffix('touch/')}vision/{inside}"
             if folders:
-                index.skip("file that is not a frame by its name", f"{folder}/{''.join(files[:1])}", len(files))
+                index.skip(
+                    "file that is not a frame by its name",
+                    f"{folder}/{''.join(files[:1])}",
+                    len(files),
+                )
             elif files:
                 frames = index.frames(folder, r"frame(\d+)\.jpe?g", files)
                 on_disk = index.listing(vision)[1]
                 index.add_recording(
-                    frames, folder,
+                    frames,
+                    folder,
                     split="test" if "data_unseen" in place else index.split_of(inside),
-                    key=inside, sensor="gelsight", sequence=folder,
+                    key=inside,
+                    sensor="gelsight",
+                    sequence=folder,
                     image_path=index.photographs(vision, frames.values(), set(on_disk)),
                     background_path=f"{folder}/{frames[0]}" if 0 in frames else None,
-                )  # fmt: skip
+                )
 
 
 def _cloth(index: DatasetIndex) -> None:
@@ -82,14 +112,30 @@ def _cloth(index: DatasetIndex) -> None:
             index.skip("cloth without properties (kept without labels)", cloth)
         for trial in index.listing(f"{base}{cloth}")[0]:
             folders, files = index.listing(f"{base}{cloth}/{trial}")
-            inside = next((f"{cloth}/{trial}/{name}" for name in CLOTH_FRAMES if name in folders), None)
+            inside = next(
+                (f"{cloth}/{trial}/{name}" for name in CLOTH_FRAMES if name in folders), None
+            )
             if inside is None:
-                reason = "video that is not unpacked" if "GelSight_video.mp4" in files else "trial without frames"
-                index.skip(f"{reason} (expected {CLOTH_FRAMES[0]}/0000.png)", f"{base}{cloth}/{trial}")
+                reason = (
+                    "video that is not unpacked"
+                    if "GelSight_video.mp4" in files
+                    else "trial without frames"
+                )
+                index.skip(
+                    f"{reason} (expected {CLOTH_FRAMES[0]}/0000.png)", f"{base}{cloth}/{trial}"
+                )
                 continue
             frames = index.frames(f"{base}{inside}", r"(?:frame)?(\d+)\.(?:png|jpe?g)")
-            index.add_recording(frames, f"{base}{inside}", split=index.split_of(cloth), key=inside,
-                                sensor="gelsight", sequence=f"{cloth}/{trial}", object=cloth, **labels)  # fmt: skip
+            index.add_recording(
+                frames,
+                f"{base}{inside}",
+                split=index.split_of(cloth),
+                key=inside,
+                sensor="gelsight",
+                sequence=f"{cloth}/{trial}",
+                object=cloth,
+                **labels,
+            )
 
 
 def _cloth_labels(values: object, table: Path | None, cloth: str) -> dict[str, int]:
@@ -100,8 +146,12 @@ def _cloth_labels(values: object, table: Path | None, cloth: str) -> dict[str, i
     except (TypeError, ValueError):
         numbers = []
     if len(numbers) != len(CLOTH_PROPERTIES) or not all(number.is_integer() for number in numbers):
-        raise DatasetError(f"{table}: cloth {cloth!r} must have {len(CLOTH_PROPERTIES)} whole numbers, has {values}")
-    return {f"label.{name}": int(number) for name, number in zip(CLOTH_PROPERTIES, numbers, strict=True)}
+        raise DatasetError(
+            f"{table}: cloth {cloth!r} must have {len(CLOTH_PROPERTIES)} whole numbers, has {values}"
+        )
+    return {
+        f"label.{name}": int(number) for name, number in zip(CLOTH_PROPERTIES, numbers, strict=True)
+    }
 
 
 def _ycb_slide(index: DatasetIndex) -> None:
@@ -117,8 +167,15 @@ def _ycb_slide(index: DatasetIndex) -> None:
             if not name.startswith("dataset_") or not (index.root / folder).is_dir():
                 index.skip("folder that is no dataset_<k>/frames", f"{base}{obj}/{name}")
                 continue
-            index.add_recording(index.frames(folder, r"frame_(\d+)\.jpe?g"), folder, split=index.split_of(obj),
-                                sensor="digit", sequence=f"{obj}/{name}", object=obj, stride=3)  # fmt: skip
+            index.add_recording(
+                index.frames(folder, r"frame_(\d+)\.jpe?g"),
+                folder,
+                split=index.split_of(obj),
+                sensor="digit",
+                sequence=f"{obj}/{name}",
+                object=obj,
+                stride=3,
+            )
 
 
 def _octopi(index: DatasetIndex) -> None:
@@ -129,12 +186,17 @@ def _octopi(index: DatasetIndex) -> None:
     names give the split if all three exist. AnyTouch calls the output folder `processed`.
     """
     base = index.find_folder("processed", "") or ""
-    index.read_contact_list(("contact_text_octopi.csv", "contact_octopi.csv", "contact.csv"), "processed")
+    index.read_contact_list(
+        ("contact_text_octopi.csv", "contact_octopi.csv", "contact.csv"), "processed"
+    )
     lists = [(part, index.find_file([f"{part}_samples.json"], base, "")) for part in common.PARTS]
     paths = [(part, path) for part, path in lists if path]
     splits: dict[str, str] = {}
     if len(paths) == len(common.PARTS):
-        folders = {part: [f for fs in common.read_json(path, list).values() for f in fs] for part, path in paths}
+        folders = {
+            part: [f for fs in common.read_json(path, list).values() for f in fs]
+            for part, path in paths
+        }
         name_of = lambda folder: Path(str(folder).replace("\\", "/")).name  # noqa: E731
         splits = common.published_splits(paths[0][1].with_name("*_samples.json"), folders, name_of)
     else:
@@ -149,9 +211,16 @@ def _octopi(index: DatasetIndex) -> None:
         if splits and sample not in splits:
             index.skip("sample in no *_samples.json (split unused)", sample)
         captions = [f"octopi_{cell}" if cell else None for cell in index.listed(sample, frames, 1)]
-        index.add_recording(frames, f"{base}{sample}", key=sample, sensor="gelsight_mini", sequence=sample, object=obj,
-                            split=splits.get(sample, "unused") if splits else index.split_of(obj),
-                            caption_id=captions)  # fmt: skip
+        index.add_recording(
+            frames,
+            f"{base}{sample}",
+            key=sample,
+            sensor="gelsight_mini",
+            sequence=sample,
+            object=obj,
+            split=splits.get(sample, "unused") if splits else index.split_of(obj),
+            caption_id=captions,
+        )
     gone = sorted(splits.keys() - {*index.listing(base)[0]})
     index.skip_all("sample of *_samples.json that is not on disk", gone)
 
@@ -164,26 +233,40 @@ def _rendered(index: DatasetIndex) -> None:
     2.0 leaves them out. The split is the benchmark's and by picture, so an object is in train and test. Every picture
     is a sequence. Pictures in no list are `unused`. Raises DatasetError without label.json or split.json.
     """
-    ids = {place: [name for name in index.listing(place, count=False)[0] if name.isdecimal()] for place in PLACES}
+    ids = {
+        place: [name for name in index.listing(place, count=False)[0] if name.isdecimal()]
+        for place in PLACES
+    }
     ids = {place: names for place, names in ids.items() if names}
     if not ids:
         return
     labels, splits = _objectfolder_lists(index)
     for place, names in ids.items():
         for name in index.tracked(names):
-            folder, number, first = f"{place}{name}", int(name), int(name) <= LAST_OF_1
+            folder = f"{place}{name}"
+            number = int(name)
+            first = int(name) <= LAST_OF_1
             if (place.endswith("touch/") and first) or (place == "obj1.0/" and not first):
-                index.skip(f"id that does not belong to {place.rstrip('/')} (1.0 ends at {LAST_OF_1})", folder)
+                index.skip(
+                    f"id that does not belong to {place.rstrip('/')} (1.0 ends at {LAST_OF_1})",
+                    folder,
+                )
                 continue
             frames = index.frames(folder)
             index.add(
-                [f"{folder}/{file}" for file in frames.values()], sensor="tacto" if first else "taxim", frame_index=0,
-                dataset="objectfolder1" if first else "objectfolder2", sequence=[f"{name}/{n}" for n in frames],
-                split=[splits.pop((number, n), "unused") for n in frames], object=name,
+                [f"{folder}/{file}" for file in frames.values()],
+                sensor="tacto" if first else "taxim",
+                frame_index=0,
+                dataset="objectfolder1" if first else "objectfolder2",
+                sequence=[f"{name}/{n}" for n in frames],
+                split=[splits.pop((number, n), "unused") for n in frames],
+                object=name,
                 **{"label.material": labels.get(number)},
-            )  # fmt: skip
+            )
             index.skip("id without a label (kept without)", folder, number not in labels)
-    index.skip("picture of split.json that is not on disk", str(next(iter(splits), "")), len(splits))
+    index.skip(
+        "picture of split.json that is not on disk", str(next(iter(splits), "")), len(splits)
+    )
 
 
 def _objectfolder_lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple[int, int], str]]:
@@ -193,15 +276,21 @@ def _objectfolder_lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple
     for name in ("label.json", "split.json"):
         path = index.find_file([name], "obj2.0", "")
         if path is None:
-            raise DatasetError(f"expected {name} in {index.root} or its folder obj2.0, or in the folder of --lists")
+            raise DatasetError(
+                f"expected {name} in {index.root} or its folder obj2.0, or in the folder of --lists"
+            )
         paths.append(path)
         tables.append(common.read_json(path))
     try:
         labels = {int(name): int(value) for name, value in tables[0].items()}
-        splits = common.published_splits(paths[1], tables[1], lambda pair: (int(pair[0]), int(pair[1])))
+        splits = common.published_splits(
+            paths[1], tables[1], lambda pair: (int(pair[0]), int(pair[1]))
+        )
     except (TypeError, ValueError) as error:
-        raise DatasetError(f"{' or '.join(map(str, paths))} is not as expected (id -> number; train, test: "
-                           f"lists of [id, number]): {error}") from None  # fmt: skip
+        raise DatasetError(
+            f"{' or '.join(map(str, paths))} is not as expected (id -> number; train, test: "
+            f"lists of [id, number]): {error}"
+        ) from None
     return labels, splits
 
 
@@ -229,8 +318,12 @@ def _real(index: DatasetIndex) -> None:
         elif files and inside:
             views[parent].append((inside, files))
     parents = {inside.rpartition("/")[0] for inside, _ in recordings}
-    for folder, files in (view for parent, siblings in views.items() if parent not in parents for view in siblings):
-        index.skip("file outside a folder 'gelsight' and its siblings", f"{folder}/{files[0]}", len(files))
+    for folder, files in (
+        view for parent, siblings in views.items() if parent not in parents for view in siblings
+    ):
+        index.skip(
+            "file outside a folder 'gelsight' and its siblings", f"{folder}/{files[0]}", len(files)
+        )
     for inside, files in recordings:
         frames = index.frames(f"{base}{inside}", files=files)
         obj = next((part for part in inside.split("/") if part.isdecimal()), inside.split("/")[0])
@@ -242,14 +335,18 @@ def _real(index: DatasetIndex) -> None:
         first, second = _camera_views(index, base, views[inside.rpartition("/")[0]], list(frames))
         listed = [f"{base}{photo}" if photo in on_disk else None for photo in photos]
         index.add_recording(
-            frames, f"{base}{inside}",
-            split=index.split_of(obj), key=inside,
-            sensor="gelslim", sequence=inside.removesuffix("/gelsight"), object=obj,
+            frames,
+            f"{base}{inside}",
+            split=index.split_of(obj),
+            key=inside,
+            sensor="gelslim",
+            sequence=inside.removesuffix("/gelsight"),
+            object=obj,
             image_path=[a or b for a, b in zip(listed, first, strict=True)],
             image2_path=second,
             caption_id=[f"obj_{caption}" if caption else None for caption in captions],
             **{"label.material": metadata.get("Material"), "label.object": metadata.get("Name")},
-        )  # fmt: skip
+        )
 
 
 def _camera_views(
@@ -289,37 +386,60 @@ def _feel(index: DatasetIndex) -> None:
     files: dict[str, set[str]] = {}
     for line, row in tracked(common.read_lines(table), "rows read"):
         if len(row) != 3 or not row[1].isdecimal() or row[2] not in ("0", "1"):
-            raise DatasetError(f"{table}, line {line}: expected object,number,0 or 1, found {','.join(row)}")
+            raise DatasetError(
+                f"{table}, line {line}: expected object,number,0 or 1, found {','.join(row)}"
+            )
         name = row[0]
         if name not in files:
             folders = index.listing(f"{base}{name}")[0]
-            files[name] = {f"{sub}/{file}" for sub in folders for file in index.listing(f"{base}{name}/{sub}")[1]}
+            files[name] = {
+                f"{sub}/{file}"
+                for sub in folders
+                for file in index.listing(f"{base}{name}/{sub}")[1]
+            }
         if splits is not None and name not in splits:
-            index.skip(f"grasp of an object that is in no list of split {index.options.fold} (split unused)", name)
+            index.skip(
+                f"grasp of an object that is in no list of split {index.options.fold} (split unused)",
+                name,
+            )
         split = index.split_of(name) if splits is None else splits.get(name, "unused")
         _add_grasp(index, f"{base}{name}", name, int(row[1]), int(row[2]), split, files[name])
 
 
 def _add_grasp(
-    index: DatasetIndex, folder: str, name: str, number: int, success: int, split: str, files: set[str]
+    index: DatasetIndex,
+    folder: str,
+    name: str,
+    number: int,
+    success: int,
+    split: str,
+    files: set[str],
 ) -> None:
     grasp = f"{name}/{number}"
     for finger in "AB":
         before = f"touch_before/{number}_{finger}.png"
         for phase, part in zip(PHASES, ("background", split, "unused"), strict=True):
-            file, photo = f"touch_{phase}/{number}_{finger}.png", f"vision_{phase}/{number}.png"
+            file = f"touch_{phase}/{number}_{finger}.png"
+            photo = f"vision_{phase}/{number}.png"
             if file not in files:
                 index.skip("picture of feel.csv that is not on disk", f"{folder}/{file}")
                 continue
             index.add(
-                [f"{folder}/{file}"], sensor="gelsight", unit=finger, sequence=f"{grasp}/{phase}/{finger}",
-                frame_index=0, split=part, object=name,
+                [f"{folder}/{file}"],
+                sensor="gelsight",
+                unit=finger,
+                sequence=f"{grasp}/{phase}/{finger}",
+                frame_index=0,
+                split=part,
+                object=name,
                 grasp_group=grasp if phase == "during" else None,
                 image_path=f"{folder}/{photo}" if photo in files else None,
                 background_path=f"{folder}/{before}" if before in files else None,
-                **{"label.success": success if phase == "during" else None,
-                   "label.contact": 0 if phase == "before" else None},
-            )  # fmt: skip
+                **{
+                    "label.success": success if phase == "during" else None,
+                    "label.contact": 0 if phase == "before" else None,
+                },
+            )
 
 
 def _splits_of_fold(index: DatasetIndex, base: str) -> dict[str, str] | None:
@@ -327,12 +447,18 @@ def _splits_of_fold(index: DatasetIndex, base: str) -> dict[str, str] | None:
     fold = index.options.fold
     path = index.find_file([f"split_{fold}.json", f"split_{fold}.npy"], base)
     if path is None and fold:
-        raise DatasetError(f"there is no split_{fold}.npy or .json for --fold {fold} in {index.root / base}")
+        raise DatasetError(
+            f"there is no split_{fold}.npy or .json for --fold {fold} in {index.root / base}"
+        )
     if path is None:
         index.notes.append(f"no split_{fold}.npy or .json: split by hash of the object")
         return None
-    table: Any = common.read_json(path) if path.suffix == ".json" else np.ravel(common.read_pickle(path))[0]
-    lists = table.values() if isinstance(table, dict) and {"train", "test"} <= table.keys() else [None]
+    table: Any = (
+        common.read_json(path) if path.suffix == ".json" else np.ravel(common.read_pickle(path))[0]
+    )
+    lists = (
+        table.values() if isinstance(table, dict) and {"train", "test"} <= table.keys() else [None]
+    )
     if not all(isinstance(names, list) for names in lists):
         raise DatasetError(f"{path}: expected the lists 'train' and 'test' of object names")
     return common.published_splits(path, table)
@@ -350,13 +476,18 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
         try:
             with h5py.File(root / name, "r") as file:
                 for grasp in _grasps(file):
-                    names_of = ("object_name", "is_gripping")  # stored as data sets or as attributes
-                    obj, success = (grasp[key][()] if key in grasp else grasp.attrs[key] for key in names_of)
+                    # stored as data sets or as attributes
+                    names_of = ("object_name", "is_gripping")
+                    obj, success = (
+                        grasp[key][()] if key in grasp else grasp.attrs[key] for key in names_of
+                    )
                     obj = _object_name(obj)
                     number = numbers[obj] = numbers.get(obj, -1) + 1
                     for key in PICTURES.keys() & grasp.keys():
                         sub, ending = PICTURES[key]
-                        _save_once(root / obj / sub / f"{number}{ending}.png", np.asarray(grasp[key][()]))
+                        _save_once(
+                            root / obj / sub / f"{number}{ending}.png", np.asarray(grasp[key][()])
+                        )
                     lines.append([obj, number, int(np.ravel(success)[0])])
         except (OSError, KeyError, ValueError) as error:
             raise DatasetError(f"{root / name} is not a file of Feel: {error}") from None
@@ -398,39 +529,59 @@ def _object_name(value: Any) -> str:
 
 READERS = {
     "visgel": DatasetReader(
-        _visgel, "images/touch/<recording>/frame0000.jpg",
+        _visgel,
+        "images/touch/<recording>/frame0000.jpg",
         "Li et al., Connecting Touch and Vision via Cross-Modal Prediction, CVPR 2019",
-        url="http://visgel.csail.mit.edu", uses=("val", "test", "lists"), paper=587_000,
+        url="http://visgel.csail.mit.edu",
+        uses=("val", "test", "lists"),
+        paper=587_000,
     ),
     "cloth": DatasetReader(
-        _cloth, "Data_ICRA18/Data/<cloth>/<trial>/gelsight_frame/0000.png",
+        _cloth,
+        "Data_ICRA18/Data/<cloth>/<trial>/gelsight_frame/0000.png",
         "Yuan et al., Active Clothing Material Perception using Tactile Sensing and Deep Learning, ICRA 2018",
-        url="http://data.csail.mit.edu/active_clothing/Data_ICRA18.tar", uses=("val", "test", "lists"), paper=587_000,
+        url="http://data.csail.mit.edu/active_clothing/Data_ICRA18.tar",
+        uses=("val", "test", "lists"),
+        paper=587_000,
     ),
     "ycb_slide": DatasetReader(
-        _ycb_slide, "real/<object>/dataset_0/frames/frame_0000000.jpg",
-        "Suresh et al., MidasTouch: Monte-Carlo inference over distributions across sliding touch, CoRL 2022", "MIT",
-        "https://github.com/rpl-cmu/YCB-Slide", paper=183_000,
+        _ycb_slide,
+        "real/<object>/dataset_0/frames/frame_0000000.jpg",
+        "Suresh et al., MidasTouch: Monte-Carlo inference over distributions across sliding touch, CoRL 2022",
+        "MIT",
+        "https://github.com/rpl-cmu/YCB-Slide",
+        paper=183_000,
     ),
     "octopi": DatasetReader(
-        _octopi, "processed/<sample>/0000000000.jpg, as Octopi's process_dataset.py writes it,",
+        _octopi,
+        "processed/<sample>/0000000000.jpg, as Octopi's process_dataset.py writes it,",
         "Yu et al., Octopi: Object Property Reasoning with Large Tactile-Language Models, RSS 2024",
-        url="https://github.com/clear-nus/octopi", uses=("val", "test", "lists"), paper=39_000,
+        url="https://github.com/clear-nus/octopi",
+        uses=("val", "test", "lists"),
+        paper=39_000,
     ),
     "objectfolder": DatasetReader(
-        _rendered, "obj1.0/<id>/<n>.png or obj2.0/touch/<id>/<n>.png",
-        "Gao et al., ObjectFolder, CoRL 2021; ObjectFolder 2.0, CVPR 2022", "CC-BY-4.0",
-        "https://github.com/rhgao/ObjectFolder", uses=("lists",),
+        _rendered,
+        "obj1.0/<id>/<n>.png or obj2.0/touch/<id>/<n>.png",
+        "Gao et al., ObjectFolder, CoRL 2021; ObjectFolder 2.0, CVPR 2022",
+        "CC-BY-4.0",
+        "https://github.com/rhgao/ObjectFolder",
+        uses=("lists",),
     ),
     "objectfolder_real": DatasetReader(
-        _real, "tactile/<object>/<trial>/gelsight/<n>.png",
+        _real,
+        "tactile/<object>/<trial>/gelsight/<n>.png",
         "Gao et al., The ObjectFolder Benchmark: Multisensory Learning with Neural and Real Objects, CVPR 2023",
-        "CC-BY-4.0", "https://objectfolder.stanford.edu/objectfolder-real-download", uses=("val", "test", "lists"),
+        "CC-BY-4.0",
+        "https://objectfolder.stanford.edu/objectfolder-real-download",
+        uses=("val", "test", "lists"),
         paper=1_165_000,
     ),
     "feel": DatasetReader(
-        _feel, "feel.csv and <object>/touch_during/0_A.png",
+        _feel,
+        "feel.csv and <object>/touch_during/0_A.png",
         "Calandra et al., The Feeling of Success: Does Touch Sensing Help Predict Grasp Outcomes?, CoRL 2017",
-        url="https://sites.google.com/view/the-feeling-of-success", uses=("val", "test", "lists", "fold", "export"),
+        url="https://sites.google.com/view/the-feeling-of-success",
+        uses=("val", "test", "lists", "fold", "export"),
     ),
-}  # fmt: skip
+}

@@ -19,7 +19,8 @@ from jax import Array
 
 Host = npt.NDArray[np.float64]
 
-FAR = 12.0  # thicknesses of the layer; the motion of a bonded layer decays exponentially and is zero beyond
+# thicknesses of the layer; the motion of a bonded layer decays exponentially and is zero beyond
+FAR = 12.0
 DISTANCE: Host = np.linspace(0, FAR, 513)
 # Up to this side length four matrix products are faster than two FFTs (twice as fast at 112, on two cores).
 MATMUL_LIMIT = 144
@@ -38,9 +39,11 @@ class Plan:
 
     @property
     def padded(self) -> tuple[int, int]:
-        rows, columns = 2 * self.rows, 2 * self.columns
+        rows = 2 * self.rows
+        columns = 2 * self.columns
         if self.matmul:
-            return rows + rows % 4, columns + columns % 4  # of a field with an even number of rows and columns
+            # of a field with an even number of rows and columns
+            return rows + rows % 4, columns + columns % 4
         return _smooth(rows - 1), _smooth(columns - 1)
 
     @property
@@ -63,13 +66,16 @@ class Plan:
 
     def even(self, transform: Array, spectrum: Array) -> Array:
         """Return the transform of a field's convolution with a kernel that is even in x and in y."""
-        return transform * (spectrum[None, None] if self.matmul else _unfold(spectrum, self.padded[0], 1))
+        return transform * (
+            spectrum[None, None] if self.matmul else _unfold(spectrum, self.padded[0], 1)
+        )
 
     def odd(self, transform: Array, spectrum: Array) -> Array:
         """Return the transform of a field's convolution with a kernel that is odd in x and in y."""
         if not self.matmul:
             return transform * _unfold(spectrum, self.padded[0], -1)
-        sign = jnp.array([[-1, 1], [1, -1]], transform.dtype)[:, :, None, None]  # sin(a - b), twice, and i squared
+        # sin(a - b), twice, and i squared
+        sign = jnp.array([[-1, 1], [1, -1]], transform.dtype)[:, :, None, None]
         return sign * transform[::-1, ::-1] * spectrum[None, None]
 
     def spectrum(self, quadrant: Any, parity: int = 1) -> Any:
@@ -108,7 +114,8 @@ def _wave_table(padded: int) -> Host:
 @functools.lru_cache(maxsize=64)
 def _kernel_table(size: int, padded: int, parity: int, weighted: bool) -> Host:
     """Return the sums (padded / 2 + 1, size) of a kernel that is even or odd, weighted as `Plan.inverse` needs it."""
-    wave, offset = np.arange(padded // 2 + 1), np.arange(size)
+    wave = np.arange(padded // 2 + 1)
+    offset = np.arange(size)
     angle = 2 * np.pi / padded * np.outer(wave, offset)
     table = np.cos(angle) * np.where(offset > 0, 2, 1) if parity > 0 else 2 * np.sin(angle)
     if weighted:
@@ -121,7 +128,8 @@ def _waves(padded: int, dtype: Any) -> Array:
 
 
 def _einsum(formula: str, a: Array, b: Array) -> Array:
-    return jnp.einsum(formula, a, b, precision=jax.lax.Precision.HIGHEST)  # accelerators would cut float32 to 10 bits
+    # accelerators would cut float32 to 10 bits
+    return jnp.einsum(formula, a, b, precision=jax.lax.Precision.HIGHEST)
 
 
 def _split(field: Array, axis: int) -> Array:
@@ -133,7 +141,8 @@ def _split(field: Array, axis: int) -> Array:
 
 def _join(parts: Array, axis: int) -> Array:
     """Invert `_split` up to a factor of two: parts (2, ...) -> ..., concatenated along `axis`."""
-    even, odd = parts[0], parts[1]
+    even = parts[0]
+    odd = parts[1]
     return jnp.concatenate([jnp.flip(even - odd, axis), even + odd], axis)
 
 
@@ -155,7 +164,9 @@ def tangential_coefficients(rows: int, columns: int, poisson: float) -> tuple[Ho
 
     Cerruti's load (Johnson, Contact Mechanics, 3.75) over a square, in units of the normal modulus E*.
     """
-    xx, yy, xy = (_over_pixel(f, rows, columns) / np.pi for f in (_xx, _yy, lambda x, y: -np.hypot(x, y)))
+    xx, yy, xy = (
+        _over_pixel(f, rows, columns) / np.pi for f in (_xx, _yy, lambda x, y: -np.hypot(x, y))
+    )
     ratio = poisson / (1 - poisson)
     return xx + yy + ratio * xx, ratio * xy, xx + yy + ratio * yy
 
@@ -170,8 +181,13 @@ def _yy(x: Host, y: Host) -> Host:
 
 
 def _over_pixel(integral: Callable[[Host, Host], Host], rows: int, columns: int) -> Host:
-    y, x = np.meshgrid(np.arange(rows, dtype=np.float64), np.arange(columns, dtype=np.float64), indexing="ij")
-    right, left, low, high = x + 0.5, x - 0.5, y + 0.5, y - 0.5
+    y, x = np.meshgrid(
+        np.arange(rows, dtype=np.float64), np.arange(columns, dtype=np.float64), indexing="ij"
+    )
+    right = x + 0.5
+    left = x - 0.5
+    low = y + 0.5
+    high = y - 0.5
     return integral(right, low) - integral(left, low) - integral(right, high) + integral(left, high)
 
 
@@ -181,7 +197,8 @@ def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
     The loads are normal, tangential along the wave, and tangential across it (Sneddon 1951; Johnson 5.8).
     """
     k = 3 - 4 * poisson
-    decay = np.exp(-2 * wave)  # divided by exp(2 wave), so nothing overflows
+    # divided by exp(2 wave), so nothing overflows
+    decay = np.exp(-2 * wave)
     below = k * (1 + decay**2) + (1 + k**2 + 4 * wave**2) * decay
     sinh = k * (1 - decay**2)
     return (sinh - 4 * wave * decay) / below, (sinh + 4 * wave * decay) / below, np.tanh(wave)
@@ -195,14 +212,17 @@ def sideways_symbol(wave: Host, poisson: float) -> Host:
     k = 3 - 4 * poisson
     decay = np.exp(-2 * wave)
     below = k * (1 + decay**2) + (1 + k**2 + 4 * wave**2) * decay
-    return (k * (1 - 2 * poisson) / 2 * (1 - decay) ** 2 - 2 * wave**2 * decay) / (1 - poisson) / below
+    return (
+        (k * (1 - 2 * poisson) / 2 * (1 - decay) ** 2 - 2 * wave**2 * decay) / (1 - poisson) / below
+    )
 
 
 @functools.lru_cache(maxsize=1)
 def _hankel() -> tuple[Host, Host, Host, Host]:
     """Return waves, quadrature weights, and J0 and J2 of `DISTANCE` times wave (distances, waves)."""
     nodes, weights = np.polynomial.legendre.leggauss(128)
-    wave, weights = 7.0 * (nodes + 1), 7.0 * weights
+    wave = 7.0 * (nodes + 1)
+    weights = 7.0 * weights
     turn = (np.arange(200) + 0.5) * np.pi / 200
     phase = np.outer(DISTANCE, wave)[..., None] * np.sin(turn)
     return wave, weights, np.cos(phase).mean(-1), np.cos(2 * turn - phase).mean(-1)
@@ -231,7 +251,8 @@ def is_infinite(value: Any) -> bool:
 def sideways_table(poisson: float) -> tuple[Host, float]:
     """Return the smooth part of `sideways_kernel` at `DISTANCE` d thicknesses, and the factor of asinh(2 / d)."""
     wave, weights, bessel0, _ = _hankel()
-    rest = (1 - 2 * poisson) / (2 * (1 - poisson))  # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
+    # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
+    rest = (1 - 2 * poisson) / (2 * (1 - poisson))
     smooth = (sideways_symbol(wave, poisson) + rest * np.expm1(-2 * wave)) / wave
     return bessel0 @ (weights * smooth), rest
 
@@ -242,7 +263,8 @@ def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtyp
     Its gradient is the sideways motion of a layer's surface by a load on a pixel.
     """
     table, rest = sideways_table(poisson)
-    radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))  # at 0 the mean of log r over a pixel
+    # at 0 the mean of log r over a pixel
+    radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))
     far = jnp.asarray(radius, dtype) * jnp.asarray(pitch / thickness, dtype)
     return jnp.where(far < FAR, _between(far, table) + rest * jnp.arcsinh(2 / far), 0)
 
@@ -259,7 +281,9 @@ def _looked_up(far: Array, table: Host, limit: float) -> Array:
     return jnp.where(far < FAR, _between(far, table), limit / jnp.maximum(far, FAR))
 
 
-def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
+def normal_spectrum(
+    plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
+) -> Array:
     """Return the spectrum of the normal coefficients. `share` (E* over the gel's modulus) is the layer's motion."""
     deep = jnp.asarray(_normal_host(plan), dtype)
     if is_infinite(thickness):
@@ -270,7 +294,9 @@ def normal_spectrum(plan: Plan, pitch: Any, poisson: float, thickness: Any, shar
     return deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, table, 1.0))
 
 
-def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any) -> Array:
+def tangential_spectra(
+    plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
+) -> Array:
     """Return (3, KH, KW) spectra of the tangential coefficients xx, xy, yy. `share` is as in `normal_spectrum`."""
     deep = jnp.asarray(_tangential_host(plan, poisson), dtype)
     if is_infinite(thickness):
@@ -283,7 +309,9 @@ def tangential_spectra(plan: Plan, pitch: Any, poisson: float, thickness: Any, s
     twofold_at = share * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
     cosine, sine = (jnp.asarray(table, dtype) for table in _twice_the_angle(plan))
     parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)
-    return deep - jnp.stack([plan.spectrum(part, p) for part, p in zip(parts, (1, -1, 1), strict=True)])
+    return deep - jnp.stack(
+        [plan.spectrum(part, p) for part, p in zip(parts, (1, -1, 1), strict=True)]
+    )
 
 
 @functools.lru_cache(maxsize=64)
@@ -302,6 +330,7 @@ def _radius(plan: Plan) -> Host:
 
 
 def _twice_the_angle(plan: Plan) -> tuple[Host, Host]:
-    y, x = np.arange(plan.rows)[:, None], np.arange(plan.columns)[None, :]
+    y = np.arange(plan.rows)[:, None]
+    x = np.arange(plan.columns)[None, :]
     squared = np.maximum(x**2 + y**2, 1)
     return (x**2 - y**2) / squared, 2 * x * y / squared

@@ -96,54 +96,84 @@ def press(
     if surface.dtype not in (jnp.float32, jnp.float64):
         surface = surface.astype(jnp.float32)
     dtype = surface.dtype
-    depth, pitch = jnp.asarray(depth, dtype), jnp.asarray(pitch, dtype)
+    depth = jnp.asarray(depth, dtype)
+    pitch = jnp.asarray(pitch, dtype)
     plane = jnp.asarray(gel.plane, dtype)
-    share = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))  # E* over the gel's own plane modulus
+    # E* over the gel's own plane modulus
+    share = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))
     cut = jnp.where(jnp.isfinite(surface), surface + depth, -jnp.ones((), dtype))
     scale = jnp.max(cut)
     scale = jnp.where((scale > 0) & (depth >= 0), scale, 0)
-    cut = jnp.where(scale > 0, cut / jnp.where(scale > 0, scale, 1), -1)  # 1 at the deepest point
+    # 1 at the deepest point
+    cut = jnp.where(scale > 0, cut / jnp.where(scale > 0, scale, 1), -1)
     plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
-    compliances = [_compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)]
+    compliances = [
+        _compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)
+    ]
     solve, most = (_fast, 2) if fidelity == "fast" else (_exact, 300)
-    solution, load, moved = solve(compliances, cut, tolerance, most if iterations is None else iterations)
-    moved = moved - _of_object(plans[0], load, share, modulus_object)  # both move: the gel's part is the rest
+    solution, load, moved = solve(
+        compliances, cut, tolerance, most if iterations is None else iterations
+    )
+    # both move: the gel's part is the rest
+    moved = moved - _of_object(plans[0], load, share, modulus_object)
     pressure = solution.x * (scale * plane * share / pitch)
     force = jnp.sum(pressure) * pitch**2 * KPA_MM2
     converged = solution.residual <= tolerance
-    return PressResult(pressure, moved * scale, force, converged, solution.iterations, solution.residual)
+    return PressResult(
+        pressure, moved * scale, force, converged, solution.iterations, solution.residual
+    )
 
 
 def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
     if fidelity not in ("exact", "fast"):
         raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
     if np.ndim(surface) != 2:
-        raise UserError(f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap for more")
+        raise UserError(
+            f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap for more"
+        )
     for name, value, least in (("depth", depth, 0.0), ("pitch", pitch, 1e-12)):
-        if not isinstance(value, jax.core.Tracer) and not np.all((np.asarray(value) >= least) & np.isfinite(value)):
-            raise UserError(f"{name} must be {'at least 0' if least == 0 else 'above 0'} mm, not {value}")
+        if not isinstance(value, jax.core.Tracer) and not np.all(
+            (np.asarray(value) >= least) & np.isfinite(value)
+        ):
+            raise UserError(
+                f"{name} must be {'at least 0' if least == 0 else 'above 0'} mm, not {value}"
+            )
     if not isinstance(surface, jax.core.Tracer):
         values = np.asarray(surface)
         if np.isnan(values).any() or np.isposinf(values).any():
-            raise UserError("a surface may hold heights in mm and -inf for no object, but no NaN and no +inf")
+            raise UserError(
+                "a surface may hold heights in mm and -inf for no object, but no NaN and no +inf"
+            )
 
 
-def _check_elastic(shape: tuple[int, ...], gel: Gel, pitch: Any, fidelity: str, modulus_object: Any) -> None:
+def _check_elastic(
+    shape: tuple[int, ...], gel: Gel, pitch: Any, fidelity: str, modulus_object: Any
+) -> None:
     if not 0 <= gel.poisson <= 0.5:
         raise UserError(f"a gel's Poisson ratio is 0 to 0.5, not {gel.poisson}")
-    for name, value in (("modulus", gel.modulus), ("thickness", gel.thickness), ("modulus_object", modulus_object)):
+    for name, value in (
+        ("modulus", gel.modulus),
+        ("thickness", gel.thickness),
+        ("modulus_object", modulus_object),
+    ):
         if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
             raise UserError(f"{name} must be above 0, not {value}")
     if not any(isinstance(value, jax.core.Tracer) for value in (pitch, gel.thickness)):
-        least = np.asarray(pitch) * (1.5 * 2 ** (len(grids(shape)) - 1) if fidelity == "fast" else 1)
+        least = np.asarray(pitch) * (
+            1.5 * 2 ** (len(grids(shape)) - 1) if fidelity == "fast" else 1
+        )
         if np.any(np.asarray(gel.thickness) < least):
-            raise UserError(f"a gel of {gel.thickness} mm is too thin for this grid: {least:g} mm is the least")
+            raise UserError(
+                f"a gel of {gel.thickness} mm is too thin for this grid: {least:g} mm is the least"
+            )
 
 
 def grids(shape: tuple[int, ...]) -> list[Plan]:
     """Return the grid of `shape` and up to two coarser ones, each half of the one before."""
     plans = [Plan(shape[0], shape[1])]
-    while len(plans) < 3 and all(n % 2 == 0 and n // 2 >= COARSEST for n in (plans[-1].rows, plans[-1].columns)):
+    while len(plans) < 3 and all(
+        n % 2 == 0 and n // 2 >= COARSEST for n in (plans[-1].rows, plans[-1].columns)
+    ):
         plans.append(Plan(plans[-1].rows // 2, plans[-1].columns // 2))
     return plans
 
@@ -181,8 +211,10 @@ def _fast(
         cuts.append(halved(cuts[-1]))
     pressure = jnp.maximum(cuts[-1], 0)
     for level in range(len(cuts) - 1, -1, -1):
-        apply, here = compliances[level], cuts[level]
-        pressure = jnp.where(here > 0, pressure, 0)  # a flat gel never bulges to touch what is above it
+        apply = compliances[level]
+        here = cuts[level]
+        # a flat gel never bulges to touch what is above it
+        pressure = jnp.where(here > 0, pressure, 0)
         solution = _descended(apply, here, pressure, iterations * 2**level)
         pressure = doubled(solution.x) if level else solution.x
     moved = jnp.maximum(solution.excess, 0) + cut
@@ -199,13 +231,17 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
     """Run projected gradients from `pressure` at its best scale, and scale the result to its best."""
     moved = apply(pressure)
     factor = scaled(pressure, moved, cut)
-    end = descent(apply, lambda p: jnp.maximum(p, 0), cut, factor * pressure, iterations, moved=factor * moved)
+    end = descent(
+        apply, lambda p: jnp.maximum(p, 0), cut, factor * pressure, iterations, moved=factor * moved
+    )
     factor = scaled(end.x, end.excess + cut, cut)
     excess = factor * (end.excess + cut) - cut
     return Solution(factor * end.x, excess, complementarity(factor * end.x, excess), end.iterations)
 
 
-def sideways(pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False) -> Array:
+def sideways(
+    pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False
+) -> Array:
     """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W) kPa alone.
 
     A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more under a wide block.
@@ -214,20 +250,31 @@ def sideways(pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exa
     """
     if is_infinite(gel.thickness):
         raise UserError("sideways motion needs a bonded layer: set the thickness of the gel")
-    shape, pitch = pressure.shape, jnp.asarray(pitch, pressure.dtype)
+    shape = pressure.shape
+    pitch = jnp.asarray(pitch, pressure.dtype)
     for _ in grids(pressure.shape)[1:] if fidelity == "fast" else ():
-        pressure, pitch = halved(pressure), 2 * pitch
+        pressure = halved(pressure)
+        pitch = 2 * pitch
     plan = Plan(*pressure.shape)
-    spectrum = plan.spectrum(sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype))
-    potential = plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)  # mm
+    spectrum = plan.spectrum(
+        sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype)
+    )
+    # mm
+    potential = (
+        plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)
+    )
     y, x = jnp.gradient(potential)
     motion = jnp.stack([x, y], -1)
-    return motion if coarse else enlarged(motion, shape)
+    if coarse:
+        return motion
+    return enlarged(motion, shape)
 
 
 def enlarged(motion: Array, shape: tuple[int, ...]) -> Array:
     """Return a motion (h, w, 2) of a coarser grid on the grid of `shape`, by cubic interpolation."""
-    return motion if motion.shape[:2] == shape else jax.image.resize(motion, (*shape, 2), "cubic")
+    if motion.shape[:2] == shape:
+        return motion
+    return jax.image.resize(motion, (*shape, 2), "cubic")
 
 
 def halved(field: Array) -> Array:

@@ -16,7 +16,16 @@ from jax import Array
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.elastic import Plan, is_infinite, tangential_spectra
-from anytouch_jax.sim.contact.mechanics import KPA_MM2, Fidelity, Gel, PressResult, centroid, enlarged, grids, positions
+from anytouch_jax.sim.contact.mechanics import (
+    KPA_MM2,
+    Fidelity,
+    Gel,
+    PressResult,
+    centroid,
+    enlarged,
+    grids,
+    positions,
+)
 from anytouch_jax.sim.contact.solver import Compliance, descent, ratio
 
 SLIPPING = 0.999  # of the friction limit
@@ -38,16 +47,31 @@ class Shear(NamedTuple):
 
 def at_rest(shape: tuple[int, int], dtype: Any = jnp.float32) -> Shear:
     """Return the state before any tangential motion, on a grid of `shape`."""
-    field, zero = jnp.zeros((*shape, 2), dtype), jnp.zeros((), dtype)
-    none, yes = jnp.zeros(shape, bool), jnp.ones((), bool)
-    return Shear(field, field, none, zero, jnp.zeros(2, dtype), zero, yes, jnp.zeros((), jnp.int32), zero)
+    field = jnp.zeros((*shape, 2), dtype)
+    zero = jnp.zeros((), dtype)
+    none = jnp.zeros(shape, bool)
+    yes = jnp.ones((), bool)
+    return Shear(
+        field, field, none, zero, jnp.zeros(2, dtype), zero, yes, jnp.zeros((), jnp.int32), zero
+    )
 
 
 def shear_step(
-    state: Shear | None, contact: PressResult, motion: Any, gel: Gel, pitch: Any, friction: Any, *, fidelity:
-    Fidelity = "exact", modulus_object: Any = float("inf"), centre: Any = (0.0, 0.0), squeezed: Array | None = None,
-    coarse: bool = False, tolerance: float = 1e-3, iterations: int | None = None,
-) -> Shear:  # fmt: skip
+    state: Shear | None,
+    contact: PressResult,
+    motion: Any,
+    gel: Gel,
+    pitch: Any,
+    friction: Any,
+    *,
+    fidelity: Fidelity = "exact",
+    modulus_object: Any = float("inf"),
+    centre: Any = (0.0, 0.0),
+    squeezed: Array | None = None,
+    coarse: bool = False,
+    tolerance: float = 1e-3,
+    iterations: int | None = None,
+) -> Shear:
     """Move the object by `motion` (dx mm, dy mm, dtheta rad about `centre` mm) under the pressure of `contact`.
 
     `state` is that of the previous frame, or None at rest. The traction starts from it, so a reversed motion leaves a
@@ -63,12 +87,15 @@ def shear_step(
     pressure = contact.pressure
     dtype = pressure.dtype
     state = at_rest((pressure.shape[0], pressure.shape[1]), dtype) if state is None else state
-    pitch, friction = jnp.asarray(pitch, dtype), jnp.asarray(friction, dtype)
+    pitch = jnp.asarray(pitch, dtype)
+    friction = jnp.asarray(friction, dtype)
     share = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(modulus_object, dtype))
-    unit = jnp.asarray(gel.plane, dtype) * share / pitch  # kPa of traction per mm
+    # kPa of traction per mm
+    unit = jnp.asarray(gel.plane, dtype) * share / pitch
     plan = grids(pressure.shape)[-1] if fidelity == "fast" else Plan(*pressure.shape)
     times = pressure.shape[0] // plan.rows
-    load, before = _pooled(pressure, times), _pooled(state.traction, times) / unit * times
+    load = _pooled(pressure, times)
+    before = _pooled(state.traction, times) / unit * times
     spectra = tangential_spectra(plan, pitch * times, gel.poisson, gel.thickness, share, dtype)
     apply = _compliance(plan, spectra)
     limit = jnp.where(load > 0, friction * load, 0) / unit * times
@@ -84,8 +111,16 @@ def shear_step(
     scale = jnp.where(scale > 0, scale, 1)
     most = iterations or (6 if fidelity == "fast" else 400)
     # Solved for the step, not the total: rounding of a large traction would lose a small step.
-    solution = descent(apply, within, moved, start, most, tolerance=None if fidelity == "fast" else tolerance * scale)
-    total = jnp.where((limit > 0)[..., None], before + solution.x, 0)  # exactly zero without pressure
+    solution = descent(
+        apply,
+        within,
+        moved,
+        start,
+        most,
+        tolerance=None if fidelity == "fast" else tolerance * scale,
+    )
+    # exactly zero without pressure
+    total = jnp.where((limit > 0)[..., None], before + solution.x, 0)
     displacement = apply(total)
     if not is_infinite(modulus_object):  # minus the object's part
         deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
@@ -99,7 +134,15 @@ def shear_step(
     residual = solution.residual / scale
     force, torque, fraction = _totals(traction, slipping, pressure, pitch)
     return Shear(
-        traction, displacement, slipping, fraction, force, torque, residual <= tolerance, solution.iterations, residual
+        traction,
+        displacement,
+        slipping,
+        fraction,
+        force,
+        torque,
+        residual <= tolerance,
+        solution.iterations,
+        residual,
     )
 
 
@@ -107,7 +150,9 @@ def _check(contact: PressResult, pitch: Any, friction: Any, fidelity: str) -> No
     if fidelity not in ("exact", "fast"):
         raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
     if jnp.ndim(contact.pressure) != 2:
-        raise UserError(f"shear_step takes one contact, not pressures {jnp.shape(contact.pressure)}; use jax.vmap")
+        raise UserError(
+            f"shear_step takes one contact, not pressures {jnp.shape(contact.pressure)}; use jax.vmap"
+        )
     if not isinstance(pitch, jax.core.Tracer) and not np.all(np.asarray(pitch) > 0):
         raise UserError(f"pitch must be above 0 mm, not {pitch}")
     if not isinstance(friction, jax.core.Tracer) and not np.all(np.asarray(friction) >= 0):
@@ -118,7 +163,8 @@ def _compliance(plan: Plan, spectra: Array) -> Compliance:
     xx, xy, yy = spectra
 
     def apply(traction: Array) -> Array:
-        x, y = plan.forward(traction[..., 0]), plan.forward(traction[..., 1])
+        x = plan.forward(traction[..., 0])
+        y = plan.forward(traction[..., 1])
         moved_x = plan.inverse(plan.even(x, xx) + plan.odd(y, xy))
         return jnp.stack([moved_x, plan.inverse(plan.odd(x, xy) + plan.even(y, yy))], -1)
 
@@ -128,7 +174,9 @@ def _compliance(plan: Plan, spectra: Array) -> Compliance:
 def _rigid(plan: Plan, pitch: Array, motion: Array, centre: Array) -> Array:
     """Return the displacement (H, W, 2) mm by `motion` (dx, dy, dtheta)."""
     x, y = positions((plan.rows, plan.columns), pitch)
-    return jnp.stack([motion[0] - motion[2] * (y - centre[1]), motion[1] + motion[2] * (x - centre[0])], -1)
+    return jnp.stack(
+        [motion[0] - motion[2] * (y - centre[1]), motion[1] + motion[2] * (x - centre[0])], -1
+    )
 
 
 def _length(field: Array) -> Array:
@@ -140,7 +188,9 @@ def _length(field: Array) -> Array:
 def _returned(traction: Array, limit: Array) -> Array:
     """Return the nearest traction within Coulomb's limit (radial return)."""
     length = _length(traction)
-    return traction * jnp.where(length > limit, limit / jnp.where(length > 0, length, 1), 1)[..., None]
+    return (
+        traction * jnp.where(length > limit, limit / jnp.where(length > 0, length, 1), 1)[..., None]
+    )
 
 
 def _stiffness(touching: Array, poisson: float) -> Array:
@@ -156,10 +206,14 @@ def _pooled(field: Array, times: int) -> Array:
 
 
 def _repeated(field: Array, times: int) -> Array:
-    return field if times == 1 else jnp.repeat(jnp.repeat(field, times, 0), times, 1)
+    if times == 1:
+        return field
+    return jnp.repeat(jnp.repeat(field, times, 0), times, 1)
 
 
-def _totals(traction: Array, slipping: Array, pressure: Array, pitch: Array) -> tuple[Array, Array, Array]:
+def _totals(
+    traction: Array, slipping: Array, pressure: Array, pitch: Array
+) -> tuple[Array, Array, Array]:
     """Return force (2,) N, torque N mm about the centre of pressure, and the slipping share of the contact's area."""
     x, y = positions((pressure.shape[0], pressure.shape[1]), pitch)
     middle = centroid(pressure, pitch)

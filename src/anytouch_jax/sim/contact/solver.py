@@ -16,7 +16,8 @@ from jax import Array
 Compliance = Callable[[Array], Array]
 Projection = Callable[[Array], Array]
 
-OWN = 1.122  # coefficient of a pixel on itself, 4 ln(1 + sqrt 2) / pi, the compliance of the shortest waves
+# coefficient of a pixel on itself, 4 ln(1 + sqrt 2) / pi, the compliance of the shortest waves
+OWN = 1.122
 
 
 class Solution(NamedTuple):
@@ -48,10 +49,18 @@ def conjugate_gradients(
     excess = apply(start) - target
     zero = jnp.zeros((), target.dtype)
     state = _Conjugate(
-        start, excess, 0 * target, zero, zero > 0, complementarity(start, excess), jnp.zeros((), jnp.int32)
+        start,
+        excess,
+        0 * target,
+        zero,
+        zero > 0,
+        complementarity(start, excess),
+        jnp.zeros((), jnp.int32),
     )
     state = jax.lax.while_loop(
-        lambda s: (s.residual > tolerance) & (s.iterations < iterations), lambda s: _round(apply, target, s), state
+        lambda s: (s.residual > tolerance) & (s.iterations < iterations),
+        lambda s: _round(apply, target, s),
+        state,
     )
     return Solution(state.pressure, state.excess, state.residual, state.iterations)
 
@@ -74,7 +83,9 @@ def _round(apply: Compliance, target: Array, state: _Conjugate) -> _Conjugate:
     pressure = jnp.where(overlap, -step * state.excess, pressure)
     excess = apply(pressure) - target
     residual = complementarity(pressure, excess)
-    return _Conjugate(pressure, excess, direction, squared, ~jnp.any(overlap), residual, state.iterations + 1)
+    return _Conjugate(
+        pressure, excess, direction, squared, ~jnp.any(overlap), residual, state.iterations + 1
+    )
 
 
 class _Descent(NamedTuple):
@@ -109,7 +120,8 @@ def descent(
         bent_by = apply(way)
         bent = jnp.sum(way * bent_by)
         share = jnp.clip(ratio(-jnp.sum(s.excess * way), bent, 0.0), 0, 1)
-        x, excess = s.x + share * way, s.excess + share * bent_by
+        x = s.x + share * way
+        excess = s.excess + share * bent_by
         step = ratio(jnp.sum(way * way), bent, 1 / OWN)
         change = s.residual if tolerance is None else residual(x, excess)
         return _Descent(x, excess, step, change, s.iterations + 1)
@@ -122,7 +134,9 @@ def descent(
         state = jax.lax.fori_loop(0, iterations, lambda _, s: advance(s), state)
         state = state._replace(residual=residual(state.x, state.excess))
     else:
-        state = jax.lax.while_loop(lambda s: (s.residual > tolerance) & (s.iterations < iterations), advance, state)
+        state = jax.lax.while_loop(
+            lambda s: (s.residual > tolerance) & (s.iterations < iterations), advance, state
+        )
     return Solution(state.x, state.excess, state.residual, state.iterations)
 
 

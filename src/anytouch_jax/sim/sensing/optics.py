@@ -19,7 +19,16 @@ import numpy as np
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact.mechanics import KPA_MM2, Gel
-from anytouch_jax.sim.sensing.sensors import DEGREE, POWERS, Markers, Photometry, Sensor, Unit, look, rotated
+from anytouch_jax.sim.sensing.sensors import (
+    DEGREE,
+    POWERS,
+    Markers,
+    Photometry,
+    Sensor,
+    Unit,
+    look,
+    rotated,
+)
 
 Array = jax.Array
 Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: value, slope
@@ -48,13 +57,16 @@ def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
     return round(sensor.field[0] * scale), round(sensor.field[1] * scale)
 
 
-def picture_view(sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False) -> PictureView:
+def picture_view(
+    sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False
+) -> PictureView:
     """Return the part of the field in an image of (height, width): the largest of its shape, zoomed and mirrored.
 
     If `stretched`, the whole field fills the image, whose pixels need not be square: what `encoder.preprocess` makes.
     """
     height, width = resolution
-    tall, wide = sensor.field[0] / height, sensor.field[1] / width
+    tall = sensor.field[0] / height
+    wide = sensor.field[1] / width
     if not stretched:
         tall = wide = min(tall, wide)
     x = unit.window[0] + unit.mirror[0] * unit.zoom * wide * (jnp.arange(width) + 0.5 - width / 2)
@@ -64,20 +76,26 @@ def picture_view(sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, str
 
 
 def backdrop(
-    sensor: Sensor, unit: Unit, resolution: tuple[int, int] | None = None, *, stretched: bool = False
+    sensor: Sensor,
+    unit: Unit,
+    resolution: tuple[int, int] | None = None,
+    *,
+    stretched: bool = False,
 ) -> Array:
     """Return the untouched image of a unit without markers and noise, f32 (3, H, W) in 0..1.
 
     Pass it to `render` as `behind` if many frames of one unit are rendered outside of one `vmap`.
     """
     resolution = resolution or picture_size(sensor)
-    place, shape = picture_view(sensor, unit, resolution, stretched=stretched), unit.base.shape
+    place = picture_view(sensor, unit, resolution, stretched=stretched)
+    shape = unit.base.shape
     rows = interpolation.spline((place.v + 1) / 2 * shape[0] - 0.5, shape[0])[0]
     columns = interpolation.spline((place.u + 1) / 2 * shape[1] - 0.5, shape[1])[0]
     image = jnp.einsum("ih,hwc,jw->cij", rows, unit.base, columns)
     bits = _pixel_bits(jax.random.key(unit.grain[1].astype(jnp.uint32)), resolution)
     grain = unit.grain[0] / 255 * _noise(bits)
-    u0, v0, radius, *absorbed = jnp.split(unit.specks, 6, 1)  # dirt and wear
+    # dirt and wear
+    u0, v0, radius, *absorbed = jnp.split(unit.specks, 6, 1)
     across = jnp.exp(-0.5 * ((place.x[None] - u0 * sensor.field[1] / 2) / radius) ** 2)
     along = jnp.exp(-0.5 * ((place.y[None] - v0 * sensor.field[0] / 2) / radius) ** 2)
     left = 1 - jnp.einsum("ki,kc,kj->cij", along, jnp.concatenate(absorbed, 1), across)
@@ -87,16 +105,26 @@ def backdrop(
 
 def _light(uneven: Array, tint: Array, place: PictureView, sensor: Sensor) -> Array:
     """Return the light (H, W) of one colour, relative to the nominal one. It falls on dents as on the untouched gel."""
-    u, v = place.u[None, :], place.v[:, None]
+    u = place.u[None, :]
+    v = place.v[:, None]
     relative = 1 + u * (uneven[0] + u * uneven[2] + v * uneven[3]) + v * (uneven[1] + v * uneven[4])
     return tint * relative * (1 - sensor.vignette * (u**2 + v**2) / 2)
 
 
 def render(
-    displacement: Array | None, tangential: Array | None, pitch: float | Array, sensor: Sensor, unit: Unit,
-    key: Array | None = None, *, resolution: tuple[int, int] | None = None, photometry: Photometry | None = None,
-    behind: Array | None = None, drift: Array | None = None, stretched: bool = False,
-) -> Array:  # fmt: skip
+    displacement: Array | None,
+    tangential: Array | None,
+    pitch: float | Array,
+    sensor: Sensor,
+    unit: Unit,
+    key: Array | None = None,
+    *,
+    resolution: tuple[int, int] | None = None,
+    photometry: Photometry | None = None,
+    behind: Array | None = None,
+    drift: Array | None = None,
+    stretched: bool = False,
+) -> Array:
     """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
 
     The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
@@ -109,7 +137,11 @@ def render(
     resolution = resolution or picture_size(sensor)
     place = picture_view(sensor, unit, resolution, stretched=stretched)
     photometry = look(sensor) if photometry is None else photometry
-    change = (lambda c: 0.0) if displacement is None else _shading(displacement, pitch, sensor, unit, photometry, place)
+    change = (
+        (lambda c: 0.0)
+        if displacement is None
+        else _shading(displacement, pitch, sensor, unit, photometry, place)
+    )
     ink = None
     if sensor.markers is not None:
         grid = None if displacement is None else displacement.shape
@@ -122,7 +154,12 @@ def render(
         if ink is not None:
             image = image + ink * (c["ink"] * light - image)
         if drift is not None:
-            image = image * (1 + c["drift"][0] + c["drift"][1] * place.u[None, :] + c["drift"][2] * place.v[:, None])
+            image = image * (
+                1
+                + c["drift"][0]
+                + c["drift"][1] * place.u[None, :]
+                + c["drift"][2] * place.v[:, None]
+            )
         noise = 0.0 if bits is None else unit.noise * _noise(bits >> c["shift"])
         return jnp.round(jnp.clip(255 * image + noise, 0, 255)).astype(jnp.uint8)
 
@@ -130,13 +167,21 @@ def render(
         behind = backdrop(sensor, unit, resolution, stretched=stretched)
     # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU backend cannot fuse the
     # arithmetic into the transpose, whose inner loop over three channels is not vectorised (six times slower).
-    planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift)).astype(jnp.uint32)
-    packed = planes[0] | planes[1] << 8 | planes[2] << 16  # a transposition of bytes would take longer than a channel
+    planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift)).astype(
+        jnp.uint32
+    )
+    # a transposition of bytes would take longer than a channel
+    packed = planes[0] | planes[1] << 8 | planes[2] << 16
     return jax.lax.bitcast_convert_type(packed, jnp.uint8)[..., :3]
 
 
 def _shading(
-    displacement: Array, pitch: Any, sensor: Sensor, unit: Unit, photometry: Photometry, place: PictureView
+    displacement: Array,
+    pitch: Any,
+    sensor: Sensor,
+    unit: Unit,
+    photometry: Photometry,
+    place: PictureView,
 ) -> Callable[[dict[str, Array]], Array]:
     """Return the change (H, W) of one channel by the dent, as a function of the channel's numbers."""
     matrices = _resample(displacement.shape, pitch, place)
@@ -149,14 +194,17 @@ def _shading(
     lit = (*rotated(*_slopes(soft, matrices, pitch), unit.light_angle), depth)
     glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
     return lambda c: (
-        colour_change(c["normal"], nx, ny, place.u, place.v) + halo_change(c["halo"], glow, place.u, place.v)
+        colour_change(c["normal"], nx, ny, place.u, place.v)
+        + halo_change(c["halo"], glow, place.u, place.v)
     )
 
 
 def tilt(slope_x: Array, slope_y: Array, steepest: float | Array) -> tuple[Array, Array]:
     """Return slopes (mm/mm) over the length of their normal, which are sines of the tilt, cut to length `steepest`."""
     square = slope_x**2 + slope_y**2
-    scale = jnp.minimum(jax.lax.rsqrt(1.0 + square), steepest * jax.lax.rsqrt(jnp.maximum(square, 1e-12)))
+    scale = jnp.minimum(
+        jax.lax.rsqrt(1.0 + square), steepest * jax.lax.rsqrt(jnp.maximum(square, 1e-12))
+    )
     return slope_x * scale, slope_y * scale
 
 
@@ -166,7 +214,9 @@ def colour_change(normal: Array, nx: Array, ny: Array, u: Array, v: Array) -> Ar
     `normal` (20, 6) is that channel of `Photometry.normal`, and `u` (W,) and `v` (H,) are places in -1..1. It is
     Horner's scheme in nx over Horner's scheme in ny. Every coefficient is a quadric of the place.
     """
-    index, u, v = {power: k for k, power in enumerate(POWERS)}, u[None, :], v[:, None]
+    index = {power: k for k, power in enumerate(POWERS)}
+    u = u[None, :]
+    v = v[:, None]
 
     def coefficient(i: int, j: int) -> Array:
         c0, cu, cv, cuu, cuv, cvv = normal[index[i, j]]
@@ -187,7 +237,8 @@ def halo_change(halo: Array, features: tuple[Array, ...], u: Array, v: Array) ->
     `halo` (3, 3) is that channel of `Photometry.halo`.
     """
     terms = [
-        feature * (halo[k, 0] + u[None, :] * halo[k, 1] + v[:, None] * halo[k, 2]) for k, feature in enumerate(features)
+        feature * (halo[k, 0] + u[None, :] * halo[k, 1] + v[:, None] * halo[k, 2])
+        for k, feature in enumerate(features)
     ]
     return terms[0] + terms[1] + terms[2]
 
@@ -198,11 +249,16 @@ def _channels(
     """Return the inputs that differ between colour channels, each with a leading axis of three."""
     ink = sensor.markers.ink if sensor.markers else (0.0, 0.0, 0.0)
     return {
-        "normal": jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0), "behind": behind, "ink": jnp.asarray(ink),
-        "halo": jnp.moveaxis(jnp.asarray(photometry.halo), -1, 0), "gain": unit.gain, "tint": unit.tint,
-        "uneven": unit.uneven.T, "drift": jnp.zeros((3, 3)) if drift is None else drift.T,
+        "normal": jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0),
+        "behind": behind,
+        "ink": jnp.asarray(ink),
+        "halo": jnp.moveaxis(jnp.asarray(photometry.halo), -1, 0),
+        "gain": unit.gain,
+        "tint": unit.tint,
+        "uneven": unit.uneven.T,
+        "drift": jnp.zeros((3, 3)) if drift is None else drift.T,
         "shift": jnp.array([0, 10, 20], jnp.uint32),
-    }  # fmt: skip
+    }
 
 
 def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: Any) -> Array:
@@ -211,9 +267,16 @@ def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: 
 
 
 def onto_picture(
-    maps: Array, *, pitch: Any, sensor: Sensor, unit: Unit, resolution: tuple[int, int], vectors: bool = False,
-    stretched: bool = False, grid: tuple[int, int] | None = None,
-) -> Array:  # fmt: skip
+    maps: Array,
+    *,
+    pitch: Any,
+    sensor: Sensor,
+    unit: Unit,
+    resolution: tuple[int, int],
+    vectors: bool = False,
+    stretched: bool = False,
+    grid: tuple[int, int] | None = None,
+) -> Array:
     """Resample maps (..., h, w, C) of the solve grid at the pixels of a unit's image of (height, width).
 
     With `vectors`, the two channels are x and y of a vector, which is mirrored with the image. `grid` is the size of
@@ -222,7 +285,9 @@ def onto_picture(
     place = picture_view(sensor, unit, resolution, stretched=stretched)
     ay, ax = _enlarging(maps.shape[-3:-1], grid, pitch, place)
     mapped = jnp.einsum("ih,...hwc,jw->...ijc", ay, maps, ax)
-    return mapped * unit.mirror.reshape((1,) * (mapped.ndim - 1) + (2,)) if vectors else mapped
+    if vectors:
+        return mapped * unit.mirror.reshape((1,) * (mapped.ndim - 1) + (2,))
+    return mapped
 
 
 def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrices:
@@ -231,14 +296,19 @@ def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrice
     return *rows, *interpolation.spline(place.x / pitch + (shape[1] - 1) / 2, shape[1])
 
 
-def _enlarging(shape: tuple[int, ...], grid: Any, pitch: Any, place: PictureView) -> tuple[Array, Array]:
+def _enlarging(
+    shape: tuple[int, ...], grid: Any, pitch: Any, place: PictureView
+) -> tuple[Array, Array]:
     """Return the value matrices from a map of `shape`, on a grid of (rows, columns) with `pitch` or a coarser one."""
     grid = grid or shape
     ay, _, ax, _ = _resample(grid, pitch, place)
     if shape[:2] == grid[:2]:
         return ay, ax
     # One product of small matrices, and not a large map between them.
-    wide = [jax.image.resize(jnp.eye(n), (most, n), "cubic") for n, most in zip(shape[:2], grid[:2], strict=True)]
+    wide = [
+        jax.image.resize(jnp.eye(n), (most, n), "cubic")
+        for n, most in zip(shape[:2], grid[:2], strict=True)
+    ]
     return ay @ wide[0], ax @ wide[1]
 
 
@@ -254,21 +324,33 @@ def _blurred(field: Array, sigma: Any) -> Array:
 
 
 def _ink(
-    tangential: Array | None, grid: Any, pitch: Any, place: PictureView, ink: Markers, sensor: Sensor, unit: Unit
+    tangential: Array | None,
+    grid: Any,
+    pitch: Any,
+    place: PictureView,
+    ink: Markers,
+    sensor: Sensor,
+    unit: Unit,
 ) -> Array:
     """Return the share of ink (H, W): the lattice at the undeformed places of the skin at the pixels."""
-    x, y = (jnp.broadcast_to(a, (len(place.y), len(place.x))) for a in (place.x[None, :], place.y[:, None]))
+    x, y = (
+        jnp.broadcast_to(a, (len(place.y), len(place.x)))
+        for a in (place.x[None, :], place.y[:, None])
+    )
     if tangential is not None:
         ay, ax = _enlarging(tangential.shape, grid, pitch, place)
         x = x - ay @ tangential[..., 0] @ ax.T
         y = y - ay @ tangential[..., 1] @ ax.T
     soft = 1.5 * jnp.abs(place.x[1] - place.x[0]) + 2 * unit.focus
     half = jnp.hypot(*sensor.field) / 2
-    x, y = x / unit.marker_pitch, y / unit.marker_pitch
+    x = x / unit.marker_pitch
+    y = y / unit.marker_pitch
     return ink_coverage(ink, x, y, unit.marker_phase, unit.marker_size, soft, half)
 
 
-def ink_coverage(markers: Markers, x: Array, y: Array, phase: Array, size: Array, soft: Array, half: Any) -> Array:
+def ink_coverage(
+    markers: Markers, x: Array, y: Array, phase: Array, size: Array, soft: Array, half: Any
+) -> Array:
     """Return the share of ink (H, W), 0..1, at places with *undeformed* coordinates `x`, `y` (H, W) mm.
 
     Spots lie on a lattice and differ a little in size, as printed spots do. `phase` (2,) is in lattice steps, `size` a
@@ -276,10 +358,14 @@ def ink_coverage(markers: Markers, x: Array, y: Array, phase: Array, size: Array
     """
     bends = is_traced(markers.bend) or markers.bend
     grow = 1.0 - markers.bend * (1.0 - (x**2 + y**2) / half**2) if bends else 1.0
-    column, row = x * grow / markers.pitch - phase[0], y * grow / markers.pitch - phase[1]
-    i, j = jnp.floor(column + 0.5), jnp.floor(row + 0.5)
-    dx, dy = (column - i) * (markers.pitch / markers.aspect), (row - j) * markers.pitch
-    scatter = 0.754877 * i + 0.569840 * j  # no visible order (plastic number), and cheaper than a sine
+    column = x * grow / markers.pitch - phase[0]
+    row = y * grow / markers.pitch - phase[1]
+    i = jnp.floor(column + 0.5)
+    j = jnp.floor(row + 0.5)
+    dx = (column - i) * (markers.pitch / markers.aspect)
+    dy = (row - j) * markers.pitch
+    # no visible order (plastic number), and cheaper than a sine
+    scatter = 0.754877 * i + 0.569840 * j
     radius = markers.radius * size * (0.88 + 0.24 * (scatter - jnp.floor(scatter)))
     distance = jnp.sqrt(dx**2 + dy**2 + 1e-12)
     return jnp.clip((radius - distance) / soft + 0.5, 0.0, 1.0)
@@ -297,7 +383,10 @@ def _pixel_bits(key: Array, shape: tuple[int, int]) -> Array:
     """
     step = jnp.uint32(0x9E3779B9)
     first, second = _mixed(jax.random.key_data(key) + step)
-    return _mixed(_mixed(jnp.arange(shape[0] * shape[1], dtype=jnp.uint32).reshape(shape) * step + first) ^ second)
+    return _mixed(
+        _mixed(jnp.arange(shape[0] * shape[1], dtype=jnp.uint32).reshape(shape) * step + first)
+        ^ second
+    )
 
 
 def _mixed(word: Array) -> Array:
@@ -309,13 +398,23 @@ def _mixed(word: Array) -> Array:
 
 def _noise(bits: Array) -> Array:
     """Return noise of zero mean and unit variance from the lowest ten bits of each word: ten coin tosses."""
-    return (jax.lax.population_count(bits & jnp.uint32(1023)).astype(jnp.float32) - 5) / np.sqrt(2.5)
+    return (jax.lax.population_count(bits & jnp.uint32(1023)).astype(jnp.float32) - 5) / np.sqrt(
+        2.5
+    )
 
 
 def measure_field(
-    displacement: Array, tangential: Array, pressure: Array, traction: Array, pitch: Any, points: int = 20, *,
-    noise: Any = 0.0, gel: Gel | None = None, key: Array | None = None,
-) -> Array:  # fmt: skip
+    displacement: Array,
+    tangential: Array,
+    pressure: Array,
+    traction: Array,
+    pitch: Any,
+    points: int = 20,
+    *,
+    noise: Any = 0.0,
+    gel: Gel | None = None,
+    key: Array | None = None,
+) -> Array:
     """Return the measurement of a field sensor, f32 (points, points, 6): displacement x, y, z mm, force x, y, z N.
 
     Inputs on the solve grid are `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h, w) kPa, `traction`
@@ -326,7 +425,9 @@ def measure_field(
     """
     shape = displacement.shape
     if not shape == pressure.shape == tangential.shape[:2] == traction.shape[:2]:
-        raise UserError(f"displacement {shape}, pressure {pressure.shape} and the tangential maps must have one size")
+        raise UserError(
+            f"displacement {shape}, pressure {pressure.shape} and the tangential maps must have one size"
+        )
     maps = jnp.concatenate([tangential, displacement[..., None], traction, pressure[..., None]], -1)
     rows, columns = (jnp.asarray(interpolation.average(n, points)) for n in shape)
     means = jnp.einsum("ih,hwc,jw->ijc", rows, maps, columns)

@@ -16,15 +16,31 @@ from typing import Annotated, Any
 import numpy as np
 
 from anytouch_jax.config import OWN_SENSOR
-from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check, parse_json, read_value
+from anytouch_jax.config.parsing import (
+    Above0,
+    Finite,
+    NotNegative,
+    Range,
+    check,
+    parse_json,
+    read_value,
+)
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, read_arrays
 from anytouch_jax.sim.contact.mechanics import Gel
 from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Photometry, Sensor
 
-NUMBERS, ARRAYS = "sensor.json", "look.npz"
+NUMBERS = "sensor.json"
+ARRAYS = "look.npz"
 MM = Range(4, 40, "4 to 40 mm")
-SHAPES = {"bases": (0, 0, 0, 3), "normal": (20, 6, 3), "halo": (3, 3, 3), "steepest": (), "widest": (3,)}  # 0: any
+# 0: any
+SHAPES = {
+    "bases": (0, 0, 0, 3),
+    "normal": (20, 6, 3),
+    "halo": (3, 3, 3),
+    "steepest": (),
+    "widest": (3,),
+}
 
 
 @dataclass(frozen=True)
@@ -45,7 +61,8 @@ class OwnSensor:
     skin_mm: NotNegative[float] = 0.1  # smallest detail that the coating passes
     halo_mm: Above0[float] = 1.0  # width of the soft shadow
     contrast: Finite[float] = 1.0  # of dents, over that of the pictures
-    spread: Annotated[float, Range(0, 1, "0 to 1")] = 0.3  # variation of simulated devices: 1 is that of a product
+    # variation of simulated devices: 1 is that of a product
+    spread: Annotated[float, Range(0, 1, "0 to 1")] = 0.3
     sure: dict = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -66,7 +83,9 @@ def find_sensor(word: str) -> Sensor:
 
 def sensor_number(sensor: Sensor) -> int:
     """Return the number that separates the random streams of sensors."""
-    return list(SENSORS).index(sensor.name) if sensor.name in SENSORS else zlib.crc32(sensor.name.encode())
+    if sensor.name in SENSORS:
+        return list(SENSORS).index(sensor.name)
+    return zlib.crc32(sensor.name.encode())
 
 
 def read_numbers(folder: str | Path) -> OwnSensor:
@@ -75,7 +94,9 @@ def read_numbers(folder: str | Path) -> OwnSensor:
     try:
         numbers: OwnSensor = read_value(OwnSensor, parse_json(file.read_bytes()), "sensor")
     except OSError as error:
-        raise UserError(f"{file}: {error.strerror}. Make the sensor with `anytouch sensor fit`.") from None
+        raise UserError(
+            f"{file}: {error.strerror}. Make the sensor with `anytouch sensor fit`."
+        ) from None
     except UserError as error:
         raise UserError(f"{file}: {error}") from None
     if numbers.name in SENSORS:
@@ -86,15 +107,24 @@ def read_numbers(folder: str | Path) -> OwnSensor:
 def read_sensor(folder: str | Path) -> Sensor:
     """Return the sensor of a folder NAME.sensor. Raises UserError for a missing or damaged file."""
     path = Path(folder).expanduser().resolve()
-    one, file = read_numbers(path), path / ARRAYS
+    one = read_numbers(path)
+    file = path / ARRAYS
     if fault := _fault(file, file.stat().st_mtime_ns if file.is_file() else 0):
         raise UserError(f"{file}: {fault}. Fit the sensor again.")
     return Sensor(
-        one.name, (one.height_mm, one.width_mm), one.pixels,
-        Gel(modulus=one.modulus_kpa, poisson=0.48, thickness=one.thickness_mm), one.dots, skin=one.skin_mm,
-        contrast=one.contrast, halo=one.halo_mm, noise=one.noise, spread=one.spread, arrays=str(file),
+        one.name,
+        (one.height_mm, one.width_mm),
+        one.pixels,
+        Gel(modulus=one.modulus_kpa, poisson=0.48, thickness=one.thickness_mm),
+        one.dots,
+        skin=one.skin_mm,
+        contrast=one.contrast,
+        halo=one.halo_mm,
+        noise=one.noise,
+        spread=one.spread,
+        arrays=str(file),
         version=file.stat().st_mtime_ns,
-    )  # fmt: skip
+    )
 
 
 @lru_cache(maxsize=16)
@@ -106,15 +136,20 @@ def _fault(file: Path, _: int) -> str:
         return str(getattr(error, "strerror", None) or error)
     for name, shape in SHAPES.items():
         array = arrays.get(name, np.zeros(0))
-        fits = array.ndim == len(shape) and all(b in (0, a) for a, b in zip(array.shape, shape, strict=True))
+        fits = array.ndim == len(shape) and all(
+            b in (0, a) for a, b in zip(array.shape, shape, strict=True)
+        )
         if not fits or not np.isfinite(array).all() or not 0 < array.size < 1 << 20:
             return f"the array {name} is missing, or has another shape than {shape}"
-    return "" if len(arrays["bases"]) <= MOST_BASES else f"more than {MOST_BASES} untouched gels"
+    if len(arrays["bases"]) <= MOST_BASES:
+        return ""
+    return f"more than {MOST_BASES} untouched gels"
 
 
 def write_sensor(folder: str | Path, numbers: OwnSensor, bases: Any, look: Photometry) -> Path:
     """Write a folder NAME.sensor, with untouched gels u8 (n, h, w, 3), and return it."""
-    path, data = Path(folder), io.BytesIO()
+    path = Path(folder)
+    data = io.BytesIO()
     arrays = {name: np.asarray(value, np.float32) for name, value in look._asdict().items()}
     np.savez(data, allow_pickle=False, bases=np.asarray(bases, np.uint8), **arrays)
     atomic_write(path / ARRAYS, data.getvalue())

@@ -13,7 +13,8 @@ from anytouch_jax.sim.world.objects import Object
 from anytouch_jax.sim.world.shapes import Shape, base, floor, layers, unroll
 
 Image = npt.NDArray[np.float32]  # (H, W) or (H, W, 3)
-Planes = tuple[Image, Image, Image]  # x, y, z or red, green, blue: separate planes are faster than a last axis of 3
+# x, y, z or red, green, blue: separate planes are faster than a last axis of 3
+Planes = tuple[Image, Image, Image]
 EXTENT = (30.0, 40.0)  # mm across the image
 
 
@@ -34,25 +35,35 @@ def seeded_photograph(job: tuple[Object, Any, Sequence[int]], size: int) -> np.n
     return photograph(thing, place, rng, size)
 
 
-def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224) -> np.ndarray:
+def photograph(
+    thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224
+) -> np.ndarray:
     """Return an RGB photograph u8 (size, size, 3) of the object around `place_mm` (x, y) mm in its frame.
 
     The place is in the middle of 30 to 40 mm. `rng` draws view, light and background.
     """
     place = np.asarray(place_mm, np.float64)
-    shape, view = thing.shape, _draw_view(rng)
+    shape = thing.shape
+    view = _draw_view(rng)
     x, y, z, ray = _trace(shape, place, view, size)
     on_table = z <= floor(shape) + 0.25
     texture, grain = _fine(shape, x, y, ~on_table)
-    normal = _normals(x, y, z - shape.texture_depth * (1 - texture) - shape.grain_depth * (1 - grain))
+    normal = _normals(
+        x, y, z - shape.texture_depth * (1 - texture) - shape.grain_depth * (1 - grain)
+    )
     lit = np.clip(_dot(normal, view.light), 0, 1) * (1 - 0.75 * _shadow(shape, x, y, z, view.light))
     millimetre = size / view.extent
-    dip = np.clip(_blur(z, 1.2 * millimetre) - z, 0, 0.8)  # light does not reach into corners
+    # light does not reach into corners
+    dip = np.clip(_blur(z, 1.2 * millimetre) - z, 0, 0.8)
     ambient = (1 - 0.45 * min(1.0, shape.texture_depth / 0.3) * (1 - texture)) * (1 - 0.7 * dip)
     ambient *= 0.55 + 0.45 * normal[2]
-    mottle, blotch = thing.material.mottle, _noise(rng, size, 10)
-    skin = (1 + 0.3 * mottle * (grain - 0.6) + 0.12 * mottle * blotch - 0.08 * (1 - texture)).astype(np.float32)
-    sky, sun = rng.uniform(0.25, 0.4), rng.uniform(0.5, 0.75)
+    mottle = thing.material.mottle
+    blotch = _noise(rng, size, 10)
+    skin = (
+        1 + 0.3 * mottle * (grain - 0.6) + 0.12 * mottle * blotch - 0.08 * (1 - texture)
+    ).astype(np.float32)
+    sky = rng.uniform(0.25, 0.4)
+    sun = rng.uniform(0.5, 0.75)
     lamp = (1.0, rng.uniform(0.88, 1.0), rng.uniform(0.75, 1.05))
     shine = np.where(on_table, np.float32(0), _shine(thing, normal, ray, view.light, lit))
     tint = thing.colour if thing.material.metallic else (1.0, 1.0, 1.0)
@@ -60,26 +71,38 @@ def photograph(thing: Object, place_mm: Any, rng: np.random.Generator, size: int
     for i, ground in enumerate(_table(rng, x, y, place)):
         colour = np.where(on_table, ground, skin * np.float32(thing.colour[i]))
         light = sky * ambient + (sun * lamp[i]) * lit
-        planes.append(colour * colour * light + tint[i] * shine)  # colours are gamma-encoded
+        # colours are gamma-encoded
+        planes.append(colour * colour * light + tint[i] * shine)
     return _develop(planes, rng)
 
 
 def _draw_view(rng: np.random.Generator) -> CameraView:
-    extent, turn = rng.uniform(*EXTENT), rng.uniform(-math.pi, math.pi)
-    tilt, roll = math.radians(rng.uniform(0, 38)), rng.uniform(-math.pi, math.pi)
+    extent = rng.uniform(*EXTENT)
+    turn = rng.uniform(-math.pi, math.pi)
+    tilt = math.radians(rng.uniform(0, 38))
+    roll = rng.uniform(-math.pi, math.pi)
     away = rng.uniform(1.8, 3.0) * extent
-    ahead = -np.asarray([math.sin(tilt) * math.cos(turn), math.sin(tilt) * math.sin(turn), math.cos(tilt)])
+    ahead = -np.asarray(
+        [math.sin(tilt) * math.cos(turn), math.sin(tilt) * math.sin(turn), math.cos(tilt)]
+    )
     right = np.cross(ahead, [math.cos(roll), math.sin(roll), 0.0])
     right /= np.linalg.norm(right)
-    lamp_turn, lamp_height = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(28, 55))
+    lamp_turn = rng.uniform(-math.pi, math.pi)
+    lamp_height = math.radians(rng.uniform(28, 55))
     flat = math.cos(lamp_height)
-    light = np.asarray([flat * math.cos(lamp_turn), flat * math.sin(lamp_turn), math.sin(lamp_height)])
+    light = np.asarray(
+        [flat * math.cos(lamp_turn), flat * math.sin(lamp_turn), math.sin(lamp_height)]
+    )
     # Rows and y both point down: from above, (right, down, ahead) has the handedness of (x, y, -z).
-    return CameraView(-away * ahead, np.stack([right, np.cross(right, ahead), ahead]), extent, light)
+    return CameraView(
+        -away * ahead, np.stack([right, np.cross(right, ahead), ahead]), extent, light
+    )
 
 
 def _remap(picture: Image, column: Image, row: Image) -> Image:
-    return np.asarray(cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.float32)
+    return np.asarray(
+        cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.float32
+    )
 
 
 def _blur(picture: Image, pixels: float) -> Image:
@@ -90,13 +113,17 @@ def _dot(a: Planes, b: Any) -> Image:
     return a[0] * np.float32(b[0]) + a[1] * np.float32(b[1]) + a[2] * np.float32(b[2])
 
 
-def _trace(shape: Shape, place: Any, view: CameraView, size: int) -> tuple[Image, Image, Image, Planes]:
+def _trace(
+    shape: Shape, place: Any, view: CameraView, size: int
+) -> tuple[Image, Image, Image, Planes]:
     """Return where the ray of each pixel meets the bare primitive (x, y, z mm in the object's frame), and unit rays."""
     axis = ((np.arange(size) + 0.5) / size - 0.5).astype(np.float32)
     focal = float(np.linalg.norm(view.eye)) / view.extent
     right, down, ahead = view.axes
     ray = [
-        axis[None, :] * np.float32(right[i]) + axis[:, None] * np.float32(down[i]) + np.float32(focal * ahead[i])
+        axis[None, :] * np.float32(right[i])
+        + axis[:, None] * np.float32(down[i])
+        + np.float32(focal * ahead[i])
         for i in range(3)
     ]
     lean_x: Image = ray[0] / ray[2]
@@ -109,13 +136,18 @@ def _trace(shape: Shape, place: Any, view: CameraView, size: int) -> tuple[Image
     def step(z: Image, every: int, share: float) -> Image:
         """Return one step to the fixed point of z = base(ray at z), damped for steep sides."""
         rough = [a[::every, ::every] for a in (x0, y0, lean_x, lean_y)]
-        return (1 - share) * z + share * base(shape, rough[0] + rough[2] * z, rough[1] + rough[3] * z)
+        return (1 - share) * z + share * base(
+            shape, rough[0] + rough[2] * z, rough[1] + rough[3] * z
+        )
 
     z = np.full(x0[::2, ::2].shape, top, np.float32)
     for _ in range(5):
         z = step(z, 2, 0.6)
-    z = step(np.asarray(cv2.resize(z, (size, size), interpolation=cv2.INTER_LINEAR), np.float32), 1, 0.6)
-    x, y = x0 + lean_x * z, y0 + lean_y * z
+    z = step(
+        np.asarray(cv2.resize(z, (size, size), interpolation=cv2.INTER_LINEAR), np.float32), 1, 0.6
+    )
+    x = x0 + lean_x * z
+    y = y0 + lean_y * z
     near: Image = 1 / np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
     return x, y, base(shape, x, y), (ray[0] * near, ray[1] * near, ray[2] * near)
 
@@ -128,11 +160,17 @@ def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tup
         return ones, ones
     u, v = unroll(shape, x, y)
     finest = min(shape.grain_pitch if shape.grain != "none" else math.inf, shape.texture_pitch)
-    step = float(np.clip(finest / 6, 0.15, 0.25))  # mm, about one pixel of a photograph of 224
-    axes, places = [], []
+    # mm, about one pixel of a photograph of 224
+    step = float(np.clip(finest / 6, 0.15, 0.25))
+    axes = []
+    places = []
     for at in (u, v):
-        low, high = (max(-80.0, min(80.0, float(end))) for end in (at[where].min(), at[where].max()))
-        axes.append((low - step + step * np.arange(math.ceil((high - low) / step) + 3)).astype(np.float32))
+        low, high = (
+            max(-80.0, min(80.0, float(end))) for end in (at[where].min(), at[where].max())
+        )
+        axes.append(
+            (low - step + step * np.arange(math.ceil((high - low) / step) + 3)).astype(np.float32)
+        )
         places.append((at - np.float32(low - step)) / np.float32(step))
     rows = range(0, len(axes[1]), 32)  # strips fit the cache: twice as fast
     strips = [layers(shape, axes[0][None, :], axes[1][row : row + 32, None]) for row in rows]
@@ -145,15 +183,21 @@ def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tup
 
 def _slope(plane: Image, right: int, down: int) -> Image:
     # Replicated borders halve all three components, so the normal keeps its direction there.
-    return np.asarray(cv2.Scharr(plane, cv2.CV_32F, right, down, borderType=cv2.BORDER_REPLICATE), np.float32)
+    return np.asarray(
+        cv2.Scharr(plane, cv2.CV_32F, right, down, borderType=cv2.BORDER_REPLICATE), np.float32
+    )
 
 
 def _normals(x: Image, y: Image, z: Image) -> Planes:
     """Return unit normals of the surface (x, y, z) over the pixels, facing up."""
     ax, ay, az = (_slope(p, 1, 0) for p in (x, y, z))
     bx, by, bz = (_slope(p, 0, 1) for p in (x, y, z))
-    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    scale = np.where(nz < 0, np.float32(-1), np.float32(1)) / np.sqrt(nx * nx + ny * ny + nz * nz + np.float32(1e-12))
+    nx = ay * bz - az * by
+    ny = az * bx - ax * bz
+    nz = ax * by - ay * bx
+    scale = np.where(nz < 0, np.float32(-1), np.float32(1)) / np.sqrt(
+        nx * nx + ny * ny + nz * nz + np.float32(1e-12)
+    )
     return nx * scale, ny * scale, nz * scale
 
 
@@ -177,11 +221,16 @@ def _noise(rng: np.random.Generator, size: int, cells: int) -> Image:
 
 def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -> Image:
     """Return highlights: those of the lamp, and on glossy objects the bright and dark sides of the room."""
-    gloss, metallic = thing.material.gloss, thing.material.metallic
+    gloss = thing.material.gloss
+    metallic = thing.material.metallic
     if gloss < 0.03:
         return np.zeros_like(lit)
     facing = 2 * _dot(ray, normal)
-    mirrored = (ray[0] - facing * normal[0], ray[1] - facing * normal[1], ray[2] - facing * normal[2])
+    mirrored = (
+        ray[0] - facing * normal[0],
+        ray[1] - facing * normal[1],
+        ray[2] - facing * normal[2],
+    )
     lamp = np.exp((8 + 80 * gloss) * (np.minimum(_dot(mirrored, light), 1) - 1)) * (lit > 0)
     room = 0.5 + 0.5 * np.sin(4 * mirrored[0] + 2.5 * mirrored[1] + 1)
     grazing = 1 - np.clip(mirrored[2], 0, 1)
@@ -191,7 +240,9 @@ def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -
 
 def _table(rng: np.random.Generator, x: Image, y: Image, place: Any) -> Planes:
     """Return red, green and blue of the table: planks, cloth or paper with clutter."""
-    side, span = 160, 110.0  # pixels, mm
+    # pixels, mm
+    side = 160
+    span = 110.0
     colour = rng.uniform(0.12, 0.85) * (1 + rng.uniform(-0.2, 0.2, 3))
     canvas = np.ones((side, side, 3), np.float32) * colour.astype(np.float32)
     for _ in range(int(rng.integers(0, 6))):
@@ -199,18 +250,34 @@ def _table(rng: np.random.Generator, x: Image, y: Image, place: Any) -> Planes:
         centre = rng.integers(0, side, 2)
         if rng.random() < 0.5:
             axes = rng.integers(6, 40, 2).tolist()
-            cv2.ellipse(canvas, centre.tolist(), axes, float(rng.uniform(0, 180)), 0, 360, ink, -1, cv2.LINE_AA)
+            cv2.ellipse(
+                canvas,
+                centre.tolist(),
+                axes,
+                float(rng.uniform(0, 180)),
+                0,
+                360,
+                ink,
+                -1,
+                cv2.LINE_AA,
+            )
         else:
             end = centre + rng.integers(-90, 90, 2)
-            cv2.line(canvas, centre.tolist(), end.tolist(), ink, int(rng.integers(2, 24)), cv2.LINE_AA)
+            cv2.line(
+                canvas, centre.tolist(), end.tolist(), ink, int(rng.integers(2, 24)), cv2.LINE_AA
+            )
     canvas = _blur(canvas, rng.uniform(0.6, 2.0))
     if rng.random() < 0.5:  # fibres
         cells = int(rng.integers(20, 60))
-        weft = np.asarray(cv2.resize(_noise(rng, side, cells), (6 * side, side))[:, :side], np.float32)
+        weft = np.asarray(
+            cv2.resize(_noise(rng, side, cells), (6 * side, side))[:, :side], np.float32
+        )
     else:
         weft = _noise(rng, side, 64)
     canvas *= 1 + np.float32(rng.uniform(0, 0.25)) * weft[..., None]
-    column, row = ((a - np.float32(b)) * (side / span) + side / 2 for a, b in ((x, place[0]), (y, place[1])))
+    column, row = (
+        (a - np.float32(b)) * (side / span) + side / 2 for a, b in ((x, place[0]), (y, place[1]))
+    )
     red, green, blue = (_remap(np.ascontiguousarray(canvas[..., i]), column, row) for i in range(3))
     return red, green, blue
 
@@ -219,11 +286,16 @@ def _develop(planes: Sequence[Image], rng: np.random.Generator) -> np.ndarray:
     """Apply exposure, vignette, blur, noise and gamma to red, green and blue. Returns u8 (H, W, 3)."""
     size = planes[0].shape[0]
     axis: Image = np.linspace(-1, 1, size, dtype=np.float32) ** 2
-    exposure = np.float32(rng.uniform(0.85, 1.15)) * (1 - np.float32(rng.uniform(0, 0.12)) * (axis[:, None] + axis))
-    noise = np.float32(255 * rng.uniform(0.004, 0.012)) * rng.standard_normal((size, size), dtype=np.float32)
+    exposure = np.float32(rng.uniform(0.85, 1.15)) * (
+        1 - np.float32(rng.uniform(0, 0.12)) * (axis[:, None] + axis)
+    )
+    noise = np.float32(255 * rng.uniform(0.004, 0.012)) * rng.standard_normal(
+        (size, size), dtype=np.float32
+    )
     channels = []
     for plane in planes:
         light = np.clip(_blur(plane * exposure, max(0.3, 0.6 * size / 224)), 0, None)
-        encoded = np.sqrt(light / (np.float32(0.75) + np.float32(0.35) * light))  # gamma, with a soft shoulder
+        # gamma, with a soft shoulder
+        encoded = np.sqrt(light / (np.float32(0.75) + np.float32(0.35) * light))
         channels.append(np.clip(255 * encoded + noise + np.float32(0.5), 0, 255).astype(np.uint8))
     return np.asarray(cv2.merge(channels), np.uint8)

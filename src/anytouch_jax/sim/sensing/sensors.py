@@ -36,7 +36,8 @@ class Markers:
     aspect: float = 1.0  # width over height of a spot
     share: float = 1.0  # of the units with markers
     ink: RGB = (0.08, 0.08, 0.08)
-    bend: float = 0.0  # lens distortion: the lattice shrinks outwards from pitch / (1 - bend) in the middle
+    # lens distortion: the lattice shrinks outwards from pitch / (1 - bend) in the middle
+    bend: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ class Sensor:
     # Tac3D's camera with 640 columns.
     noise: float = 1.0
     real: bool = True  # whether its look is that of real units
-    spread: float = 1.0  # of units, relative to a family's: 1 is also mirrored and cropped, less is one device
+    # of units, relative to a family's: 1 is also mirrored and cropped, less is one device
+    spread: float = 1.0
     arrays: str = ""  # .npz file of its look; "" is that of the package
     version: int = 0  # of that file, which may be written again
 
@@ -70,10 +72,14 @@ class Photometry(NamedTuple):
     over gradient bins (Taxim, Si and Yuan 2022). They are smooth, bounded, and exactly zero without contact.
     """
 
-    normal: Array | jax.Array  # (20, 6, 3), a colour for every power of the normal (`POWERS`) and of the position
-    halo: Array | jax.Array  # (3, 3, 3), soft shadow and light bleed, on slope and depth (1/mm) of the blurred dent
-    steepest: float | jax.Array  # largest sine of the tilt in the fit; steeper surfaces look like this one
-    widest: Array | jax.Array  # (3,), the same for the halo: a deep press all over is dark, but not black
+    # (20, 6, 3), a colour for every power of the normal (`POWERS`) and of the position
+    normal: Array | jax.Array
+    # (3, 3, 3), soft shadow and light bleed, on slope and depth (1/mm) of the blurred dent
+    halo: Array | jax.Array
+    # largest sine of the tilt in the fit; steeper surfaces look like this one
+    steepest: float | jax.Array
+    # (3,), the same for the halo: a deep press all over is dark, but not black
+    widest: Array | jax.Array
 
 
 DEGREE = 5  # of the polynomial in the normal, without its constant
@@ -83,32 +89,92 @@ POWERS = tuple((total - j, j) for total in range(1, DEGREE + 1) for j in range(t
 SENSORS: dict[str, Sensor] = {
     sensor.name: sensor
     for sensor in (
-        Sensor("gelsight", (14.16, 18.88), (480, 640), Gel(modulus=150.0, poisson=0.48, thickness=4.0),
-               Markers(pitch=1.6, radius=0.22, share=0.4), halo=1.5),
-        Sensor("gelsight_mini", (14.16, 18.88), (480, 640), Gel(modulus=180.0, poisson=0.48, thickness=4.25),
-               Markers(pitch=1.85, radius=0.36, share=0.5, ink=(0.10, 0.15, 0.14)), contrast=1.1, noise=0.6),
-        Sensor("gelslim", (15.0, 20.0), (320, 427), Gel(modulus=220.0, poisson=0.48, thickness=2.0),
-               Markers(pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12),
-               vignette=0.35, halo=0.8, noise=1.5, real=False),
-        Sensor("digit", (19.0, 14.25), (320, 240), Gel(modulus=120.0, poisson=0.48, thickness=2.5),
-               contrast=1.4, skin=0.1, noise=0.8),
-        Sensor("9dtact", (18.0, 24.0), (480, 640), Gel(modulus=120.0, poisson=0.48, thickness=3.0),
-               skin=0.15, halo=0.35, noise=0.6),
-        Sensor("duragel", (14.0, 18.7), (480, 640), Gel(modulus=350.0, poisson=0.48, thickness=3.0),
-               Markers(pitch=2.2, radius=0.3, share=0.3), vignette=0.2, skin=0.14, noise=1.2, real=False),
-        Sensor("tac3d", (17.0, 17.0), (20, 20), Gel(modulus=200.0, poisson=0.48, thickness=3.0), kind="field",
-               noise=0.01, real=False),
+        Sensor(
+            "gelsight",
+            (14.16, 18.88),
+            (480, 640),
+            Gel(modulus=150.0, poisson=0.48, thickness=4.0),
+            Markers(pitch=1.6, radius=0.22, share=0.4),
+            halo=1.5,
+        ),
+        Sensor(
+            "gelsight_mini",
+            (14.16, 18.88),
+            (480, 640),
+            Gel(modulus=180.0, poisson=0.48, thickness=4.25),
+            Markers(pitch=1.85, radius=0.36, share=0.5, ink=(0.10, 0.15, 0.14)),
+            contrast=1.1,
+            noise=0.6,
+        ),
+        Sensor(
+            "gelslim",
+            (15.0, 20.0),
+            (320, 427),
+            Gel(modulus=220.0, poisson=0.48, thickness=2.0),
+            Markers(
+                pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12
+            ),
+            vignette=0.35,
+            halo=0.8,
+            noise=1.5,
+            real=False,
+        ),
+        Sensor(
+            "digit",
+            (19.0, 14.25),
+            (320, 240),
+            Gel(modulus=120.0, poisson=0.48, thickness=2.5),
+            contrast=1.4,
+            skin=0.1,
+            noise=0.8,
+        ),
+        Sensor(
+            "9dtact",
+            (18.0, 24.0),
+            (480, 640),
+            Gel(modulus=120.0, poisson=0.48, thickness=3.0),
+            skin=0.15,
+            halo=0.35,
+            noise=0.6,
+        ),
+        Sensor(
+            "duragel",
+            (14.0, 18.7),
+            (480, 640),
+            Gel(modulus=350.0, poisson=0.48, thickness=3.0),
+            Markers(pitch=2.2, radius=0.3, share=0.3),
+            vignette=0.2,
+            skin=0.14,
+            noise=1.2,
+            real=False,
+        ),
+        Sensor(
+            "tac3d",
+            (17.0, 17.0),
+            (20, 20),
+            Gel(modulus=200.0, poisson=0.48, thickness=3.0),
+            kind="field",
+            noise=0.01,
+            real=False,
+        ),
     )
-}  # fmt: skip
+}
 
 
 @lru_cache(maxsize=8)
 def _stored(sensor: Sensor) -> dict[str, Array]:
     if sensor.arrays:
         return read_arrays(sensor.arrays)
-    with (files("anytouch_jax.sim.sensing") / "looks.npz").open("rb") as file, np.load(file) as pack:
+    with (
+        (files("anytouch_jax.sim.sensing") / "looks.npz").open("rb") as file,
+        np.load(file) as pack,
+    ):
         start = f"{sensor.name}."
-        return {name.removeprefix(start): np.asarray(pack[name]) for name in pack.files if name.startswith(start)}
+        return {
+            name.removeprefix(start): np.asarray(pack[name])
+            for name in pack.files
+            if name.startswith(start)
+        }
 
 
 @lru_cache(maxsize=16)
@@ -117,7 +183,9 @@ def bases(sensor: Sensor) -> Array:
     if sensor.kind == "field":
         return np.zeros((1, 30, 30, 3), np.float32)
     stored = _stored(sensor)["bases"]
-    return stored.astype(np.float32) / 255 if stored.dtype == np.uint8 else stored
+    if stored.dtype == np.uint8:
+        return stored.astype(np.float32) / 255
+    return stored
 
 
 def look(sensor: Sensor) -> Photometry:
@@ -145,8 +213,10 @@ class Unit(NamedTuple):
     lights: Leaf  # (4,) shift and stretch along u and v of the place that the lights see
     uneven: Leaf  # (5, 3) relative brightness on u, v, u^2, uv, v^2
     focus: Leaf  # mm, blur of the lens
-    specks: Leaf  # (SPECKS, 6): place (u, v), radius mm, share of each colour that dirt or wear absorbs
-    grain: Leaf  # (2,) standard deviation (0 to 255) and seed of the fixed pattern of a camera and a gel
+    # (SPECKS, 6): place (u, v), radius mm, share of each colour that dirt or wear absorbs
+    specks: Leaf
+    # (2,) standard deviation (0 to 255) and seed of the fixed pattern of a camera and a gel
+    grain: Leaf
     thickness: Leaf  # factor on the gel's thickness
     modulus: Leaf  # factor on the gel's modulus
     marked: Leaf  # 1 with markers, 0 without
@@ -170,14 +240,33 @@ def _unit(**values: Any) -> Unit:
 def identity_unit(sensor: Sensor) -> Unit:
     """Return the nominal unit of a sensor: no markers, no noise, the whole field, nothing moved."""
     return _unit(
-        base=bases(sensor)[0], tint=np.ones(3), gain=np.ones(3), light_angle=0, lights=[0, 0, 1, 1],
-        uneven=np.zeros((5, 3)), focus=0, specks=np.zeros((SPECKS, 6)) + np.eye(6)[2], grain=np.zeros(2),
-        thickness=1, modulus=1, marked=0, marker_pitch=1, marker_phase=np.zeros(2), marker_size=1, zoom=1,
-        window=np.zeros(2), mirror=np.ones(2), rotation=0, offset=np.zeros(2), noise=0, quality=95,
-    )  # fmt: skip
+        base=bases(sensor)[0],
+        tint=np.ones(3),
+        gain=np.ones(3),
+        light_angle=0,
+        lights=[0, 0, 1, 1],
+        uneven=np.zeros((5, 3)),
+        focus=0,
+        specks=np.zeros((SPECKS, 6)) + np.eye(6)[2],
+        grain=np.zeros(2),
+        thickness=1,
+        modulus=1,
+        marked=0,
+        marker_pitch=1,
+        marker_phase=np.zeros(2),
+        marker_size=1,
+        zoom=1,
+        window=np.zeros(2),
+        mirror=np.ones(2),
+        rotation=0,
+        offset=np.zeros(2),
+        noise=0,
+        quality=95,
+    )
 
 
-THINNEST = 0.7  # of the nominal thickness: more than four standard deviations below it, see `draw_unit`
+# of the nominal thickness: more than four standard deviations below it, see `draw_unit`
+THINNEST = 0.7
 SPECKS = 6
 MOST_BASES = 16  # untouched gels of a sensor; so many weights are drawn for each
 
@@ -189,24 +278,34 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
     to 128 pixels: GelSight Mini with dots (8 gels, 39 recordings) and without (3 units), DIGIT (3 units), 9DTact (3
     units). All sensors draw equally often, so that they can share a stream.
     """
-    xp, spread = namespace_of(rng), sensor.spread
+    xp = namespace_of(rng)
+    spread = sensor.spread
     share = sensor.markers.share if sensor.markers else 0.0
     # Measured: the dots of the 8 gels are 0.131 or 0.183 short sides apart, which is 1.85 mm at a zoom of 1 or 0.72.
     zoom = 1 + spread * (rng.uniform(0.68, 1.0) - 1)
     room = (1 - zoom) / 2 * xp.asarray(sensor.field[::-1])
-    dirt = rng.uniform(size=SPECKS) < rng.uniform(0, 0.6)  # measured: 0 to 4 specks or scratches a gel
+    # measured: 0 to 4 specks or scratches a gel
+    dirt = rng.uniform(size=SPECKS) < rng.uniform(0, 0.6)
     return _unit(
         base=_draw_base(bases(sensor) if real is None else real, rng, of),
         # Measured: means differ by 9 %, colours by 5 %.
         tint=xp.exp(spread * (rng.normal(0, 0.09) + rng.normal(0, 0.05, 3))),
         gain=sensor.contrast * xp.exp(spread * (rng.normal(0, 0.25) + rng.normal(0, 0.15, 3))),
         light_angle=spread * rng.normal(0, np.deg2rad(10)),
-        lights=xp.concatenate([spread * rng.normal(0, 0.1, 2), 1 + spread * (rng.uniform(0.8, 1.05, 2) - 1)]),
+        lights=xp.concatenate(
+            [spread * rng.normal(0, 0.1, 2), 1 + spread * (rng.uniform(0.8, 1.05, 2) - 1)]
+        ),
         uneven=spread * rng.normal(0, 0.08, (5, 3)),  # on top of the measured ones in `base`
         focus=rng.uniform(0.02, 0.15),
-        specks=xp.concatenate([
-            rng.uniform(-1, 1, (SPECKS, 2)), xp.exp(rng.uniform(math.log(0.06), math.log(0.9), (SPECKS, 1))),
-            dirt[:, None] * (rng.normal(0.06, 0.12, (SPECKS, 1)) + rng.normal(0, 0.03, (SPECKS, 3)))], 1),
+        specks=xp.concatenate(
+            [
+                rng.uniform(-1, 1, (SPECKS, 2)),
+                xp.exp(rng.uniform(math.log(0.06), math.log(0.9), (SPECKS, 1))),
+                dirt[:, None]
+                * (rng.normal(0.06, 0.12, (SPECKS, 1)) + rng.normal(0, 0.03, (SPECKS, 3))),
+            ],
+            1,
+        ),
         # Measured: 0.5 to 2.5 levels of fine structure in an untouched picture.
         grain=[xp.exp(rng.uniform(math.log(0.3), math.log(2))), rng.integers(2**24)],
         thickness=xp.exp(rng.normal(0, 0.08)),
@@ -223,7 +322,7 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
         # Measured: 10 to 90 % of the recordings have 0.2 to 1.7.
         noise=sensor.noise * xp.exp(spread * rng.normal(0, 0.5)),
         quality=rng.integers(70, 97),
-    )  # fmt: skip
+    )
 
 
 def _draw_base(real: Any, rng: Rng, of: Any) -> Any:
@@ -254,7 +353,8 @@ def draw_drift(frames: int, rng: Rng) -> Any:
 
 def rotated(x: jax.Array, y: jax.Array, angle: Any) -> tuple[jax.Array, jax.Array]:
     """Return vectors rotated by `angle` rad, from x towards y."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
+    c = jnp.cos(angle)
+    s = jnp.sin(angle)
     return c * x - s * y, s * x + c * y
 
 
@@ -266,4 +366,6 @@ def gel_to_object(unit: Unit, x: jax.Array, y: jax.Array) -> tuple[jax.Array, ja
 def unit_gel(sensor: Sensor, unit: Unit) -> Gel:
     """Return the gel of a sensor unit."""
     gel = sensor.gel
-    return replace(gel, modulus=gel.modulus * unit.modulus, thickness=gel.thickness * unit.thickness)
+    return replace(
+        gel, modulus=gel.modulus * unit.modulus, thickness=gel.thickness * unit.thickness
+    )

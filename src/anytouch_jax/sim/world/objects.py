@@ -13,7 +13,8 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.sim.world.shapes import PRIMITIVES, STROKES, TEXTURES, Shape
 
 # In kPa: a finger dents softer materials, and a hand cannot deform harder ones.
-SOFT, HARD = 400.0, 50_000.0
+SOFT = 400.0
+HARD = 50_000.0
 
 
 @dataclass(frozen=True)
@@ -39,55 +40,183 @@ class Material:
 MATERIALS: dict[str, Material] = {
     m.name: m
     for m in (
-        Material("rubber", 1_500.0, 1.0, (0.13, 0.13, 0.14), 0.25, "none", 0.8, 0.0, 0.02,
-                 ("smooth", "ridges", "grid", "dots", "knit", "sand"),
-                 ("grippy", "clinging to the skin", "dry and grippy"),
-                 ((0.55, 0.12, 0.1), (0.12, 0.25, 0.5))),
-        Material("silicone", 250.0, 1.1, (0.55, 0.75, 0.72), 0.45, "none", 0.8, 0.0, 0.03,
-                 ("smooth", "dots", "grid", "ridges", "knit", "weave"),
-                 ("slightly tacky", "skin-like", "tacky and supple"),
-                 ((0.85, 0.45, 0.5), (0.85, 0.8, 0.72), (0.4, 0.6, 0.35))),
-        Material("foam", 60.0, 0.9, (0.9, 0.82, 0.4), 0.0, "pores", 0.9, 0.07, 0.05,
-                 ("smooth", "dots", "ridges", "grid", "sand"),
-                 ("warm and porous", "airy", "light and porous"),
-                 ((0.35, 0.36, 0.4), (0.5, 0.7, 0.8))),
-        Material("fabric", 120.0, 0.55, (0.25, 0.33, 0.55), 0.0, "threads", 0.65, 0.03, 0.12,
-                 ("smooth", "weave", "knit", "ridges", "dots"),
-                 ("warm and dry", "fuzzy", "warm with loose fibres"),
-                 ((0.6, 0.2, 0.22), (0.75, 0.7, 0.6), (0.3, 0.42, 0.3)), mottle=0.2),
-        Material("leather", 5_000.0, 0.65, (0.4, 0.23, 0.13), 0.25, "pebbles", 0.8, 0.045, 0.08,
-                 ("smooth", "bark", "weave", "dots", "sand", "ridges"),
-                 ("warm and supple", "finely creased", "dry and warm"),
-                 ((0.15, 0.11, 0.1), (0.6, 0.4, 0.22)), mottle=0.25),
-        Material("cork", 9_000.0, 0.75, (0.72, 0.53, 0.34), 0.02, "pores", 0.7, 0.05, 0.08,
-                 ("smooth", "bark", "sand", "grid", "ridges"),
-                 ("warm and light", "warm and slightly crumbly", "dry and warm"), mottle=0.7),
-        Material("wood", 1.0e7, 0.45, (0.62, 0.43, 0.26), 0.12, "streaks", 0.8, 0.04, 0.05,
-                 ("smooth", "bark", "ridges", "grid", "weave", "sand"),
-                 ("neither warm nor cold", "dry and fibrous", "dry with a fine grain"),
-                 ((0.42, 0.26, 0.15), (0.78, 0.63, 0.43)), mottle=0.6),
-        Material("plastic", 2.2e6, 0.4, (0.82, 0.82, 0.8), 0.5, "none", 0.8, 0.0, 0.0,
-                 ("smooth", "grid", "dots", "ridges", "weave", "sand", "knit"),
-                 ("neutral in warmth", "light and dry", "slick and dry"),
-                 ((0.75, 0.15, 0.12), (0.12, 0.35, 0.65), (0.9, 0.65, 0.1), (0.15, 0.16, 0.17))),
-        Material("ceramic", 2.0e8, 0.3, (0.88, 0.85, 0.79), 0.75, "none", 0.8, 0.0, 0.04,
-                 ("smooth", "ridges", "dots", "bark", "weave", "sand"),
-                 ("cool", "cool and glazed", "cool and slick"),
-                 ((0.25, 0.4, 0.5), (0.65, 0.33, 0.22))),
-        Material("glass", 7.0e7, 0.25, (0.5, 0.66, 0.64), 1.0, "none", 0.8, 0.0, 0.02,
-                 ("smooth", "ridges", "dots", "grid", "bark"),
-                 ("cold and slick", "cold", "cool and flawless"),
-                 ((0.24, 0.42, 0.3), (0.45, 0.3, 0.15)), mottle=0.0),
-        Material("steel", 2.0e8, 0.3, (0.6, 0.61, 0.63), 0.9, "streaks", 0.9, 0.012, 0.01,
-                 ("smooth", "grid", "dots", "ridges", "weave", "knit", "sand"),
-                 ("cold", "cold and unyielding", "cold and slick"),
-                 ((0.68, 0.56, 0.35),), metallic=True, mottle=0.05),
-        Material("stone", 5.0e7, 0.55, (0.52, 0.5, 0.47), 0.05, "grit", 0.9, 0.06, 0.06,
-                 ("smooth", "sand", "bark", "grid", "ridges"),
-                 ("cold and dry", "cool and gritty", "cool and mineral"),
-                 ((0.35, 0.34, 0.34), (0.68, 0.58, 0.47)), mottle=0.8),
+        Material(
+            "rubber",
+            1_500.0,
+            1.0,
+            (0.13, 0.13, 0.14),
+            0.25,
+            "none",
+            0.8,
+            0.0,
+            0.02,
+            ("smooth", "ridges", "grid", "dots", "knit", "sand"),
+            ("grippy", "clinging to the skin", "dry and grippy"),
+            ((0.55, 0.12, 0.1), (0.12, 0.25, 0.5)),
+        ),
+        Material(
+            "silicone",
+            250.0,
+            1.1,
+            (0.55, 0.75, 0.72),
+            0.45,
+            "none",
+            0.8,
+            0.0,
+            0.03,
+            ("smooth", "dots", "grid", "ridges", "knit", "weave"),
+            ("slightly tacky", "skin-like", "tacky and supple"),
+            ((0.85, 0.45, 0.5), (0.85, 0.8, 0.72), (0.4, 0.6, 0.35)),
+        ),
+        Material(
+            "foam",
+            60.0,
+            0.9,
+            (0.9, 0.82, 0.4),
+            0.0,
+            "pores",
+            0.9,
+            0.07,
+            0.05,
+            ("smooth", "dots", "ridges", "grid", "sand"),
+            ("warm and porous", "airy", "light and porous"),
+            ((0.35, 0.36, 0.4), (0.5, 0.7, 0.8)),
+        ),
+        Material(
+            "fabric",
+            120.0,
+            0.55,
+            (0.25, 0.33, 0.55),
+            0.0,
+            "threads",
+            0.65,
+            0.03,
+            0.12,
+            ("smooth", "weave", "knit", "ridges", "dots"),
+            ("warm and dry", "fuzzy", "warm with loose fibres"),
+            ((0.6, 0.2, 0.22), (0.75, 0.7, 0.6), (0.3, 0.42, 0.3)),
+            mottle=0.2,
+        ),
+        Material(
+            "leather",
+            5_000.0,
+            0.65,
+            (0.4, 0.23, 0.13),
+            0.25,
+            "pebbles",
+            0.8,
+            0.045,
+            0.08,
+            ("smooth", "bark", "weave", "dots", "sand", "ridges"),
+            ("warm and supple", "finely creased", "dry and warm"),
+            ((0.15, 0.11, 0.1), (0.6, 0.4, 0.22)),
+            mottle=0.25,
+        ),
+        Material(
+            "cork",
+            9_000.0,
+            0.75,
+            (0.72, 0.53, 0.34),
+            0.02,
+            "pores",
+            0.7,
+            0.05,
+            0.08,
+            ("smooth", "bark", "sand", "grid", "ridges"),
+            ("warm and light", "warm and slightly crumbly", "dry and warm"),
+            mottle=0.7,
+        ),
+        Material(
+            "wood",
+            1.0e7,
+            0.45,
+            (0.62, 0.43, 0.26),
+            0.12,
+            "streaks",
+            0.8,
+            0.04,
+            0.05,
+            ("smooth", "bark", "ridges", "grid", "weave", "sand"),
+            ("neither warm nor cold", "dry and fibrous", "dry with a fine grain"),
+            ((0.42, 0.26, 0.15), (0.78, 0.63, 0.43)),
+            mottle=0.6,
+        ),
+        Material(
+            "plastic",
+            2.2e6,
+            0.4,
+            (0.82, 0.82, 0.8),
+            0.5,
+            "none",
+            0.8,
+            0.0,
+            0.0,
+            ("smooth", "grid", "dots", "ridges", "weave", "sand", "knit"),
+            ("neutral in warmth", "light and dry", "slick and dry"),
+            ((0.75, 0.15, 0.12), (0.12, 0.35, 0.65), (0.9, 0.65, 0.1), (0.15, 0.16, 0.17)),
+        ),
+        Material(
+            "ceramic",
+            2.0e8,
+            0.3,
+            (0.88, 0.85, 0.79),
+            0.75,
+            "none",
+            0.8,
+            0.0,
+            0.04,
+            ("smooth", "ridges", "dots", "bark", "weave", "sand"),
+            ("cool", "cool and glazed", "cool and slick"),
+            ((0.25, 0.4, 0.5), (0.65, 0.33, 0.22)),
+        ),
+        Material(
+            "glass",
+            7.0e7,
+            0.25,
+            (0.5, 0.66, 0.64),
+            1.0,
+            "none",
+            0.8,
+            0.0,
+            0.02,
+            ("smooth", "ridges", "dots", "grid", "bark"),
+            ("cold and slick", "cold", "cool and flawless"),
+            ((0.24, 0.42, 0.3), (0.45, 0.3, 0.15)),
+            mottle=0.0,
+        ),
+        Material(
+            "steel",
+            2.0e8,
+            0.3,
+            (0.6, 0.61, 0.63),
+            0.9,
+            "streaks",
+            0.9,
+            0.012,
+            0.01,
+            ("smooth", "grid", "dots", "ridges", "weave", "knit", "sand"),
+            ("cold", "cold and unyielding", "cold and slick"),
+            ((0.68, 0.56, 0.35),),
+            metallic=True,
+            mottle=0.05,
+        ),
+        Material(
+            "stone",
+            5.0e7,
+            0.55,
+            (0.52, 0.5, 0.47),
+            0.05,
+            "grit",
+            0.9,
+            0.06,
+            0.06,
+            ("smooth", "sand", "bark", "grid", "ridges"),
+            ("cold and dry", "cool and gritty", "cool and mineral"),
+            ((0.35, 0.34, 0.34), (0.68, 0.58, 0.47)),
+            mottle=0.8,
+        ),
     )
-}  # fmt: skip
+}
 
 
 class PrimitiveKind(NamedTuple):
@@ -109,13 +238,18 @@ class TextureKind(NamedTuple):
 # Contacts of 0.2 to 1.2 mm fill a good part of a field of 12 to 19 mm. Small contacts and raised figures have only
 # textures that do not hide them and are not hidden by them.
 PRIMITIVE_KINDS = {
-    "sphere": PrimitiveKind("ball", (5.0, 12.0)), "cylinder": PrimitiveKind("rod", (4.0, 11.0)),
-    "edge": PrimitiveKind("edge", (0.5, 2.5)), "corner": PrimitiveKind("corner", (0.5, 2.5)),
+    "sphere": PrimitiveKind("ball", (5.0, 12.0)),
+    "cylinder": PrimitiveKind("rod", (4.0, 11.0)),
+    "edge": PrimitiveKind("edge", (0.5, 2.5)),
+    "corner": PrimitiveKind("corner", (0.5, 2.5)),
     "cone": PrimitiveKind("cone", (3.5, 8.0), ("smooth", "bark", "sand", "ridges")),
-    "ring": PrimitiveKind("ring", (4.0, 6.5), ("smooth", "sand", "weave", "dots", "ridges", "knit")),
-    "flat": PrimitiveKind("disc", (4.5, 11.0)), "screw": PrimitiveKind("screw", (3.5, 7.0), ("smooth", "sand", "bark")),
+    "ring": PrimitiveKind(
+        "ring", (4.0, 6.5), ("smooth", "sand", "weave", "dots", "ridges", "knit")
+    ),
+    "flat": PrimitiveKind("disc", (4.5, 11.0)),
+    "screw": PrimitiveKind("screw", (3.5, 7.0), ("smooth", "sand", "bark")),
     "letters": PrimitiveKind("letter", (7.0, 12.0), ("smooth", "sand", "weave", "ridges")),
-}  # fmt: skip
+}
 TEXTURE_KINDS = {  # slopes are measured on the height maps, and a test repeats the measurement
     "smooth": TextureKind("smooth", (1.0, 1.0), 0.0),
     "weave": TextureKind("woven", (1.2, 2.6), 1.4),
@@ -172,7 +306,9 @@ def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
     used: Counter[object] = Counter()
     objects = []
     for _ in range(count):
-        chosen = min(left, key=lambda c: 3 * used[c[:2]] + used[c[1:]] + sum(used[kind] for kind in c))
+        chosen = min(
+            left, key=lambda c: 3 * used[c[:2]] + used[c[1:]] + sum(used[kind] for kind in c)
+        )
         left.remove(chosen)
         used.update([chosen[:2], chosen[1:], *chosen])
         objects.append(draw_object(*chosen, seed=int(rng.integers(2**31))))
@@ -194,12 +330,19 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
     letter = sorted(STROKES)[int(rng.integers(len(STROKES)))]
     grain_scale = float(rng.uniform(0.85, 1.2))
     shape = Shape(
-        primitive, texture, size=round(float(rng.uniform(*PRIMITIVE_KINDS[primitive].size)), 3),
-        texture_pitch=round(pitch, 3), texture_depth=0.0 if texture == "smooth" else round(depth, 3),
-        seed=int(rng.integers(2**20)), texture_angle=round(float(rng.uniform(0, math.pi)), 4),
-        irregularity=made_of.irregularity, grain=made_of.grain,
-        grain_pitch=round(made_of.grain_pitch * grain_scale, 3), grain_depth=made_of.grain_depth, letter=letter,
-    )  # fmt: skip
+        primitive,
+        texture,
+        size=round(float(rng.uniform(*PRIMITIVE_KINDS[primitive].size)), 3),
+        texture_pitch=round(pitch, 3),
+        texture_depth=0.0 if texture == "smooth" else round(depth, 3),
+        seed=int(rng.integers(2**20)),
+        texture_angle=round(float(rng.uniform(0, math.pi)), 4),
+        irregularity=made_of.irregularity,
+        grain=made_of.grain,
+        grain_pitch=round(made_of.grain_pitch * grain_scale, 3),
+        grain_depth=made_of.grain_depth,
+        letter=letter,
+    )
     tints = (made_of.colour, *made_of.tints)
     tint = np.asarray(tints[int(rng.integers(len(tints)))])
     colour = np.clip(tint * rng.uniform(0.85, 1.15) + rng.uniform(-0.03, 0.03, 3), 0.02, 0.95)
@@ -208,7 +351,9 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
     return Object(f"{kind.adjective} {material} {noun}", shape, made_of, (red, green, blue), seed)
 
 
-def hold_out(objects: Sequence[Object], share: float, seed: int) -> tuple[tuple[Object, ...], tuple[Object, ...]]:
+def hold_out(
+    objects: Sequence[Object], share: float, seed: int
+) -> tuple[tuple[Object, ...], tuple[Object, ...]]:
     """Split objects into (training, held out) that share no (primitive, texture) pair, in their order.
 
     At least `share` is held out. Training objects keep every primitive and texture. Raises UserError otherwise.
@@ -217,7 +362,8 @@ def hold_out(objects: Sequence[Object], share: float, seed: int) -> tuple[tuple[
         raise UserError(f"the share of objects held out must lie between 0 and 1, not {share}")
     pairs = sorted({o.kind for o in objects})
     sizes = Counter(o.kind for o in objects)
-    primitives, textures = Counter(p for p, _ in pairs), Counter(t for _, t in pairs)
+    primitives = Counter(p for p, _ in pairs)
+    textures = Counter(t for _, t in pairs)
     test_pairs: set[Pair] = set()
     test_objects = 0
     for i in np.random.default_rng([seed, 12]).permutation(len(pairs)):
@@ -241,14 +387,22 @@ def hold_out(objects: Sequence[Object], share: float, seed: int) -> tuple[tuple[
 def hardness_of(thing: Object) -> str:
     """Return "soft", "firm" or "hard"."""
     modulus = thing.material.modulus
-    return "soft" if modulus < SOFT else "firm" if modulus < HARD else "hard"
+    if modulus < SOFT:
+        return "soft"
+    if modulus < HARD:
+        return "firm"
+    return "hard"
 
 
 def roughness_of(thing: Object) -> str:
     """Return "smooth", "textured" or "rough", by the RMS slope of the texture."""
     shape = thing.shape
     slope = TEXTURE_KINDS[shape.texture].slope * shape.texture_depth / shape.texture_pitch
-    return "smooth" if slope == 0 else "textured" if slope < _ROUGH else "rough"
+    if slope == 0:
+        return "smooth"
+    if slope < _ROUGH:
+        return "textured"
+    return "rough"
 
 
 # Captions, in the style of AnyTouch's annotations (its appendix on GPT-4o). They never name the object, its material,
@@ -261,28 +415,74 @@ HARDNESS: dict[str, tuple[str, ...]] = {
 }
 ROUGHNESS: dict[str, tuple[str, ...]] = {
     "smooth": ("smooth", "even", "sleek", "plain", "very smooth"),
-    "textured": ("lightly textured", "slightly rough", "moderately rough", "mildly uneven", "gently textured"),
+    "textured": (
+        "lightly textured",
+        "slightly rough",
+        "moderately rough",
+        "mildly uneven",
+        "gently textured",
+    ),
     "rough": ("rough", "coarse", "strongly textured", "bumpy", "very rough"),
 }
 # {s} is a word for the spacing.
 PATTERN: dict[str, tuple[str, ...]] = {
-    "smooth": ("no noticeable pattern", "a uniform, unbroken finish", "hardly any surface detail",
-               "no bumps or grooves", "a consistent finish"),
-    "weave": ("a {s} woven pattern", "{s} interlaced strands", "a {s} basket-like pattern", "{s} criss-crossing fibres",
-              "a {s} pattern of interlaced strands"),
-    "knit": ("{s} knitted loops", "a {s} pattern of V-shaped stitches", "{s} rows of stitches",
-             "a {s} looped, chain-like pattern", "{s} interlocking loops"),
-    "ridges": ("{s} parallel ridges", "a {s} ribbed pattern", "{s} raised lines", "{s} parallel grooves",
-               "a {s} series of ridges and grooves"),
-    "grid": ("a {s} raised grid", "a {s} waffle-like lattice", "{s} square cells between raised lines",
-             "a {s} pattern of crossing ridges", "{s} crossing ribs"),
-    "dots": ("{s} raised dots", "{s} rounded bumps", "a {s} array of small bumps", "{s} dot-like bumps",
-             "a {s} pattern of studs"),
-    "bark": ("{s} irregular furrows", "{s} winding cracks", "a {s} fissured, bark-like surface",
-             "{s} uneven plates and creases", "a {s} pattern of irregular grooves"),
-    "sand": ("{s} sandpaper-like grains", "a {s} gritty texture", "{s} random bumps and pits", "a {s} grainy texture",
-             "{s} irregular grains"),
-}  # fmt: skip
+    "smooth": (
+        "no noticeable pattern",
+        "a uniform, unbroken finish",
+        "hardly any surface detail",
+        "no bumps or grooves",
+        "a consistent finish",
+    ),
+    "weave": (
+        "a {s} woven pattern",
+        "{s} interlaced strands",
+        "a {s} basket-like pattern",
+        "{s} criss-crossing fibres",
+        "a {s} pattern of interlaced strands",
+    ),
+    "knit": (
+        "{s} knitted loops",
+        "a {s} pattern of V-shaped stitches",
+        "{s} rows of stitches",
+        "a {s} looped, chain-like pattern",
+        "{s} interlocking loops",
+    ),
+    "ridges": (
+        "{s} parallel ridges",
+        "a {s} ribbed pattern",
+        "{s} raised lines",
+        "{s} parallel grooves",
+        "a {s} series of ridges and grooves",
+    ),
+    "grid": (
+        "a {s} raised grid",
+        "a {s} waffle-like lattice",
+        "{s} square cells between raised lines",
+        "a {s} pattern of crossing ridges",
+        "{s} crossing ribs",
+    ),
+    "dots": (
+        "{s} raised dots",
+        "{s} rounded bumps",
+        "a {s} array of small bumps",
+        "{s} dot-like bumps",
+        "a {s} pattern of studs",
+    ),
+    "bark": (
+        "{s} irregular furrows",
+        "{s} winding cracks",
+        "a {s} fissured, bark-like surface",
+        "{s} uneven plates and creases",
+        "a {s} pattern of irregular grooves",
+    ),
+    "sand": (
+        "{s} sandpaper-like grains",
+        "a {s} gritty texture",
+        "{s} random bumps and pits",
+        "a {s} grainy texture",
+        "{s} irregular grains",
+    ),
+}
 SPACING: dict[str, tuple[str, ...]] = {
     "fine": ("fine", "closely spaced", "tight", "dense", "small-scale"),
     "wide": ("broad", "widely spaced", "large-scale", "spread-out", "big"),
@@ -290,17 +490,24 @@ SPACING: dict[str, tuple[str, ...]] = {
 WIDE = 1.85  # mm; from this pitch on a pattern is called wide
 
 FIRST = (
-    "The surface feels {hard} and {rough}, with {pattern}.", "The surface is {rough} and {hard}, showing {pattern}.",
-    "A {hard}, {rough} surface with {pattern}.", "A {rough} surface with {pattern}; it feels {hard}.",
-    "It feels {hard} to the touch, with a {rough} finish and {pattern}.", "{Hard} and {rough}, with {pattern}.",
-    "{Rough}, {hard}, {pattern}.", "The object has {pattern}, giving a {rough} feel, and its body is {hard}.",
+    "The surface feels {hard} and {rough}, with {pattern}.",
+    "The surface is {rough} and {hard}, showing {pattern}.",
+    "A {hard}, {rough} surface with {pattern}.",
+    "A {rough} surface with {pattern}; it feels {hard}.",
+    "It feels {hard} to the touch, with a {rough} finish and {pattern}.",
+    "{Hard} and {rough}, with {pattern}.",
+    "{Rough}, {hard}, {pattern}.",
+    "The object has {pattern}, giving a {rough} feel, and its body is {hard}.",
     "One can feel {pattern} on a {hard}, {rough} surface.",
     "To the fingertips it is {rough}, with {pattern}, and {hard} underneath.",
-)  # fmt: skip
+)
 SECOND = (
-    "It is {feel}.", "The touch is {feel}.", "Overall it feels {feel}.", "The sensation is {feel}.",
+    "It is {feel}.",
+    "The touch is {feel}.",
+    "Overall it feels {feel}.",
+    "The sensation is {feel}.",
     "The material seems {feel}.",
-)  # fmt: skip
+)
 
 
 def caption(thing: Object, rng: np.random.Generator) -> str:
@@ -312,11 +519,14 @@ def caption(thing: Object, rng: np.random.Generator) -> str:
 
     spacing = "wide" if shape.texture_pitch >= WIDE else "fine"
     words = {
-        "hard": pick(HARDNESS[hardness_of(thing)]), "rough": pick(ROUGHNESS[roughness_of(thing)]),
-        "pattern": pick(PATTERN[shape.texture]).format(s=pick(SPACING[spacing])), "feel": pick(thing.material.feel),
-    }  # fmt: skip
+        "hard": pick(HARDNESS[hardness_of(thing)]),
+        "rough": pick(ROUGHNESS[roughness_of(thing)]),
+        "pattern": pick(PATTERN[shape.texture]).format(s=pick(SPACING[spacing])),
+        "feel": pick(thing.material.feel),
+    }
     words |= {"Hard": words["hard"].capitalize(), "Rough": words["rough"].capitalize()}
     text = pick(FIRST).format(**words)
     if rng.random() < 0.75:
         text += " " + pick(SECOND).format(**words)
-    return re.sub(r"\b([Aa]) (?=[aeiou](?!ni))", r"\1n ", text)  # "an even", but "a uniform"
+    # "an even", but "a uniform"
+    return re.sub(r"\b([Aa]) (?=[aeiou](?!ni))", r"\1n ", text)

@@ -31,7 +31,9 @@ def namespace(x: Array) -> ModuleType:
     return library
 
 
-def gaussian_field(u: Array, v: Array, length: tuple[float, float], seed: int, terms: int = 40) -> Array:
+def gaussian_field(
+    u: Array, v: Array, length: tuple[float, float], seed: int, terms: int = 40
+) -> Array:
     """Return a random field of mean 0 and deviation 1 with autocorrelation exp(-(du/l_u)^2 - (dv/l_v)^2).
 
     `u`, `v` and `length` are in mm. The field is a sum of cosines. The radii of their wave vectors are quantiles, so
@@ -44,13 +46,15 @@ def gaussian_field(u: Array, v: Array, length: tuple[float, float], seed: int, t
     ku = radius * np.cos(angle) * math.sqrt(2) / length[0]
     kv = radius * np.sin(angle) * math.sqrt(2) / length[1]
     phase = rng.uniform(0, 2 * math.pi, terms)
-    xp, scale = namespace(u), math.sqrt(2 / terms)
+    xp = namespace(u)
+    scale = math.sqrt(2 / terms)
     if u.shape == v.shape:
         total = 0.0 * u
         for a, b, c in zip(ku.tolist(), kv.tolist(), phase.tolist(), strict=True):
             total = total + xp.cos(a * u + (b * v + c))
         return scale * total
-    across = xp.asarray(ku[:, None], u.dtype) * u + xp.asarray(phase[:, None], u.dtype)  # (terms, W)
+    # (terms, W)
+    across = xp.asarray(ku[:, None], u.dtype) * u + xp.asarray(phase[:, None], u.dtype)
     along = v * xp.asarray(kv[None, :], v.dtype)  # (H, terms)
     return scale * (xp.cos(along) @ xp.cos(across) - xp.sin(along) @ xp.sin(across))
 
@@ -95,13 +99,18 @@ def _smooth(u: Array, v: Array, pitch: float, seed: int) -> Array:
 def _ridges(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Rounded parallel ridges, one a pitch."""
     s, _ = _shift(u, v, pitch, seed)
-    return 0.5 + 0.5 / math.tanh(1.3) * namespace(u).tanh(1.3 * namespace(u).cos(2 * math.pi * s)) + 0.0 * v
+    return (
+        0.5
+        + 0.5 / math.tanh(1.3) * namespace(u).tanh(1.3 * namespace(u).cos(2 * math.pi * s))
+        + 0.0 * v
+    )
 
 
 def _grid(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Two crossing families of raised lines, as on a waffle."""
     s, t = _shift(u, v, pitch, seed)
-    xp, width = namespace(u), 0.45
+    xp = namespace(u)
+    width = 0.45
     line_s, line_t = (xp.exp(-((xp.sin(math.pi * a) / width) ** 2)) for a in (s, t))
     return 1 - (1 - line_s) * (1 - line_t)
 
@@ -109,9 +118,12 @@ def _grid(u: Array, v: Array, pitch: float, seed: int) -> Array:
 def _dots(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Round bumps on a hexagonal lattice, a pitch apart."""
     s, t = _shift(u, v, pitch, seed)
-    xp, tall, radius = namespace(u), math.sqrt(3.0), 0.42
+    xp = namespace(u)
+    tall = math.sqrt(3.0)
+    radius = 0.42
     total = 0.0 * (u + v)
-    for offset in (0.0, 0.5):  # the hexagonal lattice is two rectangular ones
+    # the hexagonal lattice is two rectangular ones
+    for offset in (0.0, 0.5):
         ds = s + offset - xp.round(s + offset)
         dt = t / tall + offset - xp.round(t / tall + offset)
         total = total + _bump((ds * ds + (tall * dt) ** 2) / radius**2)
@@ -122,9 +134,12 @@ def _weave(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Plain weave: strands a pitch apart that pass over and under each other."""
     s, t = _shift(u, v, pitch, seed)
     xp = namespace(u)
-    i, j = xp.round(s), xp.round(t)
+    i = xp.round(s)
+    j = xp.round(t)
     over, under = (xp.tanh(xp.cos(math.pi * a)) * (0.5 / math.tanh(1)) for a in (t + i, s + j))
-    across, along = (2 * (s - i)) ** 2, (2 * (t - j)) ** 2  # both strands are round and low at their borders
+    # both strands are round and low at their borders
+    across = (2 * (s - i)) ** 2
+    along = (2 * (t - j)) ** 2
     warp = over - 1.4 * across * (0.4 + 0.6 * across)
     weft = -under - 1.4 * along * (0.4 + 0.6 * along)
     return xp.clip((_larger(warp, weft, 0.1) + 1.36) / 1.87, 0, 1)
@@ -133,7 +148,10 @@ def _weave(u: Array, v: Array, pitch: float, seed: int) -> Array:
 def _knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Stockinette: columns of stitches, each a V of two slanted loops, a pitch wide."""
     s, t = _shift(u, v, pitch, seed)
-    xp, row, lean = namespace(u), 0.75, 0.5  # rows are 0.75 pitches high, legs lean 0.5 radians
+    # rows are 0.75 pitches high, legs lean 0.5 radians
+    xp = namespace(u)
+    row = 0.75
+    lean = 0.5
     fold = xp.abs(s - xp.round(s)) - 0.26  # both legs of a V at once
     r = t / row
     r = r - xp.round(r)
@@ -155,23 +173,44 @@ def _bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
 
 
 TEXTURES: dict[str, Texture] = {
-    "smooth": _smooth, "weave": _weave, "knit": _knit, "ridges": _ridges, "grid": _grid, "dots": _dots, "bark": _bark,
+    "smooth": _smooth,
+    "weave": _weave,
+    "knit": _knit,
+    "ridges": _ridges,
+    "grid": _grid,
+    "dots": _dots,
+    "bark": _bark,
     # Heights uniform in 0 to 1 (RMS 12**-0.5), autocorrelation 1/e at `SAND_LENGTH` pitches.
-    "sand": lambda u, v, pitch, seed: normal_cdf(gaussian_field(u, v, (SAND_LENGTH * pitch / _FALL,) * 2, seed + 5)),
-}  # fmt: skip
+    "sand": lambda u, v, pitch, seed: normal_cdf(
+        gaussian_field(u, v, (SAND_LENGTH * pitch / _FALL,) * 2, seed + 5)
+    ),
+}
 
 
 GRAINS: dict[str, Texture] = {
-    "none": _smooth, "threads": _weave,
-    "streaks": lambda u, v, pitch, seed: normal_cdf(  # fine lines along v, as wood's fibres or brushed metal
-        gaussian_field(u, v, (0.4 * pitch, 6 * pitch), seed + 6, terms=20)),
-    "pores": lambda u, v, pitch, seed: 1 - normal_cdf(  # a level surface with scattered small pits, as cork or foam
-        2.5 * (gaussian_field(u, v, (0.5 * pitch, 0.5 * pitch), seed + 7, terms=24) - 0.9)),
-    "pebbles": lambda u, v, pitch, seed: 1 - namespace(u).exp(  # small cushions between fine creases, as leather
-        -((gaussian_field(u, v, (0.6 * pitch, 0.6 * pitch), seed + 8, terms=24) / 0.5) ** 2)),
+    "none": _smooth,
+    "threads": _weave,
+    "streaks": lambda u, v, pitch, seed: (
+        normal_cdf(  # fine lines along v, as wood's fibres or brushed metal
+            gaussian_field(u, v, (0.4 * pitch, 6 * pitch), seed + 6, terms=20)
+        )
+    ),
+    "pores": lambda u, v, pitch, seed: (
+        1
+        - normal_cdf(  # a level surface with scattered small pits, as cork or foam
+            2.5 * (gaussian_field(u, v, (0.5 * pitch, 0.5 * pitch), seed + 7, terms=24) - 0.9)
+        )
+    ),
+    "pebbles": lambda u, v, pitch, seed: (
+        1
+        - namespace(u).exp(  # small cushions between fine creases, as leather
+            -((gaussian_field(u, v, (0.6 * pitch, 0.6 * pitch), seed + 8, terms=24) / 0.5) ** 2)
+        )
+    ),
     "grit": lambda u, v, pitch, seed: normal_cdf(  # an even fine roughness, as stone
-        gaussian_field(u, v, (0.4 * pitch, 0.4 * pitch), seed + 9, terms=24)),
-}  # fmt: skip
+        gaussian_field(u, v, (0.4 * pitch, 0.4 * pitch), seed + 9, terms=24)
+    ),
+}
 
 PLATE = 5.0  # mm, the thickness of flat parts
 STROKE_RISE = 0.8  # mm, height of letters over their plate
@@ -204,8 +243,11 @@ class Shape:
 
     def __post_init__(self) -> None:
         tables: tuple[tuple[str, Collection[str]], ...] = (
-            ("primitive", PRIMITIVES), ("texture", TEXTURES), ("grain", GRAINS), ("letter", STROKES),
-        )  # fmt: skip
+            ("primitive", PRIMITIVES),
+            ("texture", TEXTURES),
+            ("grain", GRAINS),
+            ("letter", STROKES),
+        )
         for field, table in tables:
             name = getattr(self, field)
             if name not in table:
@@ -220,21 +262,26 @@ def base(shape: Shape, x: Array, y: Array) -> Array:
 
 def unroll(shape: Shape, x: Array, y: Array) -> tuple[Array, Array]:
     """Return places (u, v) in mm on the flattened surface, in the frame of the texture."""
-    xp, r = namespace(x), shape.size
+    xp = namespace(x)
+    r = shape.size
     if shape.primitive in ("cylinder", "screw"):
         x = r * xp.arcsin(xp.clip(x / r, -1, 1))
     elif shape.primitive == "sphere":
         away = xp.clip(xp.hypot(x, y) / r, 1e-6, 1)
         stretch = xp.arcsin(away) / away
-        x, y = x * stretch, y * stretch
-    c, s = math.cos(shape.texture_angle), math.sin(shape.texture_angle)
+        x = x * stretch
+        y = y * stretch
+    c = math.cos(shape.texture_angle)
+    s = math.sin(shape.texture_angle)
     return c * x + s * y, c * y - s * x
 
 
 def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
     """Return texture and grain at the unrolled places `u`, `v` mm, each from 0 (low) to 1 (high)."""
     if shape.texture in ("bark", "sand"):
-        s, t = u, v  # random already
+        # random already
+        s = u
+        t = v
     else:
         s, t = warp(u, v, shape.texture_pitch, shape.irregularity, shape.seed)
     texture = TEXTURES[shape.texture](s, t, shape.texture_pitch, shape.seed)
@@ -246,7 +293,8 @@ def height(shape: Shape, x: Array, y: Array) -> Array:
 
     The highest place of the primitive is 0, and texture and grain only lower it.
     """
-    x, y = _floating(x), _floating(y)
+    x = _floating(x)
+    y = _floating(y)
     z = base(shape, x, y)
     textured = shape.texture != "smooth" and shape.texture_depth > 0
     grained = shape.grain != "none" and shape.grain_depth > 0
@@ -255,12 +303,16 @@ def height(shape: Shape, x: Array, y: Array) -> Array:
     texture, grain = layers(shape, *unroll(shape, x, y))
     if textured:
         z = z - shape.texture_depth * (1 - texture)
-    return z - shape.grain_depth * (1 - grain) if grained else z
+    if grained:
+        return z - shape.grain_depth * (1 - grain)
+    return z
 
 
 def _floating(x: Array) -> Array:
     x = x if hasattr(x, "__array_namespace__") else np.asarray(x)
-    return x if x.dtype in (np.float32, np.float64) else x.astype(np.float32)
+    if x.dtype in (np.float32, np.float64):
+        return x
+    return x.astype(np.float32)
 
 
 def relief(shape: Shape, pixels: int, pitch: float) -> np.ndarray:
@@ -275,11 +327,16 @@ def _round_rim(t: Array, radius: float) -> Array:
     xp = namespace(t)
     end = radius * _STEEP / math.hypot(1, _STEEP)
     inner = xp.clip(t, 0, end)
-    return xp.sqrt(radius * radius - inner * inner) - radius - _STEEP * xp.clip(t - end, 0, math.inf)
+    return (
+        xp.sqrt(radius * radius - inner * inner) - radius - _STEEP * xp.clip(t - end, 0, math.inf)
+    )
 
 
 def _dome(square: Array, radius: float) -> Array:
-    return namespace(square).sqrt(namespace(square).clip(radius * radius - square, 0, math.inf)) - radius
+    return (
+        namespace(square).sqrt(namespace(square).clip(radius * radius - square, 0, math.inf))
+        - radius
+    )
 
 
 def _edge(shape: Shape, x: Array, y: Array) -> Array:
@@ -290,7 +347,10 @@ def _edge(shape: Shape, x: Array, y: Array) -> Array:
 def _corner(shape: Shape, x: Array, y: Array) -> Array:
     """A plate over x < 0, y < 0 whose rims and corner have radius `size`."""
     xp = namespace(x)
-    return _round_rim(xp.hypot(xp.clip(x + shape.size, 0, math.inf), xp.clip(y + shape.size, 0, math.inf)), shape.size)
+    return _round_rim(
+        xp.hypot(xp.clip(x + shape.size, 0, math.inf), xp.clip(y + shape.size, 0, math.inf)),
+        shape.size,
+    )
 
 
 def _cone(shape: Shape, x: Array, y: Array) -> Array:
@@ -302,7 +362,9 @@ def _cone(shape: Shape, x: Array, y: Array) -> Array:
 def _flat(shape: Shape, x: Array, y: Array) -> Array:
     """A round stamp with a flat face of radius `size`, its rim rounded by at most 0.5 mm within it."""
     rim = min(0.5, shape.size / 2)
-    return _round_rim(namespace(x).clip(namespace(x).hypot(x, y) - shape.size + rim, 0, math.inf), rim)
+    return _round_rim(
+        namespace(x).clip(namespace(x).hypot(x, y) - shape.size + rim, 0, math.inf), rim
+    )
 
 
 def thread_pitch(size: float) -> float:
@@ -312,10 +374,13 @@ def thread_pitch(size: float) -> float:
 
 def _screw(shape: Shape, x: Array, y: Array) -> Array:
     """A lying threaded rod of radius `size` along y; the thread winds, so its ridges lean."""
-    xp, pitch = namespace(x), thread_pitch(shape.size)
+    xp = namespace(x)
+    pitch = thread_pitch(shape.size)
     turn = xp.arcsin(xp.clip(x / shape.size, -1, 1)) / (2 * math.pi)
     wave = xp.cos(2 * math.pi * (y / pitch - turn))
-    return _dome(x * x + 0.0 * y, shape.size) - 0.5 * pitch * (0.5 - 0.5 / math.tanh(1.0) * xp.tanh(wave))
+    return _dome(x * x + 0.0 * y, shape.size) - 0.5 * pitch * (
+        0.5 - 0.5 / math.tanh(1.0) * xp.tanh(wave)
+    )
 
 
 _Point = tuple[float, float]
@@ -325,7 +390,9 @@ _Line = tuple[_Point, ...]
 def _arc(centre: _Point, radius: _Point, start: float, stop: float, pieces: int) -> _Line:
     """Return a polygon along an ellipse. Angles are in degrees, 0 to the right and growing downwards."""
     angles = [math.radians(start + (stop - start) * i / pieces) for i in range(pieces + 1)]
-    return tuple((centre[0] + radius[0] * math.cos(a), centre[1] + radius[1] * math.sin(a)) for a in angles)
+    return tuple(
+        (centre[0] + radius[0] * math.cos(a), centre[1] + radius[1] * math.sin(a)) for a in angles
+    )
 
 
 # Lines in a box of height 1 (x right, y down, the origin in the middle).
@@ -337,15 +404,25 @@ STROKES: dict[str, tuple[_Line, ...]] = {
     "K": (((-0.3, -0.5), (-0.3, 0.5)), ((0.33, -0.5), (-0.3, 0.08)), ((-0.08, -0.1), (0.36, 0.5))),
     "L": (((-0.26, -0.5), (-0.26, 0.5), (0.32, 0.5)),),
     "O": (_arc((0.0, 0.0), (0.4, 0.5), 0, 360, 14),),
-    "P": (((-0.28, 0.5), (-0.28, -0.5), (0.05, -0.5)), _arc((0.05, -0.22), (0.27, 0.28), -90, 90, 6),
-          ((0.05, 0.06), (-0.28, 0.06))),
-    "S": (_arc((0.0, -0.24), (0.29, 0.26), -20, -270, 8), _arc((0.0, 0.26), (0.31, 0.24), -90, 160, 8)),
+    "P": (
+        ((-0.28, 0.5), (-0.28, -0.5), (0.05, -0.5)),
+        _arc((0.05, -0.22), (0.27, 0.28), -90, 90, 6),
+        ((0.05, 0.06), (-0.28, 0.06)),
+    ),
+    "S": (
+        _arc((0.0, -0.24), (0.29, 0.26), -20, -270, 8),
+        _arc((0.0, 0.26), (0.31, 0.24), -90, 160, 8),
+    ),
     "T": (((-0.36, -0.5), (0.36, -0.5)), ((0.0, -0.5), (0.0, 0.5))),
-    "U": (((-0.32, -0.5), (-0.32, 0.18)), _arc((0.0, 0.18), (0.32, 0.32), 180, 0, 8), ((0.32, 0.18), (0.32, -0.5))),
+    "U": (
+        ((-0.32, -0.5), (-0.32, 0.18)),
+        _arc((0.0, 0.18), (0.32, 0.32), 180, 0, 8),
+        ((0.32, 0.18), (0.32, -0.5)),
+    ),
     "V": (((-0.36, -0.5), (0.0, 0.5), (0.36, -0.5)),),
     "X": (((-0.34, -0.5), (0.34, 0.5)), ((0.34, -0.5), (-0.34, 0.5))),
     "Z": (((-0.32, -0.5), (0.32, -0.5), (-0.32, 0.5), (0.32, 0.5)),),
-}  # fmt: skip
+}
 
 
 def _distance(letter: str, x: Array, y: Array) -> Array:
@@ -354,7 +431,8 @@ def _distance(letter: str, x: Array, y: Array) -> Array:
     nearest = 0.0 * x + 4.0
     for line in STROKES[letter]:
         for (ax, ay), (bx, by) in pairwise(line):
-            dx, dy = bx - ax, by - ay
+            dx = bx - ax
+            dy = by - ay
             share = xp.clip(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy), 0, 1)
             nearest = xp.minimum(nearest, (x - ax - share * dx) ** 2 + (y - ay - share * dy) ** 2)
     return xp.sqrt(nearest)
@@ -362,7 +440,8 @@ def _distance(letter: str, x: Array, y: Array) -> Array:
 
 def _letters(shape: Shape, x: Array, y: Array) -> Array:
     """A raised letter of height `size` on a plate `STROKE_RISE` below, strokes 0.16 size wide."""
-    xp, half = namespace(x), 0.08 * shape.size
+    xp = namespace(x)
+    half = 0.08 * shape.size
     d = _distance(shape.letter, x / shape.size, y / shape.size) * shape.size
     rim = min(0.35, half)
     side = _round_rim(xp.clip(d - half + rim, 0, math.inf), rim)
@@ -371,15 +450,29 @@ def _letters(shape: Shape, x: Array, y: Array) -> Array:
 
 PRIMITIVES: dict[str, Callable[[Shape, Array, Array], Array]] = {
     "sphere": lambda shape, x, y: _dome(x * x + y * y, shape.size),  # the upper half of a ball
-    "cylinder": lambda shape, x, y: _dome(x * x + 0.0 * y, shape.size),  # a lying rod along y, without ends
-    "edge": _edge, "corner": _corner, "cone": _cone,
+    "cylinder": lambda shape, x, y: _dome(
+        x * x + 0.0 * y, shape.size
+    ),  # a lying rod along y, without ends
+    "edge": _edge,
+    "corner": _corner,
+    "cone": _cone,
     # The upper half of a lying ring: `size` from its centre to the middle of a round bar of radius 0.3 size.
-    "ring": lambda shape, x, y: _dome((namespace(x).hypot(x, y) - shape.size) ** 2, 0.3 * shape.size),
-    "flat": _flat, "screw": _screw, "letters": _letters,
-}  # fmt: skip
+    "ring": lambda shape, x, y: _dome(
+        (namespace(x).hypot(x, y) - shape.size) ** 2, 0.3 * shape.size
+    ),
+    "flat": _flat,
+    "screw": _screw,
+    "letters": _letters,
+}
 
 
 def floor(shape: Shape) -> float:
     """Return the height of the table in mm, relative to the highest place."""
-    drop = {"sphere": shape.size, "cylinder": shape.size, "screw": shape.size, "ring": 0.3 * shape.size, "cone": 4.0}
+    drop = {
+        "sphere": shape.size,
+        "cylinder": shape.size,
+        "screw": shape.size,
+        "ring": 0.3 * shape.size,
+        "cone": 4.0,
+    }
     return -drop.get(shape.primitive, PLATE)

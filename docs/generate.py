@@ -1,4 +1,5 @@
-"""Pages of the documentation site that are made from the package: commands, API, results and tutorials.
+"""Pages of the documentation site that are made from the package: commands, API, results and
+tutorials.
 
 python -m docs.generate        writes docs/reference/, docs/results/ and docs/tutorials/
 """
@@ -41,7 +42,9 @@ _ROOMS = {
 
 
 def help_of(command: str) -> str:
-    """Return the help text of a command, 80 columns wide, without the frames that a terminal draws."""
+    """Return the help text of a command, 80 columns wide, without the frames that a terminal
+    draws.
+    """
     os.environ["COLUMNS"] = "80"
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
@@ -75,7 +78,10 @@ def api_page() -> str:
 
 
 def tutorial(notebook: Path, folder: Path) -> str:
-    """Return a notebook as a page: its text, its code and what that printed. Pictures go to `folder`."""
+    """Return a notebook as a page: its text, its code and what that printed.
+
+    Pictures go to `folder`.
+    """
     parts = [_LOW]
     for number, cell in enumerate(json.loads(notebook.read_text(encoding="utf-8"))["cells"]):
         source = "".join(cell["source"])

@@ -14,8 +14,8 @@ from anytouch_jax.errors import UserError
 def run_script(options: type, run: Callable[[Any], int], args: Sequence[str] | None = None) -> int:
     """Parse `args`, or the command line, into `options` and call `run`.
 
-    Return the exit status: that of `run`, 2 for a user's mistake (a number outside the range of its field, too) and 130
-    after Ctrl-C.
+    Return the exit status: that of `run`, 2 for a user's mistake (a number outside the range of its
+    field, too) and 130 after Ctrl-C.
     """
     import tyro
 
@@ -30,7 +30,8 @@ def run_script(options: type, run: Callable[[Any], int], args: Sequence[str] | N
 
 
 def runs_by_name(words: Sequence[str], known: Collection[str] = ()) -> dict[str, list[str]]:
-    """Return encoders by the names that they have in a table, from NAME=PATH or NAME=A,B,C for one a seed.
+    """Return encoders by the names that they have in a table, from NAME=PATH or NAME=A,B,C for one
+    a seed.
 
     Raises UserError for a path that is not there, and for a name that is not `known`, if names are.
     """

@@ -16,10 +16,11 @@ from anytouch_jax.weights import load
 
 
 def image_tower_encoder(path: str | Path) -> Encoder:
-    """Load the image tower of a stage-2 run (LoRA merged) or of CLIP weights as a touch encoder: no tactile training.
+    """Load the image tower of a stage-2 run (LoRA merged) or of CLIP weights as a touch encoder: no
+    tactile training.
 
-    A still gives the tower's embedding of that image, a clip that of its mean frame (the rows CLIP of Tables 1 to 4).
-    There are no sensor tokens. Raises UserError without an image tower.
+    A still gives the tower's embedding of that image, a clip that of its mean frame (the rows CLIP
+    of Tables 1 to 4). There are no sensor tokens. Raises UserError without an image tower.
     """
     loaded = load.load_model(path)
     model = loaded.config.model

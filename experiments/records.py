@@ -1,4 +1,6 @@
-"""Results of a study as one JSON-lines file: a line a run, named by its `key`, in the order of the keys."""
+"""Results of a study as one JSON-lines file: a line a run, named by its `key`, in the order of the
+keys.
+"""
 
 from __future__ import annotations
 
@@ -43,13 +45,18 @@ def _parsed(path: Path, *state: int) -> dict[str, Record]:
 
 
 def check_alike(path: Path, several: Iterable[Mapping[str, Any]]) -> None:
-    """Raise UserError for records of `path` whose values of one name differ: they make no table together."""
+    """Raise UserError for records of `path` whose values of one name differ: they make no table
+    together.
+    """
     if wrong := differences(several):
         raise UserError(f"{path}: runs differ ({wrong}). Make them again in one file.")
 
 
 def differences(several: Iterable[Mapping[str, Any]]) -> str:
-    """Return in words the values that differ under one name, empty for none. A name that is missing is no value."""
+    """Return in words the values that differ under one name, empty for none.
+
+    A name that is missing is no value.
+    """
     values: dict[str, set[str]] = {}
     for one in several:
         for name, value in one.items():
@@ -62,7 +69,8 @@ def differences(several: Iterable[Mapping[str, Any]]) -> str:
 def write_record(path: Path, key: str, record: Mapping[str, Any]) -> None:
     """Add a run to a file of results, or replace the run of the same key.
 
-    The file is rewritten as a whole, under a lock, so several processes may write to it. Raises OSError.
+    The file is rewritten as a whole, under a lock, so several processes may write to it. Raises
+    OSError.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with _locked(path.parent):
@@ -75,7 +83,10 @@ def write_record(path: Path, key: str, record: Mapping[str, Any]) -> None:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder. It ends with the block or with the process, and leaves no file behind."""
+    """Hold the lock of a folder.
+
+    It ends with the block or with the process, and leaves no file behind.
+    """
     import fcntl
 
     handle = os.open(folder, os.O_RDONLY)

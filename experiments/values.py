@@ -42,7 +42,9 @@ class Value(NamedTuple):
 
 
 def over_seeds(values: Sequence[float]) -> Value:
-    """Return the mean over seeds with its interval (Student's t); of two seeds the interval is the two values."""
+    """Return the mean over seeds with its interval (Student's t); of two seeds the interval is the
+    two values.
+    """
     mean = float(np.mean(values))
     count = len(values)
     if count < CLAIM:

@@ -1,4 +1,6 @@
-"""The strict ground all tests stand on: four CPU devices, no silent broadcasting, warnings are errors (pyproject)."""
+"""The strict ground all tests stand on: four CPU devices, no silent broadcasting, warnings are
+errors (pyproject).
+"""
 
 import ctypes
 import gc
@@ -7,22 +9,26 @@ import resource
 import sys
 from pathlib import Path
 
-# Set before jax is imported; child processes of the tests inherit it. The four devices below they do not.
+# Set before jax is imported; child processes of the tests inherit it. The four devices below they
+# do not.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# As the command does: jaxlib 0.10.1 logs a spurious error for a program that it reads from the cache.
+# As the command does: jaxlib 0.10.1 logs a spurious error for a program that it reads from the
+# cache.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax
 import pytest
 
-# Tests compile far more than they compute: both together make compilation five times faster. The flag is of jax 0.10;
-# another version might not know it, and XLA ends the process for a flag that it does not know.
+# Tests compile far more than they compute: both together make compilation five times faster. The
+# flag is of jax 0.10; another version might not know it, and XLA ends the process for a flag that
+# it does not know.
 if jax.__version_info__[:2] == (0, 10):
     os.environ["XLA_FLAGS"] = (
         os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
     )
 jax.config.update("jax_disable_most_optimizations", True)
-# Tracing makes many objects and no garbage: collecting it as often as usual takes a third of the time of tracing.
+# Tracing makes many objects and no garbage: collecting it as often as usual takes a third of the
+# time of tracing.
 gc.set_threshold(50_000, 20, 50)
 
 LIBC = ctypes.CDLL(None)
@@ -73,7 +79,9 @@ def compiled_once(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def _free_compiled_programs():
-    """Drop compiled programs where a worker has grown to 1.2 GB: one that keeps them all grows to 5."""
+    """Drop compiled programs where a worker has grown to 1.2 GB: one that keeps them all grows to
+    5.
+    """
     yield
     pages = int(STATM.read_text().split()[1]) if STATM.exists() else None
     if pages is not None and pages * resource.getpagesize() < 1.2e9:

@@ -1,7 +1,7 @@
 """The check before a release: `make release-check`, or `python -m tests.release`.
 
-It builds the wheel and the source archive, reads their metadata, installs the wheel into an empty environment, and runs
-the README's Python there. All of it stays in build/release.
+It builds the wheel and the source archive, reads their metadata, installs the wheel into an empty
+environment, and runs the README's Python there. All of it stays in build/release.
 """
 
 import os
@@ -23,7 +23,10 @@ BUILD = "import sys; from setuptools import build_meta; build_meta.build_{}(sys.
 
 
 def ran(*command: object, cwd: Path) -> str:
-    """Run a command without this project in its path, and return its output. Exit with its errors if it fails."""
+    """Run a command without this project in its path, and return its output.
+
+    Exit with its errors if it fails.
+    """
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(
         [*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False

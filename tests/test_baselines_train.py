@@ -25,7 +25,8 @@ def data(tmp_path_factory):
 @pytest.mark.parametrize(("name", "stage"), EVERY)
 def test_a_baseline_trains_and_embeds(data, tmp_path, name, stage):
     config = presets.apply_baseline(name, run_config(data, stage, batch=4, steps=4))
-    # The parameters of one still and one clip step are what two steps of the alternating order move.
+    # The parameters of one still and one clip step are what two steps of the alternating order
+    # move.
     result = train(
         replace(config, optim=replace(config.optim, warmup=1)), tmp_path / "r", stop_after=2
     )
@@ -40,7 +41,8 @@ def test_a_baseline_trains_and_embeds(data, tmp_path, name, stage):
         stage == 1 and name not in ("t3", "static_only", "no_dynamic")
     )
     if stage == 2:
-        # (Every touch of this world was felt by both sensors, so that withholding those texts leaves none.)
+        # (Every touch of this world was felt by both sensors, so that withholding those texts
+        # leaves none.)
         assert ("touch_to_text" in reported) == (
             name not in ("unitouch", "no_text", "no_text_aligned")
         )

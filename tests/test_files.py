@@ -125,7 +125,9 @@ class Terminal(io.StringIO):
 
 
 def screen_of(monkeypatch):
-    """Let the error stream be a terminal, from within a test: pytest replaces it between the phases of one."""
+    """Let the error stream be a terminal, from within a test: pytest replaces it between the phases
+    of one.
+    """
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
@@ -233,7 +235,9 @@ def test_a_configuration_shows_what_is_not_the_default(text):
 
 
 def test_a_sum_is_that_of_its_parts_whatever_the_number_of_rows() -> None:
-    """jaxlib 0.10.2 computes something else here, on CPUs, where more than 32,768 sums come out of one fusion."""
+    """jaxlib 0.10.2 computes something else here, on CPUs, where more than 32,768 sums come out of
+    one fusion.
+    """
     rng = np.random.default_rng(0)
     x, place, scale = (
         rng.normal(size=size).astype(np.float32)

@@ -123,7 +123,9 @@ def test_bfloat16_stays_near_float32():
 
 
 def align_batch():
-    """Four touches; images of rows 2 and 0, texts of rows 3, 2 and 1... and one slot of each that is not used."""
+    """Four touches; images of rows 2 and 0, texts of rows 3, 2 and 1... and one slot of each that
+    is not used.
+    """
     text = set_at(RNG.integers(1, 40, (4, 8)).astype(np.int32), (slice(None), slice(5, None)), 49)
     mask = np.asarray([[True] * 6 + [False] * 2] * 4)
     rows = np.asarray([2, 0, 4], np.int32), np.asarray([3, 2, 4, 0], np.int32)
@@ -293,7 +295,9 @@ def test_patches_that_matching_drops_have_no_influence(share, count):
 
 @pytest.mark.parametrize("stage", [1, 2])
 def test_no_key_is_used_twice(monkeypatch, stage):
-    """Masks, tokens and kept patches are drawn apart: a key that is used again ties them together."""
+    """Masks, tokens and kept patches are drawn apart: a key that is used again ties them
+    together.
+    """
     drawn = []
     uniform = jax.random.uniform
 
@@ -333,7 +337,9 @@ def test_a_batch_without_matching_or_without_alignment_costs_nothing_for_it():
 
 
 def drawn(monkeypatch, config, progress, rows=64):
-    """The sensor rows that stage 2 ends up with: (align, anchor, positive, negative), each (rows,)."""
+    """The sensor rows that stage 2 ends up with: (align, anchor, positive, negative), each
+    (rows,).
+    """
     received = []
 
     def spy(params, batch, noise, *, net, config, decoder_sensor, match_noise):
@@ -460,7 +466,8 @@ def test_devices_share_the_batch_and_change_nothing(stage, devices):
         np.testing.assert_allclose(a["grad_norm"], b["grad_norm"], rtol=1e-4)
     params = [flatten(merge(state.trainable, state.frozen)) for state in (many, one)]
     for name, value in params[1].items():
-        # A key's bias has no gradient but rounding noise, which Adam blows up to a step of the learning rate.
+        # A key's bias has no gradient but rounding noise, which Adam blows up to a step of the
+        # learning rate.
         noise = 2 * real_config(stage).optim.learning_rate if name.endswith("key/bias") else 1e-5
         np.testing.assert_allclose(params[0][name], value, rtol=0, atol=noise, err_msg=name)
     first = flatten(real_step(stage)[1].trainable)["touch/patch/kernel"]

@@ -37,9 +37,11 @@ def matched(frames: int, head: str) -> MatchBatch:
 
 
 def batches(config: Config, every: bool) -> list:
-    """Every kind of batch that the loader makes for a configuration, with and without photographs and captions.
+    """Every kind of batch that the loader makes for a configuration, with and without photographs
+    and captions.
 
-    Not `every`: the fullest and the emptiest alone, where the configuration changes no path of a kind.
+    Not `every`: the fullest and the emptiest alone, where the configuration changes no path of a
+    kind.
     """
     if config.stage == 1:
         return [touches(1), touches(4)]
@@ -58,7 +60,9 @@ def batches(config: Config, every: bool) -> list:
 
 
 def check(config: Config, every: bool = True) -> None:
-    """Compare the table with the walk through the program of the loss, for every parameter and kind of batch."""
+    """Compare the table with the walk through the program of the loss, for every parameter and kind
+    of batch.
+    """
     net = build(config.model)
     params = net.abstract()
     sizes = {name: leaf.size for name, leaf in flatten(params).items()}

@@ -115,7 +115,9 @@ def test_a_resumed_run_equals_one_run_bit_for_bit(straight, world, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", [1, 2])
 def test_two_steps_and_two_more_are_bit_for_bit_four_as_users_run_them(world, tmp_path, stage):
-    """Each part is its own process, on one device and with all of XLA's optimisations, unlike this process."""
+    """Each part is its own process, on one device and with all of XLA's optimisations, unlike this
+    process.
+    """
     settings = {
         key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))
     }

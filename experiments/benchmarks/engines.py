@@ -1,9 +1,12 @@
-"""One encoder by XLA, onnxruntime and OpenVINO: the time of one touch, and the error of its features.
+"""One encoder by XLA, onnxruntime and OpenVINO: the time of one touch, and the error of its
+features.
 
-    python -m experiments.benchmarks.engines anytouch-tiny --corpus data/corpus/fine/manifest.parquet
+    python -m experiments.benchmarks.engines anytouch-tiny --corpus
+    data/corpus/fine/manifest.parquet
 
-Engines take turns, a touch each, so quiet the machine first. int8 is calibrated on touches of the training split. A
-line an encoder and engine goes to `experiments/results/engines.jsonl`. The page of speed shows it.
+Engines take turns, a touch each, so quiet the machine first. int8 is calibrated on touches of the
+training split. A line an encoder and engine goes to `experiments/results/engines.jsonl`. The page
+of speed shows it.
 """
 
 from __future__ import annotations
@@ -46,7 +49,9 @@ BATCH = 16
 def touches_of(
     encoder: Encoder, table: Any, split: str, frames: int, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `count` prepared touches u8 (n, frames, H, W, 3) of a split, and their sensor rows (n,)."""
+    """Return `count` prepared touches u8 (n, frames, H, W, 3) of a split, and their sensor rows
+    (n,).
+    """
     rows = retrieval.deepest_rows(table, split=split, frames=frames)
     rows = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
     clips: list[np.ndarray] = []
@@ -73,7 +78,9 @@ def encoders_on(source: Encoder, table: Any, frames: int, folder: Path) -> dict[
 def errors(
     encoders: dict[str, Encoder], touches: tuple[np.ndarray, np.ndarray]
 ) -> dict[str, float]:
-    """Return the largest difference of features from the first engine, as a share of its largest feature."""
+    """Return the largest difference of features from the first engine, as a share of its largest
+    feature.
+    """
     found = {
         name: run_in_batches(
             lambda part, one=one: one.encode_touch(*part), zip(*touches, strict=True)
@@ -94,7 +101,9 @@ def one_touch(encoder: Encoder, frames: int) -> Callable[[np.ndarray], np.ndarra
 
 
 def timed(encoders: dict[str, Encoder], frames: int, rounds: int) -> dict[str, dict[str, Any]]:
-    """Return p50 and p99 of one touch in ms, and the ratio to the first engine in the same round."""
+    """Return p50 and p99 of one touch in ms, and the ratio to the first engine in the same
+    round.
+    """
     side = next(iter(encoders.values())).config.model.image_size
     touches = np.random.default_rng(0).integers(0, 256, (BATCH, 1, frames, side, side, 3), np.uint8)
     ready = {name: one_touch(encoder, frames) for name, encoder in encoders.items()}

@@ -1,10 +1,11 @@
-"""What an accelerator does in four minutes: endless simulation, training of tiny and ViT-L, embedding.
+"""What an accelerator does in four minutes: endless simulation, training of tiny and ViT-L,
+embedding.
 
     python -m experiments.benchmarks.gpu --minutes 4 --out experiments/results/variants.jsonl
 
-Each workload is printed and stored as soon as it is timed, and once more with its errors against float32. Nothing is
-started after the time is over. `--quick` rehearses it on a CPU. Only jax, flax, optax and numpy are needed, and what is
-not installed for the simulation is said in its row.
+Each workload is printed and stored as soon as it is timed, and once more with its errors against
+float32. Nothing is started after the time is over. `--quick` rehearses it on a CPU. Only jax, flax,
+optax and numpy are needed, and what is not installed for the simulation is said in its row.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ Row = dict[str, Any]
 
 
 def simulation(count: int, rounds: int) -> Row:
-    """Return frames a second of `sim.endless`: stills of 112 x 112 pixels, drawn and rendered on the device."""
+    """Return frames a second of `sim.endless`: stills of 112 x 112 pixels, drawn and rendered on
+    the device.
+    """
     from anytouch_jax.sim import endless, scene
 
     world = jax.device_put(endless.make_world(endless.objects_of(scene.Scenes(objects=40))))
@@ -73,7 +76,9 @@ def errors(work: Workload, fast: Variant) -> dict[str, float]:
 
 
 def measured(options: argparse.Namespace, end: float) -> Iterator[tuple[str, str, list[Row]]]:
-    """Yield preset, title and rows: of the simulation, then of each workload, without and with errors."""
+    """Yield preset, title and rows: of the simulation, then of each workload, without and with
+    errors.
+    """
     count, rounds = (4, 1) if options.quick else (TOUCHES, 5)
     try:
         yield "tiny", "endless simulation", [simulation(count, rounds)]

@@ -24,9 +24,12 @@ VECTORS = {"amx_tile": "AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
 
 @dataclass(frozen=True)
 class Machine:
-    """Where figures were measured. `memory_gib` is the host's, `load` the mean of its last minute, as it began.
+    """Where figures were measured.
 
-    `vectors` is the widest kind of vector instructions: AMX, AVX-512 or AVX2; empty where the system does not say.
+    `memory_gib` is the host's, `load` the mean of its last minute, as it began.
+
+    `vectors` is the widest kind of vector instructions: AMX, AVX-512 or AVX2; empty where the
+    system does not say.
     """
 
     device: str
@@ -85,10 +88,11 @@ def _cpuinfo(field: str) -> str:
 def matmul(
     dtype: str, size: int | None = None, precision: str | None = "highest"
 ) -> tuple[Callable[[], object], float]:
-    """(run, operations): `run` multiplies two square matrices of `dtype` on the first device and waits for the product.
+    """(run, operations): `run` multiplies two square matrices of `dtype` on the first device and
+    waits for the product.
 
-    float32 is full float32, unless `precision` (tensorfloat32) says otherwise; a 16-bit product keeps its type, but on
-    a CPU is float32, which alone is fast there (`nn/product.py`).
+    float32 is full float32, unless `precision` (tensorfloat32) says otherwise; a 16-bit product
+    keeps its type, but on a CPU is float32, which alone is fast there (`nn/product.py`).
     """
     size = size or SIZES.get(jax.default_backend(), 2048)
     rng = np.random.default_rng(0)

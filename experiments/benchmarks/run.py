@@ -2,8 +2,9 @@
 
     python -m experiments.benchmarks.run stage1 embed --preset small
 
-The variants take turns in one process. Quiet the machine first. Only jax, flax, optax and numpy are needed. What is
-done is stored at once. With `--out experiments/results/variants.jsonl` the page of speed has the times.
+The variants take turns in one process. Quiet the machine first. Only jax, flax, optax and numpy are
+needed. What is done is stored at once. With `--out experiments/results/variants.jsonl` the page of
+speed has the times.
 """
 
 from __future__ import annotations
@@ -99,7 +100,8 @@ def network(options: argparse.Namespace, what: str) -> Iterator[tuple[str, Rows]
         chosen = [one for one in known if not options.variants or one.name in options.variants]
         if not chosen:
             raise UserError(
-                f"{work.name} has no such variant. Choose among {'; '.join(one.name for one in known)}."
+                f"{work.name} has no such variant. Choose among "
+                f"{'; '.join(one.name for one in known)}."
             )
         try:
             rows = speed.measure(
@@ -138,7 +140,10 @@ def store(
     log(here.sentence())
     about |= {"machine": plain(here), "quick": options.quick}
     for preset, title, records in sections:
-        key = f"{preset}, {here.vectors if here.device == 'cpu' else here.device}{', quick' * options.quick}"
+        key = (
+            f"{preset}, "
+            f"{here.vectors if here.device == 'cpu' else here.device}{', quick' * options.quick}"
+        )
         before = read_records(options.out).get(key, {}).get("results", {})
         write_record(
             options.out, key, about | {"preset": preset, "results": before | {title: records}}

@@ -1,9 +1,10 @@
-"""Simulated touches: frames a second, error of the fast solver against the exact one, share of the roofline.
+"""Simulated touches: frames a second, error of the fast solver against the exact one, share of the
+roofline.
 
     python -m experiments.benchmarks.simulator --out experiments/results/simulator.jsonl
 
-One program serves all sensors, so a sensor is compiled only once for a size, a number of frames and a fidelity. It runs
-on any device of jax.
+One program serves all sensors, so a sensor is compiled only once for a size, a number of frames and
+a fidelity. It runs on any device of jax.
 """
 
 from __future__ import annotations
@@ -74,7 +75,9 @@ def timed(call: Any, rounds: int) -> tuple[float, float]:
 
 
 def errors(fast: SimulatedTouches, exact: SimulatedTouches) -> dict[str, float]:
-    """Return root mean squares of fast minus exact where the gel is touched: mm, kPa and grey levels."""
+    """Return root mean squares of fast minus exact where the gel is touched: mm, kPa and grey
+    levels.
+    """
     touched = np.asarray(exact.fields[..., 0]) > TOUCHED
     change = np.asarray(fast.fields - exact.fields)[touched]
     mm, kpa = np.sqrt(np.mean(change**2, 0)) if len(change) else (0.0, 0.0)
@@ -87,7 +90,9 @@ def errors(fast: SimulatedTouches, exact: SimulatedTouches) -> dict[str, float]:
 
 
 def peaks(size: int | None) -> tuple[float, float]:
-    """Return operations and bytes a second that this device reaches: a product of matrices, and a copy."""
+    """Return operations and bytes a second that this device reaches: a product of matrices, and a
+    copy.
+    """
     product, operations = machine.matmul("float32", size)
     block = jnp.ones(1 << (22 if size else 27), jnp.float32)
     copy = jax.jit(lambda x: x + 1).lower(block).compile()

@@ -1,7 +1,8 @@
 """Speed against error: variants of a workload in turns in one process, and a float64 reference.
 
-A variant's time is a ratio to the float32 baseline *of the same round*, so that a busy machine slows both. Errors are
-those of the same parameters and the same batch computed in float64. Imports nothing but jax, flax, optax, numpy.
+A variant's time is a ratio to the float32 baseline *of the same round*, so that a busy machine
+slows both. Errors are those of the same parameters and the same batch computed in float64. Imports
+nothing but jax, flax, optax, numpy.
 """
 
 from __future__ import annotations
@@ -38,12 +39,15 @@ _LATENCY_CALLS = 20  # calls a round of what is timed one sample at a time
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """The figures of a variant. Seconds and ratios are medians over rounds, `*_iqr` their interquartile ranges.
+    """The figures of a variant.
 
-    `operations`: useful ones a call (`workloads`); `peak_share` of the matrix product of the variant's own type, and
-    `float32_share` of the float32 one, in the same rounds. `error_*`: relative L2 against float64 (of the loss:
-    relative). `peak_bytes`: arguments, results and temporaries of the compiled program. `copies`: copy instructions in
-    it. `p50`, `p99`: seconds of single calls.
+    Seconds and ratios are medians over rounds, `*_iqr` their interquartile ranges.
+
+    `operations`: useful ones a call (`workloads`); `peak_share` of the matrix product of the
+    variant's own type, and `float32_share` of the float32 one, in the same rounds. `error_*`:
+    relative L2 against float64 (of the loss: relative). `peak_bytes`: arguments, results and
+    temporaries of the compiled program. `copies`: copy instructions in it. `p50`, `p99`: seconds of
+    single calls.
     """
 
     workload: str
@@ -79,11 +83,14 @@ class SpeedRow:
         return self.operations / self.seconds / 1e9
 
 
-# Error --------------------------------------------------------------------------------------------------------------
+# Error
+# --------------------------------------------------------------------------------------------------
 
 
 def errors(variants: Sequence[Variant], work: Workload, params: Tree) -> list[dict[str, float]]:
-    """Relative errors {"output", "loss", "gradient"} of each variant against float64, on a batch of a few samples."""
+    """Relative errors {"output", "loss", "gradient"} of each variant against float64, on a batch of
+    a few samples.
+    """
     small = work.resized(min(work.samples, ERROR_SAMPLES))
     rng = np.random.default_rng(1)
     noise = rng.random((small.samples, small.config.model.patches)).astype(np.float32)
@@ -132,13 +139,17 @@ def relative(found: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> float:
     return wrong**0.5
 
 
-# Timing -------------------------------------------------------------------------------------------------------------
+# Timing
+# --------------------------------------------------------------------------------------------------
 
 
 def interleaved(
     calls: Sequence[Callable[[], object]], rounds: int, repeats: Sequence[int] | None = None
 ) -> list[Any]:
-    """Seconds (rounds, repeats) of each call. All take turns, each round begins with another; one round warms up."""
+    """Seconds (rounds, repeats) of each call.
+
+    All take turns, each round begins with another; one round warms up.
+    """
     if rounds < 1 or not calls:
         raise UserError("a benchmark needs at least one round and one thing to time")
     repeats = repeats or [1] * len(calls)
@@ -164,7 +175,9 @@ def measure(
     peak_size: int | None = None,
     log: Log = lambda _: None,
 ) -> list[SpeedRow]:
-    """The rows of a workload, the baseline first. A variant that cannot be compiled or run here is a row with a note.
+    """The rows of a workload, the baseline first.
+
+    A variant that cannot be compiled or run here is a row with a note.
 
     Raises UserError when there is no round, or when the baseline itself fails.
     """
@@ -212,7 +225,8 @@ def measure(
             RuntimeError
         ) as error:  # most often out of memory: the times are still worth something
             log(
-                f"{work.name}: no errors, the float64 reference failed: {str(error).splitlines()[0]}"
+                f"{work.name}: no errors, the float64 reference failed: "
+                f"{str(error).splitlines()[0]}"
             )
     rows = [_row(p, times[i], times[0], best, wrong[i]) for i, p in enumerate(programs)]
     return rows + [_empty(work, variant, note) for variant, note in failed]
@@ -249,7 +263,10 @@ def _timed(
 def _those_that_run(
     programs: Sequence[Program], work: Workload, whole: Tree
 ) -> tuple[list[Program], list[tuple[Variant, str]]]:
-    """The programs whose first call succeeds, and the others with the reason. Raises UserError for the baseline."""
+    """The programs whose first call succeeds, and the others with the reason.
+
+    Raises UserError for the baseline.
+    """
     good = []
     failed = []
     for program in programs:
@@ -271,7 +288,9 @@ def _those_that_run(
 
 
 def step_calls(programs: Sequence[Program], state: Tree) -> list[Callable[[], object]]:
-    """A call is a step of training that goes on from the state that the call before left, whichever variant it was."""
+    """A call is a step of training that goes on from the state that the call before left, whichever
+    variant it was.
+    """
     held = [state]
     key = jax.random.key(0)
 

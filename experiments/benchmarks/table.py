@@ -1,4 +1,6 @@
-"""Rows of the benchmarks from their records: times of a step and of a touch, by kind of processor."""
+"""Rows of the benchmarks from their records: times of a step and of a touch, by kind of
+processor.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def _ratio(row: Mapping[str, Any]) -> Value:
 
 
 def rows_by_kind(folder: Path) -> dict[str, Rows]:
-    """Return rows of HEAD by kind of processor: AVX2, AMX, or the name of another processor or a GPU."""
+    """Return rows of HEAD by kind of processor: AVX2, AMX, or the name of another processor or a
+    GPU.
+    """
     result: dict[str, Rows] = {}
 
     def add(
@@ -94,11 +98,16 @@ def rows_by_kind(folder: Path) -> dict[str, Rows]:
 
 
 def simulated_table(folder: Path) -> Table:
-    """Return the speed of the simulator and the error of "fast" against "exact": means of sensors, then sensors."""
+    """Return the speed of the simulator and the error of "fast" against "exact": means of sensors,
+    then sensors.
+    """
     groups: dict[tuple[str, str], list[Record]] = {}
     for one in read_records(folder / "simulator.jsonl").values():
         device = one["machine"]["device"].replace("cpu", one["machine"].get("vectors", ""))
-        kind = f"{one['size']} pixels, {'stills' if one['frames'] == 1 else 'clips'}, {one['fidelity']}"
+        kind = (
+            f"{one['size']} pixels, {'stills' if one['frames'] == 1 else 'clips'}, "
+            f"{one['fidelity']}"
+        )
         groups.setdefault((device, kind), []).append(one)
         if one["sensor"] != "all" and (one["size"], one["frames"], one["fidelity"]) == (
             112,

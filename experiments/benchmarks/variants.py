@@ -49,7 +49,9 @@ _STEPS = (
 
 
 def variants_of(work: Workload, backend: str = "cpu") -> tuple[Variant, ...]:
-    """The variants worth a row for a workload, the baseline first; on a GPU those of its hardware."""
+    """The variants worth a row for a workload, the baseline first; on a GPU those of its
+    hardware.
+    """
     if backend != "cpu":
         fast = (
             BASELINE,
@@ -81,7 +83,8 @@ class Program:
     copies: int
 
 
-# Compiling ----------------------------------------------------------------------------------------------------------
+# Compiling
+# --------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -98,7 +101,10 @@ def cold() -> Iterator[None]:
 
 
 def compiled(variant: Variant, work: Workload, state: Tree) -> Program:
-    """Compile a variant, timed, cold. `state` is a TrainState, or parameters for an embedding (shapes will do)."""
+    """Compile a variant, timed, cold.
+
+    `state` is a TrainState, or parameters for an embedding (shapes will do).
+    """
     work = variant.of(work)
     batch = make_batch(work)
     if work.trains:

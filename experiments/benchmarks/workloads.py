@@ -1,6 +1,7 @@
 """Timed workloads: training steps and embeddings on made-up batches, and their useful operations.
 
-Imports nothing but jax, flax, optax, numpy and what of ours stands on them: a bare accelerator image can run it.
+Imports nothing but jax, flax, optax, numpy and what of ours stands on them: a bare accelerator
+image can run it.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ _STEPS = 1000
 
 @dataclass(frozen=True)
 class Workload:
-    """A thing to time: its name, its configuration, how many samples a call has and how many frames a sample."""
+    """A thing to time: its name, its configuration, how many samples a call has and how many frames
+    a sample.
+    """
 
     name: str
     config: Config
@@ -82,11 +85,14 @@ def workloads(
     )
 
 
-# Batches ------------------------------------------------------------------------------------------------------------
+# Batches
+# --------------------------------------------------------------------------------------------------
 
 
 def make_batch(work: Workload, seed: int = 0) -> TouchBatch | Stage2Batch:
-    """A made-up uint8 batch of a workload, the same for the same seed: noise, every sensor of the release's table."""
+    """A made-up uint8 batch of a workload, the same for the same seed: noise, every sensor of the
+    release's table.
+    """
     rng = np.random.default_rng(seed)
     side = work.config.model.image_size
 
@@ -131,7 +137,8 @@ def _captions(
     return ids, at <= words[:, None]
 
 
-# Programs -----------------------------------------------------------------------------------------------------------
+# Programs
+# --------------------------------------------------------------------------------------------------
 
 
 def first_state(config: Config) -> Tree:
@@ -145,7 +152,9 @@ def abstract_state(config: Config) -> Tree:
 
 
 def step_of(config: Config, mesh: Mesh | None = None) -> Callable[..., Any]:
-    """The training step of a configuration, as `train.loop.fit` builds it: (state, batch, key) -> (state, metrics)."""
+    """The training step of a configuration, as `train.loop.fit` builds it: (state, batch, key) ->
+    (state, metrics).
+    """
     loss = objectives.stage1_loss if config.stage == 1 else objectives.stage2_loss
     loss_fn: Callable[..., Any] = partial(loss, net=build(config.model), config=config)
     loss_fn = loss_fn if mesh is None else gathering(loss_fn, mesh)
@@ -154,7 +163,9 @@ def step_of(config: Config, mesh: Mesh | None = None) -> Callable[..., Any]:
 
 
 def embed_of(config: Config) -> Callable[..., jax.Array]:
-    """(params, clip u8, sensor) -> features (B, E) float32, as `evaluate.features` computes them."""
+    """(params, clip u8, sensor) -> features (B, E) float32, as `evaluate.features` computes
+    them.
+    """
     net = build(config.model)
 
     def embed(params: Tree, clip: jax.Array, sensor: jax.Array) -> jax.Array:
@@ -166,10 +177,12 @@ def embed_of(config: Config) -> Callable[..., jax.Array]:
 
 
 def values_of(config: Config, trains: bool = True) -> Callable[..., dict[str, Any]]:
-    """(params, normalised batch, noise) -> {"output", and for a training step "loss" and "gradient"}.
+    """(params, normalised batch, noise) -> {"output", and for a training step "loss" and
+    "gradient"}.
 
-    Nothing is drawn inside, so that the same call in float64 is the reference of all others. The output of stage 1 is
-    the painted pixels, of alignment and matching the touch embeddings, of an embedding itself.
+    Nothing is drawn inside, so that the same call in float64 is the reference of all others. The
+    output of stage 1 is the painted pixels, of alignment and matching the touch embeddings, of an
+    embedding itself.
     """
     net = build(config.model)
 
@@ -228,11 +241,14 @@ def normalised(batch: Any) -> Any:
     return batch._replace(align=align, match=match)
 
 
-# Useful operations ----------------------------------------------------------------------------------------------------
+# Useful operations
+# --------------------------------------------------------------------------------------------------
 
 
 def products(jaxpr: Any) -> float:
-    """Return the operations of the matrix products and convolutions of a jaxpr; a loop's body counts for each turn."""
+    """Return the operations of the matrix products and convolutions of a jaxpr; a loop's body
+    counts for each turn.
+    """
     total = 0.0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name

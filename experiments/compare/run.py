@@ -1,10 +1,11 @@
 """Encoders compared: what each family costs, and with your files what it knows.
 
-    python -m experiments.compare.run
-    python -m experiments.compare.run --encoders a=FILE b=FILE --data manifest.parquet --label material
+    python -m experiments.compare.run python -m experiments.compare.run --encoders a=FILE b=FILE
+    --data manifest.parquet --label material
 
-Each figure is a line of `experiments/results/compare.jsonl`, and the page of speed has a table of them. Figures of your
-own encoders go to `runs/compare/compare.jsonl`, or to the file of `--out`, with a page next to it.
+Each figure is a line of `experiments/results/compare.jsonl`, and the page of speed has a table of
+them. Figures of your own encoders go to `runs/compare/compare.jsonl`, or to the file of `--out`,
+with a page next to it.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ YOURS = Path("runs/compare/compare.jsonl")
 
 @dataclass(frozen=True)
 class Options:
-    """Compare encoders of several families: costs of untrained copies, and accuracy of your files."""
+    """Compare encoders of several families: costs of untrained copies, and accuracy of your
+    files.
+    """
 
     encoders: tuple[str, ...] = ()  # NAME=FILE of each encoder whose accuracy is wanted.
     data: tuple[Path, ...] = ()  # Manifests for the accuracy.
@@ -53,7 +56,9 @@ class Options:
 
 
 def costs(encoder: Encoder, repeats: int) -> dict[str, Any]:
-    """Return parameters, operations, memory and times of one touch, in float32, with its smallest number of frames."""
+    """Return parameters, operations, memory and times of one touch, in float32, with its smallest
+    number of frames.
+    """
     frames = encoder.config.model.frames if hasattr(encoder, "form") else 1
     frame = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     gel = np.full_like(frame, 90)
@@ -87,7 +92,9 @@ def costs(encoder: Encoder, repeats: int) -> dict[str, Any]:
 
 
 def _times(call: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """Return the shortest time of a call, and the median processor time of all its threads, in milliseconds."""
+    """Return the shortest time of a call, and the median processor time of all its threads, in
+    milliseconds.
+    """
     walls = []
     processor = []
     for _ in range(repeats):

@@ -1,9 +1,11 @@
-"""Which of 50 look-alikes is the same touch, by another sensor? Encoders and raw pixels on objects never trained on.
+"""Which of 50 look-alikes is the same touch, by another sensor? Encoders and raw pixels on objects
+never trained on.
 
-    python -m experiments.encoders.lookalikes anytouch-tiny --fine data/corpus/fine --coarse data/corpus/coarse
+    python -m experiments.encoders.lookalikes anytouch-tiny --fine data/corpus/fine --coarse
+    data/corpus/coarse
 
-Queries and galleries are the deepest frames of the test split. The other 49 resemble the touch most in place, depth and
-force.
+Queries and galleries are the deepest frames of the test split. The other 49 resemble the touch most
+in place, depth and force.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ from experiments.records import write_record
 
 
 def recall(encoders: dict[str, Encoder], path: Path) -> dict[str, Any]:
-    """Return the recall@1 and its interval over objects of each encoder, and of pixels, on the test split."""
+    """Return the recall@1 and its interval over objects of each encoder, and of pixels, on the test
+    split.
+    """
     table = manifests.read(path)
     rows = retrieval.deepest_rows(table, table.rows_of("test"))
     features = {

@@ -4,9 +4,9 @@
     python -m experiments.encoders.measure calibrate runs/anytouch-tiny
     python -m experiments.encoders.measure test anytouch-tiny
 
-`train` trains the decoder alone, so features stay as they are. `calibrate` scales the deviations on objects of the
-validation split, and writes the folder again. `test` measures errors on objects of the test split, by sensor, and
-writes `measure.jsonl`. Both see new units of the sensors only.
+`train` trains the decoder alone, so features stay as they are. `calibrate` scales the deviations on
+objects of the validation split, and writes the folder again. `test` measures errors on objects of
+the test split, by sensor, and writes `measure.jsonl`. Both see new units of the sensors only.
 """
 
 from __future__ import annotations
@@ -64,7 +64,9 @@ def sampling(frames: int, *, wild: float, free: float) -> endless.Sampling:
 
 
 def world_of(split: Any, variants: int = 1, sensors: tuple[str, ...] = ()) -> endless.World:
-    """Return the world of the objects of a split, with those kinds held out that training of the encoder held out."""
+    """Return the world of the objects of a split, with those kinds held out that training of the
+    encoder held out.
+    """
     settings = SimulatedConfig()
     scenes = scene.Scenes(objects=settings.objects, seed=settings.seed, depth=settings.depth)
     things = endless.objects_of(scenes, split, variants=variants)
@@ -81,7 +83,9 @@ def batches(
     moved: bool = False,
     **options: float,
 ) -> Iterator[FieldBatch]:
-    """Yield batches with normalised pixels and sensor rows: three of stills, which cost less, then one of clips."""
+    """Yield batches with normalised pixels and sensor rows: three of stills, which cost less, then
+    one of clips.
+    """
     rows = np.array(
         [config.model.sensor_row(name) for name in SimulatedConfig().sensors]
         + [config.model.universal_row]
@@ -119,7 +123,9 @@ def calibrate(folder: Path) -> None:
 
 
 def train(model: str, minutes: float, out: Path) -> None:
-    """Train the decoder on endless touches and untouched gels that moved a little, and write the encoder to `out`."""
+    """Train the decoder on endless touches and untouched gels that moved a little, and write the
+    encoder to `out`.
+    """
     path = locate(model)
     loaded = load_model(path)
     folder = path if path.is_dir() else path.parent
@@ -175,7 +181,9 @@ def subtracted(config: Config) -> Config:
 def collect(
     params: Any, config: Config, split: str, count: int, size: int = 32
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Return errors and deviations of every quantity, in units of the outputs, over new touches of a split."""
+    """Return errors and deviations of every quantity, in units of the outputs, over new touches of
+    a split.
+    """
     net = build(config.model)
     measure = jax.jit(net.measure)
     errors: dict[str, dict[str, list[np.ndarray]]] = {
@@ -217,10 +225,12 @@ def collect(
 def scores(
     params: Any, config: Config, sensor: str, factors: dict[str, float], touches: int = 192
 ) -> dict[str, float]:
-    """Return the errors of one sensor on new units and objects of the test split, stills and clips together.
+    """Return the errors of one sensor on new units and objects of the test split, stills and clips
+    together.
 
-    `false_contact` and `false_force` are shares of gels that nothing touches, but that moved a little since the picture
-    of them: those with a pixel of contact, and those with more than 0.05 N.
+    `false_contact` and `false_force` are shares of gels that nothing touches, but that moved a
+    little since the picture of them: those with a pixel of contact, and those with more than 0.05
+    N.
     """
     world = world_of("test", sensors=(sensor,))
     row = config.model.sensor_row(sensor)
@@ -256,7 +266,9 @@ def scores(
 
 
 def dots_errors(out: FieldOutput, batch: FieldBatch, touch: Any) -> dict[str, np.ndarray]:
-    """Return where shear and force along gels with dots are within 20 degrees, and within one deviation."""
+    """Return where shear and force along gels with dots are within 20 degrees, and within one
+    deviation.
+    """
     found = {name: [np.zeros(0)] for name in ("dots_shear", "dots_inside", "drag", "drag_inside")}
     aspects = np.exp(batch.aspect)
     for row, (gel, clip, width) in enumerate(

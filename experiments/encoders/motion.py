@@ -1,11 +1,13 @@
-"""Which way does the object turn or slide? A small antisymmetric head on the patch tokens of a frozen encoder.
+"""Which way does the object turn or slide? A small antisymmetric head on the patch tokens of a
+frozen encoder.
 
     python -m experiments.encoders.motion anytouch-tiny --data data/corpus/*/manifest.parquet
 
-Features that are averaged over a picture say little about the sign of a turn. The head reads a vector from every patch:
-how its token differs from that of the clip played backwards. A clip has the first, the middle and the last touched
-frame, and its tokens are those after a third and two thirds of the blocks. Playing it backwards turns all vectors
-around. A turn is the sum of the vectors' moments about the touched place, a slide is their mean.
+Features that are averaged over a picture say little about the sign of a turn. The head reads a
+vector from every patch: how its token differs from that of the clip played backwards. A clip has
+the first, the middle and the last touched frame, and its tokens are those after a third and two
+thirds of the blocks. Playing it backwards turns all vectors around. A turn is the sum of the
+vectors' moments about the touched place, a slide is their mean.
 """
 
 from __future__ import annotations
@@ -43,7 +45,9 @@ TOUCHED = 0.08  # mm of the deepest point that count as contact
 
 
 class Clips(NamedTuple):
-    """Tokens f16 (n, 2, P, E) of clips played backwards and forwards, with columns (n,) of the manifest."""
+    """Tokens f16 (n, 2, P, E) of clips played backwards and forwards, with columns (n,) of the
+    manifest.
+    """
 
     tokens: Array
     turn: Array
@@ -54,7 +58,9 @@ class Clips(NamedTuple):
 
 
 def read(encoder: Encoder, paths: list[Path], most: int) -> Clips:
-    """Embed clips that turn or slide, at most `most` of them, and those of the training split in a mirror too."""
+    """Embed clips that turn or slide, at most `most` of them, and those of the training split in a
+    mirror too.
+    """
     manifest = manifests.read(paths)
     names = ("label.twist", "label.slide", "sensor", "split", "touch")
     columns = {name: manifest.text_column(name) for name in names}
@@ -116,7 +122,8 @@ def init(width: int, seed: int = 0) -> dict[str, jax.Array]:
 
 
 def head(params: dict[str, jax.Array], tokens: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the logit of a clockwise turn (B,) and those of SLIDES (B, 4) of token pairs (B, 2, P, E).
+    """Return the logit of a clockwise turn (B,) and those of SLIDES (B, 4) of token pairs (B, 2, P,
+    E).
 
     Exchanging the pair changes the sign of the turn, and exchanges left and right, up and down.
     """
@@ -183,7 +190,9 @@ def fit(clips: Clips, train: Array, val: Array) -> dict[str, jax.Array]:
 
 
 def score(params: dict[str, jax.Array], clips: Clips, rows: Array) -> dict[str, Any]:
-    """Return the shares of turns and slides named right on `rows`, with 95 % intervals over touches."""
+    """Return the shares of turns and slides named right on `rows`, with 95 % intervals over
+    touches.
+    """
     x = (clips.tokens[rows] - np.asarray(params["mean"])) / np.asarray(params["spread"])
     logit, logits = jax.jit(head)({name: params[name] for name in init(1)}, x.astype(np.float32))
     named = {
@@ -203,7 +212,9 @@ def score(params: dict[str, jax.Array], clips: Clips, rows: Array) -> dict[str, 
 
 
 def pooled_score(clips: Clips, splits: dict[str, Array]) -> float:
-    """Return the share of test turns that a linear probe names right on the change of the mean token."""
+    """Return the share of test turns that a linear probe names right on the change of the mean
+    token.
+    """
     change = (clips.tokens[:, 1].astype(np.float32) - clips.tokens[:, 0]).mean(1)
     rows = {split: one[clips.turn[one] != "none"] for split, one in splits.items()}
     models = heads.linear_path(change[rows["train"]], clips.turn[rows["train"]], (1.0, 0.1, 0.01))

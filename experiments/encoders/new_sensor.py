@@ -1,14 +1,17 @@
-"""A known sensor as if it was new: fitted from pictures of one device, adapted by simulation, then asked.
+"""A known sensor as if it was new: fitted from pictures of one device, adapted by simulation, then
+asked.
 
     python -m experiments.encoders.new_sensor anytouch-tiny --minutes 4
 
-A simulated device of DIGIT, GelSlim and 9DTact has hidden parameters. Its tokens are trained on simulated touches of
-the fitted sensor alone. Then the device itself, of the hidden parameters, touches held-out objects: which of some 150
-touches by other sensors is the same, how deep, and how hard? A GelSight Mini is fitted to real pictures, and asked for
-real objects. The parts of the encoder that all sensors share have met every sensor in training. But those of
-commit 7546a43 had not met the colours that a GelSight Mini has now:
+A simulated device of DIGIT, GelSlim and 9DTact has hidden parameters. Its tokens are trained on
+simulated touches of the fitted sensor alone. Then the device itself, of the hidden parameters,
+touches held-out objects: which of some 150 touches by other sensors is the same, how deep, and how
+hard? A GelSight Mini is fitted to real pictures, and asked for real objects. The parts of the
+encoder that all sensors share have met every sensor in training. But those of commit 7546a43 had
+not met the colours that a GelSight Mini has now:
 
-    python -m experiments.encoders.new_sensor WEIGHTS --sensors gelsight_mini --ball-mm 6.31 --title "colours unseen"
+    python -m experiments.encoders.new_sensor WEIGHTS --sensors gelsight_mini --ball-mm 6.31 --title
+    "colours unseen"
 """
 
 from __future__ import annotations
@@ -56,7 +59,9 @@ BATCHES = 8
 
 @partial(jax.jit, static_argnames="sampling")
 def device_touches(key: Any, world: Any, unit: Any, sampling: Sampling) -> Any:
-    """Return COUNT touches, each by a known sensor and by one device of family 0, which every touch shares."""
+    """Return COUNT touches, each by a known sensor and by one device of family 0, which every touch
+    shares.
+    """
     drawn = endless.draw_touches(key, world, sampling, COUNT, 0)
     own = jax.tree.map(lambda old, one: old.at[:, 1].set(one), drawn.clip.unit, unit)
     numbers = jax.tree.map(lambda old, one: old.at[:, 1].set(one[0]), drawn.numbers, world.families)
@@ -76,9 +81,11 @@ def adapted_to(
     seed: int,
     ball_mm: float | None = None,
 ) -> tuple[Encoder, str, dict[str, Any]]:
-    """Return an encoder with tokens for the sensor of these pictures, the name of the tokens, and how it was fitted.
+    """Return an encoder with tokens for the sensor of these pictures, the name of the tokens, and
+    how it was fitted.
 
-    Tokens that find fewer touches than the universal ones are refused: then the universal ones stay.
+    Tokens that find fewer touches than the universal ones are refused: then the universal ones
+    stay.
     """
     mine = folder / f"my_{name}.sensor"
     run = folder / f"run_{name}"
@@ -185,7 +192,9 @@ def _mean(errors: list[dict[str, np.ndarray]], name: str) -> dict[str, Any]:
 def real_study(
     encoder: Encoder, pack: Path, folder: Path, minutes: float, seed: int
 ) -> dict[str, Any]:
-    """Return scores on real objects of a GelSight Mini whose look is fitted to its real pictures of training."""
+    """Return scores on real objects of a GelSight Mini whose look is fitted to its real pictures of
+    training.
+    """
     data = recordings.read(pack)
     score = data.manifest.number_column("label.contact_score")
     pressed = np.flatnonzero((data.split == "train") & (data.finger == "cam0") & (score > PRESSED))

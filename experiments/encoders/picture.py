@@ -15,7 +15,9 @@ import anytouch_jax as at
 
 
 def draw(out: Path, model: str = "anytouch-tiny") -> None:
-    """Draw the touches, one row a press and one column a sensor, beside the cosines of their centred features."""
+    """Draw the touches, one row a press and one column a sensor, beside the cosines of their
+    centred features.
+    """
     encoder = at.load_encoder(model)
     touches = at.example_touches()
     frames = np.stack([encoder.preprocess(touch.frame, touch.background) for touch in touches])

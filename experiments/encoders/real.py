@@ -1,10 +1,12 @@
-"""The real recordings that the shipped encoders are trained on: a copy of what two packs of real touch allow.
+"""The real recordings that the shipped encoders are trained on: a copy of what two packs of real
+touch allow.
 
     python -m experiments.encoders.real ../shared/real_touch2 ../shared/real_touch --out data/real
 
-Taken are train rows of a GelSight Mini or a 9DTact, with a background and a licence for commercial use. The slip clips
-of the first pack are left out, since the second pack has them with other splits. A touch of the second pack is a group
-of grasps: recordings of one object, by either finger, whose contact pictures agree.
+Taken are train rows of a GelSight Mini or a 9DTact, with a background and a licence for commercial
+use. The slip clips of the first pack are left out, since the second pack has them with other
+splits. A touch of the second pack is a group of grasps: recordings of one object, by either finger,
+whose contact pictures agree.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ def copy(
 
 
 def _shrink(source: Path, target: Path) -> None:
-    """Write a picture with a short side of SHORT pixels at most, so that all of them fit an upload."""
+    """Write a picture with a short side of SHORT pixels at most, so that all of them fit an
+    upload.
+    """
     image = cv2.imread(str(source))
     scale = min(1.0, SHORT / min(image.shape[:2]))
     image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -1,10 +1,12 @@
 """Training of the encoder in the package: stage 1, stage 2, then the folder with its card.
 
-    python -m experiments.encoders.train --minutes 12 --real data/real/pack2/manifest.csv --out runs/anytouch-tiny
+    python -m experiments.encoders.train --minutes 12 --real data/real/pack2/manifest.csv --out
+    runs/anytouch-tiny
 
-Each stage gets a share of the time, compilation included, and its schedule follows the time. The next call starts from
-the weights in OUT/state, on this machine or another, and trains stage 2 again for its whole time: a cycle. Touches are
-simulated in the training program. With a GPU the batches are large and the arithmetic has 16 bits.
+Each stage gets a share of the time, compilation included, and its schedule follows the time. The
+next call starts from the weights in OUT/state, on this machine or another, and trains stage 2 again
+for its whole time: a cycle. Touches are simulated in the training program. With a GPU the batches
+are large and the arithmetic has 16 bits.
 """
 
 from __future__ import annotations
@@ -58,7 +60,8 @@ STAGES: dict[int, dict[str, Any]] = {
         "data.clip_share": 0.34,
     },
 }
-# Device: touches of a batch of stage 1, pairs of stage 2, share of the patches that matching encodes, more settings.
+# Device: touches of a batch of stage 1, pairs of stage 2, share of the patches that matching
+# encodes, more settings.
 DEVICES: dict[str, tuple[int, int, float, dict[str, Any]]] = {
     "gpu": (1024, 640, 0.6, {"model.dtype": "bfloat16"}),
     "cpu": (32, 32, 0.5, {"simulated.reuse": 4}),
@@ -126,7 +129,8 @@ def main() -> None:
         config = configure(stage, given.real, cycle, changes)
         result = pretrain(config, run, init=init, log=log, until=until)
         log(
-            f"stage {stage}: {result.step} steps of {config.data.batch_size}, loss {result.metrics.get('loss')}"
+            f"stage {stage}: {result.step} steps of {config.data.batch_size}, loss "
+            f"{result.metrics.get('loss')}"
         )
         if result.interrupted:
             raise SystemExit(130)

@@ -1,4 +1,5 @@
-"""Run the notebooks again in place: `python -m experiments.notebooks.execute [01 04 ...]`, or `make notebooks`.
+"""Run the notebooks again in place: `python -m experiments.notebooks.execute [01 04 ...]`, or `make
+notebooks`.
 
 Each runs in an own process. Its outputs are stored without what libraries print to standard error.
 """

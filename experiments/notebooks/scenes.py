@@ -23,7 +23,9 @@ DEMO = Path(__file__).resolve().parents[2] / "runs" / "demo" / "scenes"  # those
 
 
 def scenes() -> at.Manifest:
-    """Return the manifest of the scenes of `make demo`, or of the folder SCENES. They are simulated if missing."""
+    """Return the manifest of the scenes of `make demo`, or of the folder SCENES. They are simulated
+    if missing.
+    """
     folder = Path(os.environ.get("SCENES") or DEMO)
     if not (folder / "manifest.parquet").exists():
         simulate(Scenes(touches=500, objects=250, size=128), folder)
@@ -56,7 +58,9 @@ def small(config: at.Config, steps: int, batch: int) -> at.Config:
 
 
 def deepest(table: at.Manifest, split: str, most: int) -> np.ndarray:
-    """Return the rows (n,) of the deepest frame of up to `most` touches of a split, by every sensor."""
+    """Return the rows (n,) of the deepest frame of up to `most` touches of a split, by every
+    sensor.
+    """
     rows = deepest_rows(table, table.rows_of(split))
     touches = table.text_column("touch")[rows]
     return rows[np.isin(touches, np.unique(touches)[:most])]
@@ -68,7 +72,9 @@ def embed(encoder: at.Encoder, table: at.Manifest, rows: np.ndarray) -> np.ndarr
 
 
 def small_pictures(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
-    """Return the change of pictures from the untouched gel as features (n, d): what needs no encoder."""
+    """Return the change of pictures from the untouched gel as features (n, d): what needs no
+    encoder.
+    """
     size = (24, 24)
     changes = [
         cv2.resize(decode(table.file(int(row))), size).astype(np.float32)

@@ -39,7 +39,10 @@ PAGES: Mapping[str, tuple[str, Callable[[Path], Page]]] = {
 
 
 def pages(folder: Path) -> list[Page]:
-    """Return the pages of a folder, for the data that are there. Raises UserError for data that make no page."""
+    """Return the pages of a folder, for the data that are there.
+
+    Raises UserError for data that make no page.
+    """
     made = []
     for data, make in PAGES.values():
         name, _, question = data.partition("/")
@@ -60,7 +63,8 @@ def index(several: list[Page]) -> str:
     table = page.markdown(Table("", ("question", "answer", "figure", "page"), rows))
     table = re.sub(r"\[(\w+)]\\\(\1\.md\)", r"[\1](\1.md)", table)
     return (
-        "# Results\n\nEach page answers one question. It is made from its data alone, by `make results`. An interval "
+        "# Results\n\nEach page answers one question. It is made from its data alone, by `make "
+        "results`. An interval "
         f"is one of 95 %.\n\n{table}\n\n[What was tried](tried.md) lists studies that have left.\n"
     )
 
@@ -73,13 +77,17 @@ def tried(folder: Path) -> str:
     ]
     table = page.markdown(Table("", ("question", "answer", "figure", "code at"), rows))
     return (
-        "# What was tried\n\nThese studies have answered their question, and their code has left. It last ran at the "
-        f"commit in the last column. Differences are in points, with intervals of 95 %.\n\n{table}\n"
+        "# What was tried\n\nThese studies have answered their question, and their code has left. "
+        "It last ran at the "
+        "commit in the last column. Differences are in points, with intervals of 95 "
+        f"%.\n\n{table}\n"
     )
 
 
 def readme(text: str, several: list[Page]) -> str:
-    """Return the README with the values of the pages that its table links to, written as `name` 1.2 %."""
+    """Return the README with the values of the pages that its table links to, written as `name` 1.2
+    %.
+    """
     lines = text.splitlines(keepends=True)
     for one in several:
         for name, value in one.readme.items():
@@ -92,7 +100,10 @@ def readme(text: str, several: list[Page]) -> str:
 
 
 def write(folder: Path) -> list[Path]:
-    """Write the pages, their figures and the front page of a folder, and return the pages. Raises UserError."""
+    """Write the pages, their figures and the front page of a folder, and return the pages.
+
+    Raises UserError.
+    """
     several = pages(folder)
     texts = {one.name: page.text(one) for one in several} | {"README": index(several)}
     if (folder / TRIED).exists():

@@ -1,4 +1,6 @@
-"""Rows and findings of the encoders in the package: real recordings, look-alikes, motion and trust."""
+"""Rows and findings of the encoders in the package: real recordings, look-alikes, motion and
+trust.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +99,8 @@ def motion(folder: Path) -> Page:
             for row, found in scores.items()
         ]
         findings.append(
-            f"`{name}`: the head names {own[0][2].mean:.0f} % of turns of new objects. A linear probe on "
+            f"`{name}`: the head names {own[0][2].mean:.0f} % of turns of new objects. A linear "
+            "probe on "
             f"the mean token names {100 * record['pooled']:.0f} %."
         )
         rows += own
@@ -135,7 +138,8 @@ def measure(folder: Path) -> Page:
     findings = [
         f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
         *(
-            f"{name}: the radius is off by {100 * one['radius'][0]:.0f} %, the centre by {one['centre'][0]:.2f} mm."
+            f"{name}: the radius is off by {100 * one['radius'][0]:.0f} %, the centre by "
+            f"{one['centre'][0]:.2f} mm."
             for name, one in balls.items()
         ),
     ]
@@ -207,7 +211,8 @@ def new_sensor(folder: Path) -> Page:
         found = {kind: value(record, "scores", kind, 100) for kind in kinds}
         refused = "" if steps else " (refused: the universal tokens stay)"
         gains.append(
-            f"{key}: {found['universal'].mean:.0f} % with universal tokens, {found['adapted'].mean:.0f} % "
+            f"{key}: {found['universal'].mean:.0f} % with universal tokens, "
+            f"{found['adapted'].mean:.0f} % "
             f"adapted{refused}, {found['own'].mean:.0f} % with its own."
         )
     return Page("new_sensor", [rows], gains)
@@ -220,7 +225,8 @@ def trust(folder: Path) -> Page:
         by_kind.setdefault(key.partition("/")[0], {})[key.partition("/")[2]] = one
     if lost := {"trust", "health"} - by_kind.keys():
         raise UserError(
-            f"{folder / 'trust.jsonl'} has no record of {min(lost)}. Run experiments.real.trust first."
+            f"{folder / 'trust.jsonl'} has no record of {min(lost)}. Run experiments.real.trust "
+            "first."
         )
     rows = []
     findings = []
@@ -234,7 +240,8 @@ def trust(folder: Path) -> Page:
         figures = (percent(one[key]) for key in ("accuracy", "ece", "coverage", "decided", "novel"))
         rows.append((name, *figures, one["size"], *both))
         findings.append(
-            f"{name}: sets hold the class in {rows[-1][3].mean:.1f} %, and {100 * one['asked']:.0f} % were asked for."
+            f"{name}: sets hold the class in {rows[-1][3].mean:.1f} %, and "
+            f"{100 * one['asked']:.0f} % were asked for."
         )
     counts = {
         fault: np.sum([one["faults"][fault] for one in units.values()], 0)

@@ -1,4 +1,6 @@
-"""Pages of results: a record of `pages.toml`, with the rows and findings that are made from its data."""
+"""Pages of results: a record of `pages.toml`, with the rows and findings that are made from its
+data.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Measure(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Rows under a head, which has a word for a text column and a Measure for a column of values."""
+    """Rows under a head, which has a word for a text column and a Measure for a column of
+    values.
+    """
 
     title: str
     head: Sequence[str | Measure]
@@ -67,11 +71,13 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Page:
-    """What a page has beyond its record: rows of its tables, and findings, of which the first answers the question.
+    """What a page has beyond its record: rows of its tables, and findings, of which the first
+    answers the question.
 
-    A table is rows for the next table of the record, or a Table. Only findings that show a difference are printed.
-    `answer` is another answer with its figure. The picture has the first table, or is drawn by `figure`, which is given
-    the path. `readme` has the values by name that the README repeats, and `words` what the record leaves open.
+    A table is rows for the next table of the record, or a Table. Only findings that show a
+    difference are printed. `answer` is another answer with its figure. The picture has the first
+    table, or is drawn by `figure`, which is given the path. `readme` has the values by name that
+    the README repeats, and `words` what the record leaves open.
     """
 
     name: str
@@ -133,7 +139,8 @@ def text(page: Page) -> str:
     files = ", ".join(f"[`{name}`]({name})" for name in one["data"])
     return (
         f"# {one['question']}\n\n{about}\n\n## Findings\n\n{found}\n\n{tables}\n"
-        f"![{one.get('caption', CAPTION)}](figures/{page.name}.png)\n\nData: {files}. Command: `{one['command']}`.\n"
+        f"![{one.get('caption', CAPTION)}](figures/{page.name}.png)\n\nData: {files}. Command: "
+        f"`{one['command']}`.\n"
     )
 
 
@@ -157,7 +164,9 @@ def _cell(column: str | Measure, cell: Any) -> str:
 
 
 def draw(page: Page, path: Path) -> None:
-    """Draw the figure of a page: its own, or a dot and an interval for each row, with a panel for each measure."""
+    """Draw the figure of a page: its own, or a dot and an interval for each row, with a panel for
+    each measure.
+    """
     if page.figure is not None:
         page.figure(path)
         return

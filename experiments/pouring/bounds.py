@@ -1,4 +1,6 @@
-"""Bounds of pouring by touch: policies with the same MLP that get the time, or the load on the gel."""
+"""Bounds of pouring by touch: policies with the same MLP that get the time, or the load on the
+gel.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ Array = npt.NDArray[Any]
 
 
 def blind_inputs(actions: Array) -> Array:
-    """Time and counts of the own actions so far (S, B, 4), from actions (S, B); nothing of the run itself."""
+    """Time and counts of the own actions so far (S, B, 4), from actions (S, B); nothing of the run
+    itself.
+    """
     chosen = np.eye(len(ACTIONS), dtype=np.float32)[actions]
     before = np.cumsum(chosen, 0) - chosen
     time = np.broadcast_to(
@@ -55,21 +59,25 @@ class Blind:
 def learn_blind(task: Task, seed: int, count: int, learning: policy.Learning) -> Blind:
     """A blind policy from `count` demonstrations of an expert that never waits.
 
-    To wait is to answer what is seen: a blind policy would learn that it has poured too early to stop, as it never
-    waited.
+    To wait is to answer what is seen: a blind policy would learn that it has poured too early to
+    stop, as it never waited.
     """
     trials = policy.demonstrate(task, seed, count, side=None, patient=False, chunk=count)
     return Blind(imitate_plainly(trials, blind_inputs(trials.actions)[START:], learning))
 
 
 def imitate_plainly(trials: Trials, x: Array, learning: policy.Learning) -> policy.Head:
-    """Return the MLP over inputs x (S - START, B, d), trained without dropout: they are few and without noise."""
+    """Return the MLP over inputs x (S - START, B, d), trained without dropout: they are few and
+    without noise.
+    """
     return policy.imitate(*policy.moments(trials, x), replace(learning, dropout=0.0))[0]
 
 
 @partial(jax.jit, static_argnames=("task",))
 def _loads(state: State, setups: Setup, *, task: Task) -> jax.Array:
-    """Shear and normal force N, and a tenth of the twist N mm, on the gels of stacked runs (B, 4)."""
+    """Shear and normal force N, and a tenth of the twist N mm, on the gels of stacked runs (B,
+    4).
+    """
 
     def one(state: State, setup: Setup) -> jax.Array:
         load = physics.load(state, setup, task)
@@ -79,9 +87,11 @@ def _loads(state: State, setups: Setup, *, task: Task) -> jax.Array:
 
 
 class Scales:
-    """Notes the load of stacked runs `setups` while another controller acts, or acts on it with the MLP `head`.
+    """Notes the load of stacked runs `setups` while another controller acts, or acts on it with the
+    MLP `head`.
 
-    It gets the load on the gel, with blows and jolts, and no picture. No touch of this gel holds more information.
+    It gets the load on the gel, with blows and jolts, and no picture. No touch of this gel holds
+    more information.
     """
 
     looks = False
@@ -118,7 +128,9 @@ class Scales:
 
 
 def learn_loads(task: Task, seed: int, count: int, learning: policy.Learning) -> policy.Head:
-    """The MLP over the loads themselves, from the demonstrations that `policy.demonstrate` gives for the same seed."""
+    """The MLP over the loads themselves, from the demonstrations that `policy.demonstrate` gives
+    for the same seed.
+    """
     setups, keys = draw_runs(task, seed, count)
     noting = Scales(task, setups, Expert(task))
     trials = run(task, setups, keys, noting, late=policy.late_hands(seed, count))

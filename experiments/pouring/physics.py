@@ -1,7 +1,9 @@
-"""Pouring beads out of a held cylinder: tilt, flow with chance, and the load that one finger's gel bears (Sec. Q3).
+"""Pouring beads out of a held cylinder: tilt, flow with chance, and the load that one finger's gel
+bears (Sec. Q3).
 
-Three frames of one body: `k` up the cylinder's axis, `d` across it toward the lip that dips, `t` the axis of the tilt.
-The gel's normal lies between t and d. g, mm, s, N, rad; everything is a pure function of one run, `jax.vmap` for more.
+Three frames of one body: `k` up the cylinder's axis, `d` across it toward the lip that dips, `t`
+the axis of the tilt. The gel's normal lies between t and d. g, mm, s, N, rad; everything is a pure
+function of one run, `jax.vmap` for more.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ SLOTS = 49  # slices of the cylinder across `d`, for volumes and moments
 # constants of the slot law; the margin is in bead diameters
 FLOW = 1.03
 MARGIN = 1.4
-# moments in which the gripped cylinder still stands on the table; then it is lifted to its first tilt
+# moments in which the gripped cylinder still stands on the table; then it is lifted to its first
+# tilt
 STAND = 3
 EXPOSURE = 1 / 60  # s of one frame: blows shorter than this are averaged
 STEEPEST = math.radians(86)
@@ -43,9 +46,10 @@ VERSION = 3  # of what a run gives for its seed
 class Task:
     """The paper's task: `beads` g in the cylinder, pour out `target` g, then retract.
 
-    An action changes the tilt by `step` degrees, or not, `rate` times a second. A run ends when the tilt is `back`
-    degrees below the highest reached and no bead flows any more, or after `limit` actions; the tilt stays below `most`
-    degrees. `markers`: of the gel. Raises UserError for a task that cannot be done.
+    An action changes the tilt by `step` degrees, or not, `rate` times a second. A run ends when the
+    tilt is `back` degrees below the highest reached and no bead flows any more, or after `limit`
+    actions; the tilt stays below `most` degrees. `markers`: of the gel. Raises UserError for a task
+    that cannot be done.
     """
 
     beads: Above0[float] = 100.0
@@ -61,18 +65,20 @@ class Task:
         check(self)
         if self.target >= self.beads:
             raise UserError(
-                f"the target of {self.target:g} g must be below the {self.beads:g} g in the cylinder"
+                f"the target of {self.target:g} g must be below the {self.beads:g} g in the "
+                "cylinder"
             )
 
 
 class Setup(NamedTuple):
     """What differs from run to run, f32 scalars (or stacked).
 
-    `radius`, `height` mm of the cylinder and `empty` g of its mass; `bead` mm across; `bulk` g / mm^3; `repose`
-    rad, the angle of repose; `tilt` rad at the start; `mount` rad from the tilt's axis to the gel's normal;
-    `grip_height` mm of the fingers; `grip` N, which falls by the share `relax` within `relax_time` s; `share` of the
-    load on the gel's finger; `friction` on the gel; `jolt` N of the arm's step; `place` (2,) mm, `yaw` rad, `lean`
-    (slope) of the cylinder on the gel; `unit` of the sensor.
+    `radius`, `height` mm of the cylinder and `empty` g of its mass; `bead` mm across; `bulk` g /
+    mm^3; `repose` rad, the angle of repose; `tilt` rad at the start; `mount` rad from the tilt's
+    axis to the gel's normal; `grip_height` mm of the fingers; `grip` N, which falls by the share
+    `relax` within `relax_time` s; `share` of the load on the gel's finger; `friction` on the gel;
+    `jolt` N of the arm's step; `place` (2,) mm, `yaw` rad, `lean` (slope) of the cylinder on the
+    gel; `unit` of the sensor.
     """
 
     radius: Any
@@ -97,9 +103,11 @@ class Setup(NamedTuple):
 
 
 class State(NamedTuple):
-    """A run at one moment: `mass` g left, `tilt` and the highest tilt, `slope` of the beads' surface against the
-    cylinder's cross-section, `start` rad over the angle of repose at which they break loose, whether they are
-    `flowing`, `rate` g/s of the last step, `steps` done, `moved` in the last one, `done`, and the random `key`."""
+    """A run at one moment: `mass` g left, `tilt` and the highest tilt, `slope` of the beads'
+    surface against the cylinder's cross-section, `start` rad over the angle of repose at which they
+    break loose, whether they are `flowing`, `rate` g/s of the last step, `steps` done, `moved` in
+    the last one, `done`, and the random `key`.
+    """
 
     mass: Array
     tilt: Array
@@ -115,7 +123,9 @@ class State(NamedTuple):
 
 
 class Load(NamedTuple):
-    """On the gel: `shear` (2,) N (x across the cylinder, y down its axis), `twist` N mm from x to y, `normal` N."""
+    """On the gel: `shear` (2,) N (x across the cylinder, y down its axis), `twist` N mm from x to
+    y, `normal` N.
+    """
 
     shear: Array
     twist: Array
@@ -123,7 +133,9 @@ class Load(NamedTuple):
 
 
 def draw_setup(task: Task, rng: np.random.Generator) -> Setup:
-    """The parameters of a run, from `rng`; its first tilt is 3 to 20 degrees before the beads flow."""
+    """The parameters of a run, from `rng`; its first tilt is 3 to 20 degrees before the beads
+    flow.
+    """
     unit = draw_unit(SENSORS["gelsight_mini"], rng)._replace(marked=np.float32(task.markers))
     radius = rng.uniform(22, 28)
     bulk = rng.uniform(1.45e-3, 1.6e-3)
@@ -170,16 +182,19 @@ def begin(setup: Setup, task: Task, key: Array) -> State:
 
 
 def _start(key: Array) -> Array:
-    """How far over the angle of repose the next avalanche starts: the angle of maximal stability, by chance."""
+    """How far over the angle of repose the next avalanche starts: the angle of maximal stability,
+    by chance.
+    """
     return jnp.deg2rad(jax.random.uniform(key, minval=0.4, maxval=2.0))
 
 
 def advance(state: State, action: Array, setup: Setup, task: Task) -> State:
     """Return the state after one action and a fifth of a second; a finished run does not change.
 
-    Beads break loose when their surface is steeper than the angle of maximal stability, and run out at the rate of a
-    slot of the lip's width and the depth of what lies over the angle of repose (Myers and Sellers 1978, after Beverloo
-    et al. 1961; see Nedderman 1992, ch. 10), in whole beads whose number scatters as Poisson's, until none comes.
+    Beads break loose when their surface is steeper than the angle of maximal stability, and run out
+    at the rate of a slot of the lip's width and the depth of what lies over the angle of repose
+    (Myers and Sellers 1978, after Beverloo et al. 1961; see Nedderman 1992, ch. 10), in whole beads
+    whose number scatters as Poisson's, until none comes.
     """
     key, flow_key, start_key = jax.random.split(state.key, 3)
     turn = jnp.deg2rad(task.step) * ((action == POUR) * 1.0 - (action == RETRACT) * 1.0)
@@ -238,13 +253,17 @@ def _steepness(slope: Array) -> Array:
 
 
 def capacity(slope: Array, setup: Setup) -> Array:
-    """g of beads that stay behind a surface of `slope` rad (against the cross-section) that just reaches the lip."""
+    """g of beads that stay behind a surface of `slope` rad (against the cross-section) that just
+    reaches the lip.
+    """
     area, column = _behind(slope, setup)
     return setup.bulk * jnp.sum(area * column)
 
 
 def _behind(slope: Array, setup: Setup) -> tuple[Array, Array]:
-    """The slices' areas mm^2, and the height mm of the beads in each behind a surface of `slope` that meets the lip."""
+    """The slices' areas mm^2, and the height mm of the beads in each behind a surface of `slope`
+    that meets the lip.
+    """
     place, area = _slices(setup)
     return area, jnp.clip(
         setup.height - (setup.radius - place) * _steepness(slope), 0, setup.height
@@ -254,10 +273,10 @@ def _behind(slope: Array, setup: Setup) -> tuple[Array, Array]:
 def slot_rate(excess: Array, slope: Array, setup: Setup) -> Array:
     """g/s over the lip when `excess` g lie above the angle of repose.
 
-    A slot as deep as the layer, which lies on the beads at rest (where they leave the bottom bare, on less than the
-    whole ellipse), and as wide as the chord of the lip that the layer's surface cuts, a plane `depth` above the one
-    that just meets the lip. The empty margin of 1.4 beads is left on the sides; the layer is open above, and its lower
-    rim is beads.
+    A slot as deep as the layer, which lies on the beads at rest (where they leave the bottom bare,
+    on less than the whole ellipse), and as wide as the chord of the lip that the layer's surface
+    cuts, a plane `depth` above the one that just meets the lip. The empty margin of 1.4 beads is
+    left on the sides; the layer is open above, and its lower rim is beads.
     """
     inclined = jnp.clip(slope, 0, math.radians(75))
     area, column = _behind(slope, setup)
@@ -271,7 +290,9 @@ def slot_rate(excess: Array, slope: Array, setup: Setup) -> Array:
 
 
 def heap(mass: Array, slope: Array, setup: Setup) -> tuple[Array, Array]:
-    """Where the middle of `mass` g of beads lies behind a surface of `slope`: mm along `d`, mm above the bottom."""
+    """Where the middle of `mass` g of beads lies behind a surface of `slope`: mm along `d`, mm
+    above the bottom.
+    """
     place, area = _slices(setup)
     steep = _steepness(slope)
     volume = mass / setup.bulk
@@ -292,11 +313,13 @@ def heap(mass: Array, slope: Array, setup: Setup) -> tuple[Array, Array]:
 
 
 def load(state: State, setup: Setup, task: Task, *, shocks: bool = True) -> Load:
-    """What the gel bears: its share of weight and torque, and the grip, which the weight presses or eases.
+    """What the gel bears: its share of weight and torque, and the grip, which the weight presses or
+    eases.
 
-    In the first STAND moments the table bears the weight. The fingers hold at `grip_height` on the axis; a moment about
-    the line across the gel is taken up by more of the weight on one finger. `shocks`: blows of falling beads (their
-    number in one exposure is Poisson's) and the arm's jolts, another draw for each state.
+    In the first STAND moments the table bears the weight. The fingers hold at `grip_height` on the
+    axis; a moment about the line across the gel is taken up by more of the weight on one finger.
+    `shocks`: blows of falling beads (their number in one exposure is Poisson's) and the arm's
+    jolts, another draw for each state.
     """
     across, up = heap(state.mass, state.slope, setup)
     total = state.mass + setup.empty

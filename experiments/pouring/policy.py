@@ -1,4 +1,5 @@
-"""Imitation learning of the pouring task: features of the last segments -> pour, wait or retract (a small MLP).
+"""Imitation learning of the pouring task: features of the last segments -> pour, wait or retract (a
+small MLP).
 
 A frozen encoder computes its features once. Fine-tuning trains it with the MLP.
 """
@@ -38,14 +39,17 @@ LIFTED = START - FRAMES + 1
 
 @dataclass(frozen=True)
 class Learning:
-    """How a policy learns: `steps` of AdamW at `rate` on batches of `batch` moments, `width` hidden units.
+    """How a policy learns: `steps` of AdamW at `rate` on batches of `batch` moments, `width` hidden
+    units.
 
-    Features (`pooling` as in `Encoder.embed`) are many and gels few, which an MLP soon knows by heart: it is given the
-    first `components` principal components of its inputs, leaves out a share `dropout` of them and of its hidden
-    units at every step (Srivastava et al. 2014), and the weights are kept that did best on a share `held_out` of the
-    demonstrations. The policy acts on the mean of the log-probabilities of the last `votes` moments: one that retracts
-    by mistake cannot go back. Fine-tuning goes on for `tune_steps` on `tune_moments` of each of `tune_runs` runs, at
-    `tune_rate` (the encoder's; the MLP's is twice `rate`), which rises for a tenth of the steps and then falls.
+    Features (`pooling` as in `Encoder.embed`) are many and gels few, which an MLP soon knows by
+    heart: it is given the first `components` principal components of its inputs, leaves out a share
+    `dropout` of them and of its hidden units at every step (Srivastava et al. 2014), and the
+    weights are kept that did best on a share `held_out` of the demonstrations. The policy acts on
+    the mean of the log-probabilities of the last `votes` moments: one that retracts by mistake
+    cannot go back. Fine-tuning goes on for `tune_steps` on `tune_moments` of each of `tune_runs`
+    runs, at `tune_rate` (the encoder's; the MLP's is twice `rate`), which rises for a tenth of the
+    steps and then falls.
     """
 
     steps: Count[int] = 3000
@@ -69,8 +73,9 @@ class Learning:
 
 
 class Head(NamedTuple):
-    """The MLP over inputs (n, d): their `mean` (d,), the `basis` (d, k) of their principal components of unit spread,
-    weights and biases of its layers."""
+    """The MLP over inputs (n, d): their `mean` (d,), the `basis` (d, k) of their principal
+    components of unit spread, weights and biases of its layers.
+    """
 
     mean: Any
     basis: Any
@@ -94,8 +99,9 @@ def demonstrate(
 ) -> Trials:
     """`count` runs of the expert, with frames of `side` pixels, or without (None).
 
-    The hand is late by 0 to `late` moments, drawn for each run: runs that all end at the target would teach to retract
-    only where one is retracting already (noise in demonstrations: Laskey et al. 2017).
+    The hand is late by 0 to `late` moments, drawn for each run: runs that all end at the target
+    would teach to retract only where one is retracting already (noise in demonstrations: Laskey et
+    al. 2017).
     """
     setups, keys = draw_runs(task, seed, count)
     hand = late_hands(seed, count, late)
@@ -103,7 +109,8 @@ def demonstrate(
     plain = run(task, setups, keys, expert, late=hand)
     if side is None:
         return plain
-    # Runs of like length together: a batch is drawn until its longest has ended. One array, since films are large.
+    # Runs of like length together: a batch is drawn until its longest has ended. One array, since
+    # films are large.
     frames = np.zeros((*plain.actions.shape, side, side, 3), np.uint8)
     order = np.argsort(plain.steps, kind="stable")
     for start in range(0, count, chunk):
@@ -128,10 +135,12 @@ def features(
     sides: Array | None = None,
     learned: Array | None = None,
 ) -> Array:
-    """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a run's end.
+    """Features (S - 2, B, E) of the segment that ends at each moment from the third on; 0 after a
+    run's end.
 
-    `sides` (B, 2): in which mirrors the runs are shown (`segments`). `learned` (S - START, B): embed the segments of
-    these moments of choice alone, and those of the standing and of the lifted cylinder; the others are 0.
+    `sides` (B, 2): in which mirrors the runs are shown (`segments`). `learned` (S - START, B):
+    embed the segments of these moments of choice alone, and those of the standing and of the lifted
+    cylinder; the others are 0.
     """
     if trials.frames is None:
         raise UserError("these demonstrations have no frames; record them with a picture size")
@@ -154,7 +163,8 @@ def features(
 
 
 def subtracted(encoder: Encoder, frames: Array, first: Array) -> Array:
-    """Return frames u8 (..., B, side, side, 3) as the encoder reads them: untouched, or minus the `first` frames.
+    """Return frames u8 (..., B, side, side, 3) as the encoder reads them: untouched, or minus the
+    `first` frames.
 
     `first` u8 (B, side, side, 3) show the gel that holds the standing cylinder.
     """
@@ -166,10 +176,11 @@ def subtracted(encoder: Encoder, frames: Array, first: Array) -> Array:
 def segments(
     encoder: Encoder, frames: Array, where: Array, ahead: int, sides: Array | None = None
 ) -> Array:
-    """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run, as `subtracted`.
+    """Segments (n, ahead, ...) that end at moments `where` (n, 2), number of the segment and run,
+    as `subtracted`.
 
-    A gel in a mirror bears the same load: runs are shown upside down where the first of `sides` (B, 2) is 1, left to
-    right where the second is.
+    A gel in a mirror bears the same load: runs are shown upside down where the first of `sides` (B,
+    2) is 1, left to right where the second is.
     """
     ends = where[:, 0] + FRAMES - 1
     runs = where[:, 1]
@@ -190,20 +201,25 @@ def segments(
 def inputs(now: Any, before: Any, lifted: Any, standing: Any, xp: Any = np) -> Any:
     """What the MLP is given (..., 4 E): changes between the features of four segments.
 
-    The last two, the first of the lifted cylinder, whose beads are known, and that of the standing one, the tare.
+    The last two, the first of the lifted cylinder, whose beads are known, and that of the standing
+    one, the tare.
     """
     return xp.concatenate([now - standing, lifted - standing, now - lifted, now - before], -1)
 
 
 def input_table(z: Array) -> Array:
-    """`inputs` (S - LIFTED, B, 4 E) at the moments of choice, from features (S, B, E) of all segments."""
+    """`inputs` (S - LIFTED, B, 4 E) at the moments of choice, from features (S, B, E) of all
+    segments.
+    """
     now = z[LIFTED:]
     before = now[np.maximum(np.arange(len(now)) - LAG, 0)]
     return np.asarray(inputs(now, before, *(np.broadcast_to(z[i], now.shape) for i in (LIFTED, 0))))
 
 
 def forward(head: Head, x: Any, dropout: float = 0.0, key: jax.Array | None = None) -> jax.Array:
-    """Logits (n, 3) of the actions; with a `key`, a share `dropout` of what each layer is given is left out."""
+    """Logits (n, 3) of the actions; with a `key`, a share `dropout` of what each layer is given is
+    left out.
+    """
 
     def layer(number: int, x: jax.Array) -> jax.Array:
         weight, bias = head.layers[number]
@@ -250,9 +266,11 @@ def imitation_loss(logits: jax.Array, choices: jax.Array) -> jax.Array:
 
 
 def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[Head, float]:
-    """Train the MLP on inputs (n, d), actions (n,) of the demonstrations `runs` (n,); also its loss on those held out.
+    """Train the MLP on inputs (n, d), actions (n,) of the demonstrations `runs` (n,); also its loss
+    on those held out.
 
-    A single demonstration is held out and learned from. Raises UserError on inputs of NaN, and on a single input.
+    A single demonstration is held out and learned from. Raises UserError on inputs of NaN, and on a
+    single input.
     """
     if not np.isfinite(x).all():
         raise UserError("the policy's inputs are not finite; look at the encoder's weights")
@@ -311,10 +329,11 @@ def imitate(x: Array, actions: Array, runs: Array, learning: Learning) -> tuple[
 
 
 class Touch:
-    """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last features.
+    """A policy that sees tactile frames of `sensor` only: an encoder and the MLP over its last
+    features.
 
-    `pooling`: of its features. `votes`: moments that have a say in an action (`Learning`). `loss`: of imitation, on the
-    demonstrations held out (of a fine-tuned one: of its last steps).
+    `pooling`: of its features. `votes`: moments that have a say in an action (`Learning`). `loss`:
+    of imitation, on the demonstrations held out (of a fine-tuned one: of its last steps).
     """
 
     looks = True
@@ -346,7 +365,9 @@ class Touch:
         self._said: list[Array] = []
 
     def act(self, frames: Array | None, state: State | None = None) -> Array:
-        """Actions (B,) from the frames u8 (B, h, w, 3) so far; it waits until it has subtracted a segment."""
+        """Actions (B,) from the frames u8 (B, h, w, 3) so far; it waits until it has subtracted a
+        segment.
+        """
         assert frames is not None
         frames = np.stack(
             [touch_evaluation([frame], self.encoder.config.model.image_size)[0] for frame in frames]
@@ -367,9 +388,11 @@ class Touch:
 
 
 def moments(trials: Trials, x: Array, learned: Array | None = None) -> tuple[Array, Array, Array]:
-    """The moments of choice of all demonstrations, from inputs x (S - START, B, d): inputs, choices and runs (n,).
+    """The moments of choice of all demonstrations, from inputs x (S - START, B, d): inputs, choices
+    and runs (n,).
 
-    `learned` (S - START, B): only these."""
+    `learned` (S - START, B): only these.
+    """
     taken = trials.taken[START:] if learned is None else trials.taken[START:] & learned
     return x[taken], trials.choices[START:][taken], np.nonzero(taken)[1]
 
@@ -377,7 +400,8 @@ def moments(trials: Trials, x: Array, learned: Array | None = None) -> tuple[Arr
 def learn_frozen(
     encoder: Encoder, trials: Trials, learning: Learning, *, stills: bool, sensor: str = SENSOR
 ) -> Touch:
-    """Return a policy over frozen features of `sensor`, from demonstrations and their mirror images.
+    """Return a policy over frozen features of `sensor`, from demonstrations and their mirror
+    images.
 
     It learns from every LAG-th moment of a run: those between resemble them, and cost as much.
     """
@@ -412,18 +436,21 @@ def learn_frozen(
     )
 
 
-# Fine-tuning ----------------------------------------------------------------------------------------------------------
+# Fine-tuning
+# --------------------------------------------------------------------------------------------------
 #
-# Demonstrations are few, and an encoder soon fits their gels by heart. So a step draws many runs, mirrored at random,
-# with a few moments each. The segments of the standing and of the lifted cylinder are embedded once a run, and the last
-# segment of a moment is the one before of the next.
+# Demonstrations are few, and an encoder soon fits their gels by heart. So a step draws many runs,
+# mirrored at random, with a few moments each. The segments of the standing and of the lifted
+# cylinder are embedded once a run, and the last segment of a moment is the one before of the next.
 
 Params = Any
 
 
 class Chains(NamedTuple):
-    """Moments of R runs, C of each in a chain: the `runs` (R,), the `numbers` (R, 3 + C) of the segments to embed
-    (standing, lifted, the one before the chain, the C of the chain) and `inside` (R, C), which moments there are."""
+    """Moments of R runs, C of each in a chain: the `runs` (R,), the `numbers` (R, 3 + C) of the
+    segments to embed (standing, lifted, the one before the chain, the C of the chain) and `inside`
+    (R, C), which moments there are.
+    """
 
     runs: Array
     numbers: Array
@@ -431,9 +458,11 @@ class Chains(NamedTuple):
 
 
 def draw_chains(rng: np.random.Generator, steps: Array, runs: int, moments: int) -> Chains:
-    """Chains of `moments`, `LAG` apart, in `runs` runs drawn from those that took `steps` (B,) actions.
+    """Chains of `moments`, `LAG` apart, in `runs` runs drawn from those that took `steps` (B,)
+    actions.
 
-    Each moment of choice of a run is as likely as the others; a chain may stick out at either end of its run.
+    Each moment of choice of a run is as likely as the others; a chain may stick out at either end
+    of its run.
     """
     drawn = rng.integers(len(steps), size=runs)
     last = (steps[drawn] - FRAMES)[:, None]
@@ -445,9 +474,11 @@ def draw_chains(rng: np.random.Generator, steps: Array, runs: int, moments: int)
 
 
 def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
-    """Go on from a policy over frozen features with the encoder's parameters trained too, on all demonstrations.
+    """Go on from a policy over frozen features with the encoder's parameters trained too, on all
+    demonstrations.
 
-    The policy's `loss` then is that of its last tenth of steps. Raises UserError when that is not finite.
+    The policy's `loss` then is that of its last tenth of steps. Raises UserError when that is not
+    finite.
     """
     assert trials.frames is not None
     encoder = policy.encoder
@@ -474,7 +505,8 @@ def fine_tune(policy: Touch, trials: Trials, learning: Learning) -> Touch:
     late = float(np.mean(jax.device_get(losses[-max(1, learning.tune_steps // 10) :])))
     if not math.isfinite(late):
         raise UserError(
-            f"fine-tuning went astray (its loss is {late}); lower tune_rate, {learning.tune_rate:g} now"
+            f"fine-tuning went astray (its loss is {late}); lower tune_rate, "
+            f"{learning.tune_rate:g} now"
         )
     return Touch(
         tuned,
@@ -532,8 +564,9 @@ def _tuner(
 def logits_of(
     params: Params, clips: jax.Array, *, net: Net, pooling: Pooling, mean: jax.Array, sensor: int
 ) -> jax.Array:
-    """Logits (R, C, 3) of the moments of chains, from their segments (R, 3 + C, T, h, w, 3), and parameters of the
-    encoder and of the MLP with its basis."""
+    """Logits (R, C, 3) of the moments of chains, from their segments (R, 3 + C, T, h, w, 3), and
+    parameters of the encoder and of the MLP with its basis.
+    """
     runs, count = clips.shape[:2]
     flat = clips.reshape(runs * count, *clips.shape[2:])
     rows = jnp.full(len(flat), sensor, jnp.int32)

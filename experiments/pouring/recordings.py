@@ -1,9 +1,9 @@
 """Recordings of pouring, of a robot or of the simulation, as demonstrations; and policies on disk.
 
-The form: a manifest whose sequences are runs, one row a moment of choice (five a second), `label.action` pour, wait or
-retract. In the first STAND moments of a run the fingers hold the cylinder while it still stands; then it is lifted. A
-column `label.choice` says what should have been done where that differs (a hand that was late). Nothing is
-learned from split test.
+The form: a manifest whose sequences are runs, one row a moment of choice (five a second),
+`label.action` pour, wait or retract. In the first STAND moments of a run the fingers hold the
+cylinder while it still stands; then it is lifted. A column `label.choice` says what should have
+been done where that differs (a hand that was late). Nothing is learned from split test.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ WEIGHTS = "encoder.safetensors"
 
 
 class Recordings(NamedTuple):
-    """Runs as trials of B (masses are unknown: NaN), those of the test split last: `test` (B,); their sensor, and the
-    content hash of their manifest (`data`)."""
+    """Runs as trials of B (masses are unknown: NaN), those of the test split last: `test` (B,);
+    their sensor, and the content hash of their manifest (`data`).
+    """
 
     trials: Trials
     test: Array
@@ -58,9 +59,11 @@ class Recordings(NamedTuple):
 
 
 def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -> Path:
-    """Write trials with frames as PNG files and `manifest.parquet`, the last `held_out` of the runs as split test.
+    """Write trials with frames as PNG files and `manifest.parquet`, the last `held_out` of the runs
+    as split test.
 
-    Masses stand in `label.mass` (g), which no policy reads. Gives back the manifest's path. Raises UserError.
+    Masses stand in `label.mass` (g), which no policy reads. Gives back the manifest's path. Raises
+    UserError.
     """
     import cv2
 
@@ -101,13 +104,17 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
 
 
 def read(path: Path, side: int) -> Recordings:
-    """The runs of a manifest, frames resized to `side` pixels. Raises UserError: no labels, gaps, too short a run."""
+    """The runs of a manifest, frames resized to `side` pixels.
+
+    Raises UserError: no labels, gaps, too short a run.
+    """
     table = manifests.read(path)
     split = table.text_column("split")
     part = np.isin(split, LEARNING)
     if not table.present("label.action")[part].all():
         raise UserError(
-            f"{path}: label.action must be {', '.join(ACTIONS)} on every row of {', '.join(LEARNING)}"
+            f"{path}: label.action must be {', '.join(ACTIONS)} on every row of "
+            f"{', '.join(LEARNING)}"
         )
     sensors = np.unique(table.text_column("sensor")[part])
     if len(sensors) > 1:
@@ -138,7 +145,10 @@ def read(path: Path, side: int) -> Recordings:
 
 
 def _runs(table: Manifest, path: Path) -> list[Array]:
-    """The rows of each run in time. Raises UserError for runs that are of two splits or have gaps, and short ones."""
+    """The rows of each run in time.
+
+    Raises UserError for runs that are of two splits or have gaps, and short ones.
+    """
     split = table.text_column("split")
     sequence = table.text_column("sequence")
     number = table.number_column("frame_index")
@@ -175,8 +185,10 @@ def _frame(table: Manifest, side: int, row: int) -> Array:
 
 
 class Agreement(NamedTuple):
-    """How a policy follows the hand on runs that it did not learn: the share of moments with the same action (mean of
-    runs), the mean share over the three actions, and |moment of turning back - the hand's| in s (median of runs)."""
+    """How a policy follows the hand on runs that it did not learn: the share of moments with the
+    same action (mean of runs), the mean share over the three actions, and |moment of turning back -
+    the hand's| in s (median of runs).
+    """
 
     share: float
     balanced: float
@@ -184,7 +196,9 @@ class Agreement(NamedTuple):
 
 
 def agreement(policy: Controller, trials: Trials, rate: float) -> Agreement:
-    """Show the frames of recorded runs to a policy, as the hand's actions led to them; `rate` moments a second."""
+    """Show the frames of recorded runs to a policy, as the hand's actions led to them; `rate`
+    moments a second.
+    """
     assert trials.frames is not None
     policy.begin(len(trials.steps))
     predicted = np.stack([policy.act(frames, None) for frames in trials.frames])  # type: ignore[arg-type]
@@ -192,7 +206,9 @@ def agreement(policy: Controller, trials: Trials, rate: float) -> Agreement:
 
 
 def agreement_blind(shown: Trials, unseen: Trials, learning: Learning, rate: float) -> Agreement:
-    """The agreement of the same MLP that gets the time and the hand's actions so far, not the touch."""
+    """The agreement of the same MLP that gets the time and the hand's actions so far, not the
+    touch.
+    """
     head = imitate_plainly(shown, blind_inputs(shown.actions)[START:], learning)
     predicted = [np.asarray(forward(head, x)).argmax(-1) for x in blind_inputs(unseen.actions)]
     return compare(np.stack(predicted), unseen, rate)
@@ -223,7 +239,10 @@ def compare(predicted: Array, trials: Trials, rate: float) -> Agreement:
 
 
 def save_policy(folder: Path, policy: Touch) -> None:
-    """Write the MLP to `policy.npz` and the encoder next to it, each in one move. Raises UserError."""
+    """Write the MLP to `policy.npz` and the encoder next to it, each in one move.
+
+    Raises UserError.
+    """
     from anytouch_jax.config import to_json
     from anytouch_jax.weights import safetensors
 
@@ -258,8 +277,11 @@ def save_policy(folder: Path, policy: Touch) -> None:
 
 
 def load_policy(folder: Path | str) -> Touch:
-    """The policy that `save_policy` wrote. `begin(1)`, then `act(frame[None])` at every moment: 0 pour, 1 wait,
-    2 retract (`sim.pouring.ACTIONS`). Raises UserError when files are missing or do not belong together."""
+    """The policy that `save_policy` wrote.
+
+    `begin(1)`, then `act(frame[None])` at every moment: 0 pour, 1 wait, 2 retract
+    (`sim.pouring.ACTIONS`). Raises UserError when files are missing or do not belong together.
+    """
     folder = Path(folder)
     encoder = load_encoder(folder / WEIGHTS)
     try:
@@ -286,7 +308,8 @@ def load_policy(folder: Path | str) -> Touch:
         raise UserError(f"{folder / POLICY} is no pouring policy ({error})") from None
     if mark != encoder.fingerprint:
         raise UserError(
-            f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}. Learn the policy again."
+            f"{folder / POLICY} was learned over another encoder than {folder / WEIGHTS}. Learn "
+            "the policy again."
         )
     return Touch(encoder, head, stills=stills, pooling=pooling, sensor=sensor, votes=votes)
 

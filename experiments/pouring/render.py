@@ -1,8 +1,10 @@
-"""The touch of a held cylinder: loads -> shear, twist and pressure of the gel -> frames of a GelSight Mini.
+"""The touch of a held cylinder: loads -> shear, twist and pressure of the gel -> frames of a
+GelSight Mini.
 
-A run's contact is solved once: the dent at a few forces, and the skin's motion for unit loads while everything sticks.
-A frame then is a weighted sum and a picture, so that any frame of a run can be drawn alone. Mindlin's law adds what the
-slipping rim gives way. `sim.shear.shear_step` with its history is what this is tested against.
+A run's contact is solved once: the dent at a few forces, and the skin's motion for unit loads while
+everything sticks. A frame then is a weighted sum and a picture, so that any frame of a run can be
+drawn alone. Mindlin's law adds what the slipping rim gives way. `sim.shear.shear_step` with its
+history is what this is tested against.
 """
 
 from __future__ import annotations
@@ -30,9 +32,11 @@ STICKS = 1e4  # a coefficient of friction at which nothing slips
 
 
 class Grasp(NamedTuple):
-    """How the gel of one run answers: `dents` (L, h, w) mm at normal `forces` (L,) N; `moves` (3, h, w, 2) mm of the
-    skin for 1 N along x, 1 N along y (in the gel's own frame) and 1 N mm of twist; `radius` mm of the contact for a
-    twist's share of the friction; `behind` (3, H, W), the untouched picture."""
+    """How the gel of one run answers: `dents` (L, h, w) mm at normal `forces` (L,) N; `moves` (3,
+    h, w, 2) mm of the skin for 1 N along x, 1 N along y (in the gel's own frame) and 1 N mm of
+    twist; `radius` mm of the contact for a twist's share of the friction; `behind` (3, H, W), the
+    untouched picture.
+    """
 
     dents: Array
     forces: Array
@@ -60,7 +64,9 @@ def surface(setup: Setup) -> Array:
 
 
 def hold(setup: Setup, side: int) -> tuple[Grasp, PressResult]:
-    """The gel's answers in one run, for pictures of `side` pixels, and the contact under the grip."""
+    """The gel's answers in one run, for pictures of `side` pixels, and the contact under the
+    grip.
+    """
     gel = unit_gel(SENSOR, setup.unit)
     z = surface(setup)
     press = jax.vmap(
@@ -79,7 +85,9 @@ def hold(setup: Setup, side: int) -> tuple[Grasp, PressResult]:
 
 
 def unit_moves(contact: PressResult, gel: Gel) -> Array:
-    """The skin's displacement (3, h, w, 2) mm for 1 N along x, 1 N along y, 1 N mm about the centre of pressure."""
+    """The skin's displacement (3, h, w, 2) mm for 1 N along x, 1 N along y, 1 N mm about the centre
+    of pressure.
+    """
     centre = mechanics.centroid(contact.pressure, PITCH)
     motions = jnp.diag(jnp.array([0.1, 0.1, 0.02]))
 
@@ -96,8 +104,8 @@ def unit_moves(contact: PressResult, gel: Gel) -> Array:
 def skin(grasp: Grasp, setup: Setup, load: Load) -> tuple[Array, Array]:
     """The gel under a load: dent (h, w) mm and tangential displacement (h, w, 2) mm of the skin.
 
-    The slipping rim lets go further than sticking would by Mindlin's (1949) factor, 3/2 (1 - (1 - q)^(2/3)) / q at the
-    share q of the friction limit, which full slip ends.
+    The slipping rim lets go further than sticking would by Mindlin's (1949) factor, 3/2 (1 - (1 -
+    q)^(2/3)) / q at the share q of the friction limit, which full slip ends.
     """
     place = jnp.interp(load.normal, grasp.forces, jnp.arange(len(LEVELS), dtype=jnp.float32))
     weights = jnp.maximum(1 - jnp.abs(place - jnp.arange(len(LEVELS))), 0)
@@ -117,7 +125,9 @@ def skin(grasp: Grasp, setup: Setup, load: Load) -> tuple[Array, Array]:
 
 
 def picture(grasp: Grasp, setup: Setup, load: Load, key: Array | None, side: int) -> Array:
-    """The frame u8 (side, side, 3) of the whole field, squeezed to a square as the encoder's own transform does."""
+    """The frame u8 (side, side, 3) of the whole field, squeezed to a square as the encoder's own
+    transform does.
+    """
     shape = optics.picture_size(SENSOR, side)
     dent, moved = skin(grasp, setup, load)
     image = optics.render(
@@ -128,5 +138,7 @@ def picture(grasp: Grasp, setup: Setup, load: Load, key: Array | None, side: int
 
 
 def prepare() -> None:
-    """Fit the sensor's colours to real presses once, outside of any compiled program (a few seconds)."""
+    """Fit the sensor's colours to real presses once, outside of any compiled program (a few
+    seconds).
+    """
     look(SENSOR)

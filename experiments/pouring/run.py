@@ -1,4 +1,6 @@
-"""A pouring policy from the command line: learned from the simulated expert or from your recordings, then tried."""
+"""A pouring policy from the command line: learned from the simulated expert or from your
+recordings, then tried.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +26,22 @@ from experiments.pouring.physics import Task
 
 @dataclass(frozen=True)
 class Pour:
-    """Pour 60 g of 100 g of beads by touch alone, in simulation: imitation learning over features, then trials.
+    """Pour 60 g of 100 g of beads by touch alone, in simulation: imitation learning over features,
+    then trials.
 
     Example: python -m experiments.pouring.run --model runs/stage2 --trials 10
 
-    Prints the mass of each trial and the mean error, compared with a blind policy and the expert. OUT gets the
-    numbers and the policy. With --recordings it learns from your runs and is compared with the hand on split test.
+    Prints the mass of each trial and the mean error, compared with a blind policy and the expert.
+    OUT gets the numbers and the policy. With --recordings it learns from your runs and is compared
+    with the hand on split test.
     """
 
     model: Path | None = None
     """Run folder or weights file (.pth, .safetensors)."""
     recordings: Path | None = None
-    """Manifest of recorded runs to learn from: a row a moment (five a second), label.action pour, wait or retract."""
+    """Manifest of recorded runs to learn from: a row a moment (five a second), label.action pour,
+    wait or retract.
+    """
     record: Path | None = None
     """Only write the expert's demonstrations to this folder, in the form of --recordings."""
     size: Annotated[int, Range(14, 1024, "14 to 1024")] = 112
@@ -45,7 +51,9 @@ class Pour:
     out: Path | None = None
     """Folder for pour.json and the policy (default: pour in the run's folder)."""
     demos: Count[int] = 120
-    """Demonstrations of the expert, who sees the scales. A thousand are better (5 GB of memory at 84 pixels)."""
+    """Demonstrations of the expert, who sees the scales. A thousand are better (5 GB of memory at
+    84 pixels).
+    """
     stills: bool = False
     """Use features of single frames, not of segments of three."""
     fine_tune: bool = False
@@ -65,7 +73,8 @@ def run(options: Pour) -> int:
         return _record(options, options.record)
     if options.model is None:
         raise UserError(
-            "Give --model, whose features the policy learns from, or --record to write demonstrations."
+            "Give --model, whose features the policy learns from, or --record to write "
+            "demonstrations."
         )
     folder = options.model if options.model.is_dir() else options.model.parent
     out = options.out or folder / "pour"
@@ -114,7 +123,8 @@ def _recorded(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any])
     learned_from = data.part(False)
     test = data.part(True)
     log(
-        f"{len(learned_from.steps)} runs of {data.sensor} to learn from, {len(test.steps)} of split test"
+        f"{len(learned_from.steps)} runs of {data.sensor} to learn from, {len(test.steps)} of "
+        "split test"
     )
     learned, learning = _learn(options, encoder, learned_from, data.sensor)
     rate = Task().rate
@@ -169,7 +179,9 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
 
 
 def _check_unused(out: Path, about: Mapping[str, Any]) -> None:
-    """Raise UserError where a folder holds the results of other settings: a policy would be lost."""
+    """Raise UserError where a folder holds the results of other settings: a policy would be
+    lost.
+    """
     try:
         before = dict(json.loads((out / "pour.json").read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):

@@ -1,9 +1,11 @@
-"""The pouring study: 60 g of beads by touch alone, in the form of the paper's Table 4 (`make pouring`).
+"""The pouring study: 60 g of beads by touch alone, in the form of the paper's Table 4 (`make
+pouring`).
 
-Two fingers hold a cylinder with 100 g of beads, one of them a GelSight Mini. Three actions (pour, wait, retract) tilt
-it, five times a second. Cylinder, beads, gel and camera are simulated, and differ from run to run. An expert that sees
-the scales demonstrates. A small MLP imitates it, over features of four segments: the last two, the first of the lifted
-cylinder, and that of the standing one. The encoder is frozen or fine-tuned.
+Two fingers hold a cylinder with 100 g of beads, one of them a GelSight Mini. Three actions (pour,
+wait, retract) tilt it, five times a second. Cylinder, beads, gel and camera are simulated, and
+differ from run to run. An expert that sees the scales demonstrates. A small MLP imitates it, over
+features of four segments: the last two, the first of the lifted cylinder, and that of the standing
+one. The encoder is frozen or fine-tuned.
 """
 
 from __future__ import annotations
@@ -34,14 +36,18 @@ RECIPES = {"none": "anytouch", "t3": "t3", "static": "static_only", "anytouch": 
 
 @dataclass(frozen=True)
 class Options:
-    """Run what is missing of the pouring study. Its encoders are those of `make experiments`, trained if missing.
+    """Run what is missing of the pouring study.
+
+    Its encoders are those of `make experiments`, trained if missing.
 
     Example: python -m experiments.pouring.study --runs anytouch=runs/stage2 t3=a,b,c
     """
 
     runs: tuple[str, ...] = ()
-    """Encoders of yours by row, NAME=PATH, or NAME=A,B,C for one a seed. `none` without a path is an untrained encoder,
-    `static` the run of `anytouch` on single frames. A row without a run is left out."""
+    """Encoders of yours by row, NAME=PATH, or NAME=A,B,C for one a seed. `none` without a path is
+    an untrained encoder, `static` the run of `anytouch` on single frames. A row without a run is
+    left out.
+    """
     study: Path = Path("runs/matrix")
     """Folder of `make experiments`."""
     out: Path = Path("experiments/results/pouring.jsonl")
@@ -85,7 +91,9 @@ class Study:
         self.trained = cache(self._trained)
 
     def _trained(self, seed: int) -> dict[str, Path]:
-        """The runs of Tables 2 to 4 by the names of the rows; the image tower of AnyTouch's is the one untouched."""
+        """The runs of Tables 2 to 4 by the names of the rows; the image tower of AnyTouch's is the
+        one untouched.
+        """
         size = plan.QUICK if self.options.quick else plan.FULL
         return Work(self.options.study).runs(
             {k: plan.training(size, r, seed) for k, r in RECIPES.items()}, size
@@ -101,7 +109,9 @@ class Study:
         return None
 
     def encoder_of(self, name: str, seed: int) -> tuple[Encoder, str] | None:
-        """The encoder of a row with its source and the fingerprint of its weights, None without a run."""
+        """The encoder of a row with its source and the fingerprint of its weights, None without a
+        run.
+        """
         path = self.path_of(name, seed)
         if path is not None:
             encoder = image_tower_encoder(path) if name == "none" else load_encoder(path)
@@ -117,7 +127,8 @@ class Study:
         )
         return (
             encoder,
-            f"{'untrained' if path is None else Path(path).name} (weights {encoder.fingerprint}{shown})",
+            f"{'untrained' if path is None else Path(path).name} (weights "
+            f"{encoder.fingerprint}{shown})",
         )
 
     def wanted(self, name: str, mode: str, seed: int, source: str) -> bool:

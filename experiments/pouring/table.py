@@ -31,7 +31,9 @@ DYNAMIC = ("anytouch",)  # rows whose policy sees three-frame segments; the othe
 
 
 def record(trials: Trials, task: Task, **about: Any) -> dict[str, Any]:
-    """Return the record of a row's trials with one seed; `about` has its row, mode, seed, source and settings."""
+    """Return the record of a row's trials with one seed; `about` has its row, mode, seed, source
+    and settings.
+    """
     poured = np.asarray(trials.poured, np.float64)
     about |= {
         "target": task.target,
@@ -58,7 +60,9 @@ def errors_of(path: Path) -> dict[tuple[str, str], Seeds]:
 
 
 def compared(path: Path, data: str) -> tuple[list[tuple[Any, ...]], list[Finding]]:
-    """Return the rows of a table of results, and AnyTouch compared with the others. `data` names the file.
+    """Return the rows of a table of results, and AnyTouch compared with the others.
+
+    `data` names the file.
 
     The runs of a seed share one learned policy, so intervals are over seeds.
     """

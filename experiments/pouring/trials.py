@@ -1,4 +1,6 @@
-"""Runs of the pouring task in batches: who chooses the actions, demonstrations of an expert, and errors."""
+"""Runs of the pouring task in batches: who chooses the actions, demonstrations of an expert, and
+errors.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ START = STAND + FRAMES - 1
 
 
 class Controller(Protocol):
-    """Who chooses the actions of a batch of runs; `looks`: it is given the frames u8 (B, side, side, 3), else None."""
+    """Who chooses the actions of a batch of runs; `looks`: it is given the frames u8 (B, side,
+    side, 3), else None.
+    """
 
     looks: bool
 
@@ -36,9 +40,11 @@ class Controller(Protocol):
 
 
 class Trials(NamedTuple):
-    """What happened in B runs of up to S actions: `poured` (B,) g, `steps` (B,) taken, `choices` and `actions` (S, B),
-    which differ only where a late hand went on, `mass` g, `tilt` degrees and `rate` g/s (S, B) before each action, and
-    the `frames` u8 (S, F, side, side, 3) of those F runs, the first ones, that were filmed, or None."""
+    """What happened in B runs of up to S actions: `poured` (B,) g, `steps` (B,) taken, `choices`
+    and `actions` (S, B), which differ only where a late hand went on, `mass` g, `tilt` degrees and
+    `rate` g/s (S, B) before each action, and the `frames` u8 (S, F, side, side, 3) of those F runs,
+    the first ones, that were filmed, or None.
+    """
 
     poured: Array
     steps: Array
@@ -56,7 +62,9 @@ class Trials(NamedTuple):
 
 
 class Expert:
-    """Sees the scales: pours, waits while much is under way (if `patient`), goes back just before the target."""
+    """Sees the scales: pours, waits while much is under way (if `patient`), goes back just before
+    the target.
+    """
 
     looks = False
 
@@ -68,7 +76,9 @@ class Expert:
         """Nothing to forget."""
 
     def act(self, frames: Array | None, state: State) -> Array:
-        """Actions (B,) from the mass, the flow and whether the cylinder has been on its way back."""
+        """Actions (B,) from the mass, the flow and whether the cylinder has been on its way
+        back.
+        """
         mass, rate, tilt, highest = jax.device_get(
             (state.mass, state.rate, state.tilt, state.highest)
         )
@@ -98,7 +108,10 @@ class Replay:
 
 
 def draw_runs(task: Task, seed: int, count: int) -> tuple[Setup, jax.Array]:
-    """`count` runs drawn from `seed`: their stacked parameters and keys (count,). No run depends on the others."""
+    """`count` runs drawn from `seed`: their stacked parameters and keys (count,).
+
+    No run depends on the others.
+    """
     setups = [
         physics.draw_setup(task, np.random.default_rng([seed % 2**63, number]))
         for number in range(count)
@@ -152,12 +165,13 @@ def run(
     late: Array | None = None,
     grasps: render.Grasp | None = None,
 ) -> Trials:
-    """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or to `film` runs.
+    """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or to
+    `film` runs.
 
     `film`: of so many runs, the first ones, the frames are kept.
 
-    `grasps`: those of `hold` for these runs and `side`, where they are at hand.
-    `late` (B,): a hand that goes on pouring for so many moments after the controller retracts, which then stays the
+    `grasps`: those of `hold` for these runs and `side`, where they are at hand. `late` (B,): a hand
+    that goes on pouring for so many moments after the controller retracts, which then stays the
     choice. So demonstrations show what to do where the target is already passed.
     """
     drawn = controller.looks or film > 0
@@ -195,6 +209,8 @@ def run(
 
 
 def error(poured: Array, target: float) -> Value:
-    """The mean of |poured - target| over runs `poured` (n,) g, with a bootstrap interval (None for a single run)."""
+    """The mean of |poured - target| over runs `poured` (n,) g, with a bootstrap interval (None for
+    a single run).
+    """
     wrong = np.abs(np.asarray(poured, np.float64) - target)
     return Value(float(wrong.mean()), *mean_interval(wrong, np.arange(len(wrong))))

@@ -1,16 +1,18 @@
-"""How far is the depth of a steel ball off? An encoder that measures, beside a calibration of the unit itself.
+"""How far is the depth of a steel ball off? An encoder that measures, beside a calibration of the
+unit itself.
 
     python -m experiments.real.balls anytouch-tiny
     python -m experiments.real.balls --calibration
 
-A ball of known radius R that touches the gel in a circle of radius a has the profile sqrt(R^2 - r^2) - sqrt(R^2 - a^2)
-above the rim of its contact. The circle is detected in the difference from the untouched gel (`find_circle`). So depth
-is compared with the rim's: what the gel does outside the contact is not known. `--picture` draws real and simulated
-presses, and their colours by slope.
+A ball of known radius R that touches the gel in a circle of radius a has the profile sqrt(R^2 -
+r^2) - sqrt(R^2 - a^2) above the rim of its contact. The circle is detected in the difference from
+the untouched gel (`find_circle`). So depth is compared with the rim's: what the gel does outside
+the contact is not known. `--picture` draws real and simulated presses, and their colours by slope.
 
-`--calibration` is what the field does for one unit: slopes of the ball are fitted to colours and places on half of the
-presses, by a polynomial or a small network, and integrated (Poisson). The halves are exchanged, so that every press is
-tested once. Intervals are 95 %, from 1000 draws of presses. Rows go to `experiments/results/balls.jsonl`.
+`--calibration` is what the field does for one unit: slopes of the ball are fitted to colours and
+places on half of the presses, by a polynomial or a small network, and integrated (Poisson). The
+halves are exchanged, so that every press is tested once. Intervals are 95 %, from 1000 draws of
+presses. Rows go to `experiments/results/balls.jsonl`.
 """
 
 from __future__ import annotations
@@ -66,7 +68,10 @@ class BallOptions:
 
 
 class Unit(NamedTuple):
-    """Presses of balls on one unit. `width_mm` is what the width of its pictures shows, None if nobody says it."""
+    """Presses of balls on one unit.
+
+    `width_mm` is what the width of its pictures shows, None if nobody says it.
+    """
 
     name: str
     sensor: str
@@ -80,7 +85,8 @@ class Unit(NamedTuple):
     fitted: float | None = None
 
 
-# The source's own configuration gives 0.0634 mm a pixel: https://github.com/rpl-cmu/gelslam, config.yaml (ppmm).
+# The source's own configuration gives 0.0634 mm a pixel: https://github.com/rpl-cmu/gelslam,
+# config.yaml (ppmm).
 UNITS = (
     Unit(
         "GelSight Mini",
@@ -136,13 +142,17 @@ class Press(NamedTuple):
 
 
 def difference(frame: Array, gel: Array) -> Array:
-    """Return the colour difference f32 (h, w, 3) of a frame from the untouched gel, without a change of light."""
+    """Return the colour difference f32 (h, w, 3) of a frame from the untouched gel, without a
+    change of light.
+    """
     change = frame.astype(np.float32) - gel
     return np.asarray(cv2.GaussianBlur(change - np.median(change, axis=(0, 1)), (0, 0), 1.0))
 
 
 def find_disc(change: Array) -> tuple[float, float, float]:
-    """Return centre x, y and radius in pixels of the disc whose area and centroid are those of the strongest change."""
+    """Return centre x, y and radius in pixels of the disc whose area and centroid are those of the
+    strongest change.
+    """
     size = cv2.GaussianBlur(np.abs(change).max(2), (0, 0), 3)
     _, _, stats, centres = cv2.connectedComponentsWithStats(
         (size > 0.35 * float(size.max())).astype(np.uint8)
@@ -152,10 +162,11 @@ def find_disc(change: Array) -> tuple[float, float, float]:
 
 
 def find_circle(change: Array, radii: tuple[float, float] | None) -> tuple[float, float, float]:
-    """Return centre x, y and radius in pixels of the circle over which the colours of `change` jump most.
+    """Return centre x, y and radius in pixels of the circle over which the colours of `change` jump
+    most.
 
-    After Daugman (1993): the jump is averaged along the circle, of which a third must lie in the picture. Without
-    `radii` in pixels it is `find_disc`.
+    After Daugman (1993): the jump is averaged along the circle, of which a third must lie in the
+    picture. Without `radii` in pixels it is `find_disc`.
     """
     if radii is None:
         return find_disc(change)
@@ -192,7 +203,10 @@ def find_circle(change: Array, radii: tuple[float, float] | None) -> tuple[float
 
 
 def read_presses(unit: Unit, folder: Path) -> tuple[Array, list[Press]]:
-    """Return the untouched gel and the presses of a unit. A ball's radii lie within a quarter of their median."""
+    """Return the untouched gel and the presses of a unit.
+
+    A ball's radii lie within a quarter of their median.
+    """
     gel = decode(folder / unit.gel)
     presses = list[Press]()
     for ball, pattern in unit.presses.items():
@@ -221,7 +235,9 @@ def distance(press: Press) -> tuple[Array, Array, Array]:
 
 
 def true_depth(press: Press, mm: float) -> Array:
-    """Return the depth (h, w) in mm above the rim of a ball's contact, NaN outside; `mm` is that of a pixel."""
+    """Return the depth (h, w) in mm above the rim of a ball's contact, NaN outside; `mm` is that of
+    a pixel.
+    """
     _, _, r = distance(press)
     inside = r < press.radius
     height = np.sqrt(np.maximum(press.ball**2 - (mm * r) ** 2, 0)) - np.sqrt(
@@ -231,7 +247,9 @@ def true_depth(press: Press, mm: float) -> Array:
 
 
 class Error(NamedTuple):
-    """Errors of a press: radius of the ball as a share, depth of its centre and of its profile over the rim in mm."""
+    """Errors of a press: radius of the ball as a share, depth of its centre and of its profile over
+    the rim in mm.
+    """
 
     radius: float
     centre: float
@@ -255,7 +273,9 @@ def error_of(depth: Array, press: Press, mm: float) -> Error:
 
 
 def sphere(depth: Array, press: Press, mm: float) -> float:
-    """Return the radius mm of the sphere that fits a measured depth (h, w) in mm inside the circle."""
+    """Return the radius mm of the sphere that fits a measured depth (h, w) in mm inside the
+    circle.
+    """
     x, y, r = distance(press)
     inside = r < _INNER * press.radius
     z = depth[inside]
@@ -279,7 +299,8 @@ def sphere(depth: Array, press: Press, mm: float) -> float:
     return float(np.exp(fit.x[3]))
 
 
-# The calibration of one unit ------------------------------------------------------------------------------------------
+# The calibration of one unit
+# ------------------------------------------------------------------------------------------
 
 
 def inputs(press: Press, gel: Array) -> Array:
@@ -290,7 +311,9 @@ def inputs(press: Press, gel: Array) -> Array:
 
 
 def slopes(press: Press, mm: float) -> tuple[Array, Array]:
-    """Return slopes (h * w, 2) of the ball along x and y, 0 far outside of it, and where they are known (h * w,)."""
+    """Return slopes (h * w, 2) of the ball along x and y, 0 far outside of it, and where they are
+    known (h * w,).
+    """
     x, y, r = distance(press)
     height = np.sqrt(np.maximum(press.ball**2 - (mm * r) ** 2, 1e-6))
     inside = r < press.radius - 1
@@ -300,7 +323,10 @@ def slopes(press: Press, mm: float) -> tuple[Array, Array]:
 
 
 def calibrate(kind: str, presses: Sequence[Press], gel: Array, mm: float) -> Any:
-    """Return the regression of slopes on colours and places. The outside of a press counts as much as its inside."""
+    """Return the regression of slopes on colours and places.
+
+    The outside of a press counts as much as its inside.
+    """
     rng = np.random.default_rng(0)
     xs = []
     ys = []
@@ -323,7 +349,9 @@ def calibrate(kind: str, presses: Sequence[Press], gel: Array, mm: float) -> Any
 
 
 def integrate(slope: Array) -> Array:
-    """Return the surface (h, w) whose slopes (h, w, 2) a pixel along x and y fit best (Poisson, free edges)."""
+    """Return the surface (h, w) whose slopes (h, w, 2) a pixel along x and y fit best (Poisson,
+    free edges).
+    """
     height, width = slope.shape[:2]
     divergence = np.zeros((height, width))
     across = (slope[:, 1:, 0] + slope[:, :-1, 0]) / 2
@@ -342,7 +370,9 @@ def integrate(slope: Array) -> Array:
 
 
 def calibrated_depths(kind: str, gel: Array, presses: Sequence[Press], mm: float) -> list[Array]:
-    """Return the depth (h, w) mm of every press, by a calibration on the other half of the presses."""
+    """Return the depth (h, w) mm of every press, by a calibration on the other half of the
+    presses.
+    """
     depths: list[Array] = [np.zeros(0)] * len(presses)
     for half in (0, 1):
         model = calibrate(
@@ -358,7 +388,9 @@ def calibrated_depths(kind: str, gel: Array, presses: Sequence[Press], mm: float
 def measured_depths(
     encoder: Encoder, unit: Unit, gel: Array, presses: Sequence[Press]
 ) -> tuple[list[Array], Array, Array]:
-    """Return depths (h, w) in mm, their deviations at the centre, and areas of contact in mm2, of every press."""
+    """Return depths (h, w) in mm, their deviations at the centre, and areas of contact in mm2, of
+    every press.
+    """
     depths = list[Array]()
     deviations = list[float]()
     areas = list[float]()
@@ -380,7 +412,9 @@ def interval(values: Array) -> list[float]:
 
 
 def record_of(depths: Sequence[Array], presses: Sequence[Press], mm: float) -> dict[str, Any]:
-    """Return medians with intervals of the errors on presses whose circle lies in the picture, and those of each."""
+    """Return medians with intervals of the errors on presses whose circle lies in the picture, and
+    those of each.
+    """
     whole = [n for n, press in enumerate(presses) if press.is_whole]
     errors = [error_of(depths[n], presses[n], mm) for n in whole]
     record: dict[str, Any] = {"presses": len(whole), "left_out": len(presses) - len(whole)}
@@ -413,7 +447,9 @@ def unknown_record(depths: Sequence[Array], presses: Sequence[Press], mm: float)
 
 
 def draw_colours(path: Path, unit: Unit, gel: Array, presses: Sequence[Press]) -> None:
-    """Draw differences of presses above simulated ones of the same balls and circles, and their strength by slope."""
+    """Draw differences of presses above simulated ones of the same balls and circles, and their
+    strength by slope.
+    """
     mm = (unit.width_mm or 0.0) / gel.shape[1]
     kind = SENSORS[unit.sensor]
     device = identity_unit(kind)._replace(gain=np.full(3, kind.contrast, np.float32))

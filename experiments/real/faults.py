@@ -153,7 +153,9 @@ FAULTS: dict[str, tuple[str, Fault]] = {
 
 
 def most_different(unit: UnitFrames, units: Sequence[UnitFrames]) -> UnitFrames | None:
-    """Return the other unit of the same sensor and size whose usual picture differs most, None without one."""
+    """Return the other unit of the same sensor and size whose usual picture differs most, None
+    without one.
+    """
     rivals = [
         other
         for other in units

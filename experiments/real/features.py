@@ -14,7 +14,8 @@ from experiments.real.recordings import Recordings
 
 
 def encoder_features(encoder: Encoder, data: Recordings, sensor: str | None = None) -> np.ndarray:
-    """Return the class token and the mean of the patch tokens (n, 2E), each with unit variance over train frames.
+    """Return the class token and the mean of the patch tokens (n, 2E), each with unit variance over
+    train frames.
 
     With `sensor` all frames get the tokens of that sensor.
     """
@@ -28,7 +29,9 @@ def encoder_features(encoder: Encoder, data: Recordings, sensor: str | None = No
 
 
 def pixel_values(data: Recordings) -> np.ndarray:
-    """Return 200 principal components of 32 x 24 pixels and of their difference from the untouched gel."""
+    """Return 200 principal components of 32 x 24 pixels and of their difference from the untouched
+    gel.
+    """
 
     def small(picture: np.ndarray) -> np.ndarray:
         return cv2.resize(picture, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
@@ -47,7 +50,9 @@ def components(values: list[np.ndarray], data: Recordings, count: int = 200) -> 
 
 
 def classical_values(data: Recordings) -> np.ndarray:
-    """Return histograms of oriented gradients and of local binary patterns of the difference picture."""
+    """Return histograms of oriented gradients and of local binary patterns of the difference
+    picture.
+    """
     hog = cv2.HOGDescriptor((96, 96), (32, 32), (32, 32), (16, 16), 9)
     values = []
     for frame, gel in data.pairs():
@@ -60,7 +65,9 @@ def classical_values(data: Recordings) -> np.ndarray:
 
 
 def _binary_patterns(grey: np.ndarray, cells: int = 4) -> np.ndarray:
-    """Return 256-bin histograms of 8-neighbour codes in a grid of cells, pooled to 59 uniform patterns."""
+    """Return 256-bin histograms of 8-neighbour codes in a grid of cells, pooled to 59 uniform
+    patterns.
+    """
     centre = grey[1:-1, 1:-1]
     code = np.zeros(centre.shape, np.uint8)
     steps = [(-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1)]

@@ -1,4 +1,6 @@
-"""Real recordings of a GelSight Mini with dots: rows of a manifest, and what three questions ask of them."""
+"""Real recordings of a GelSight Mini with dots: rows of a manifest, and what three questions ask of
+them.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,10 @@ Untouched = Literal["rule", "median", "first frame"]
 
 @dataclass(frozen=True)
 class Recordings:
-    """Frames as rows of `manifest`, and one value of every column a frame. `data` is the hash of the whole pack."""
+    """Frames as rows of `manifest`, and one value of every column a frame.
+
+    `data` is the hash of the whole pack.
+    """
 
     manifest: Manifest
     recording: np.ndarray
@@ -54,8 +59,9 @@ class Recordings:
 def read(path: str | Path, untouched: Untouched = "rule") -> Recordings:
     """Read all rows of the gripper from the manifest of the pack. Raises UserError.
 
-    `untouched`: what is taken for the untouched gel. "rule" is that of the package, the unit's own picture, or the
-    median of its frames. "median" is this median everywhere, and "first frame" that of the recording.
+    `untouched`: what is taken for the untouched gel. "rule" is that of the package, the unit's own
+    picture, or the median of its frames. "median" is this median everywhere, and "first frame" that
+    of the recording.
     """
     whole = manifests.read(path)
     rows = (whole.text_column("dataset") == SET) & (whole.text_column("split") != "background")

@@ -1,10 +1,13 @@
-"""What is an encoder worth on real recordings? Scores of encoders beside pixels and a classical baseline.
+"""What is an encoder worth on real recordings? Scores of encoders beside pixels and a classical
+baseline.
 
-    python -m experiments.real.run anytouch-tiny untrained:anytouch-tiny "stage 1=runs/anytouch-tiny/stage1"
+    python -m experiments.real.run anytouch-tiny untrained:anytouch-tiny "stage
+    1=runs/anytouch-tiny/stage1"
 
-Each model is a name, a run folder or a weights file; `untrained:MODEL` is the same network without training. Every row
-goes to `experiments/results/real.jsonl`. `make results` makes the page from that file alone. `--untouched median` does
-without the pictures of the untouched gel, and `--untouched "first frame"` takes the first frame of a recording for it.
+Each model is a name, a run folder or a weights file; `untrained:MODEL` is the same network without
+training. Every row goes to `experiments/results/real.jsonl`. `make results` makes the page from
+that file alone. `--untouched median` does without the pictures of the untouched gel, and
+`--untouched "first frame"` takes the first frame of a recording for it.
 """
 
 from __future__ import annotations
@@ -24,7 +27,9 @@ CNN = "small CNN from scratch"
 
 
 def load(name: str) -> Encoder:
-    """Load an encoder by name, path or TITLE=PATH; `untrained:` gives the same network without training."""
+    """Load an encoder by name, path or TITLE=PATH; `untrained:` gives the same network without
+    training.
+    """
     name = name.rpartition("=")[2]
     if name.startswith(UNTRAINED):
         return random_encoder(load_encoder(name.removeprefix(UNTRAINED)).config)

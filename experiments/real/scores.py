@@ -1,6 +1,8 @@
-"""Scores of whole recordings: a head is fitted on frames, and a recording gets the mean of its frames' scores.
+"""Scores of whole recordings: a head is fitted on frames, and a recording gets the mean of its
+frames' scores.
 
-Every choice (the penalty, the number of neighbours) is made on validation recordings or on folds of train.
+Every choice (the penalty, the number of neighbours) is made on validation recordings or on folds of
+train.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ class Score(NamedTuple):
 def linear_scores(
     x: Array, y: Array, classes: int, fit: Array, weights: Array
 ) -> list[tuple[float, Array]]:
-    """Return (penalty, probabilities (n, classes)) of logistic regression on the rows `fit` for every penalty.
+    """Return (penalty, probabilities (n, classes)) of logistic regression on the rows `fit` for
+    every penalty.
 
     All columns are divided by one number, which keeps the ranking of principal components.
     """
@@ -91,7 +94,9 @@ def recording_score(
     classes: int,
     score: Callable[..., list[tuple[float, Array]]] = linear_scores,
 ) -> Score:
-    """Fit on train, choose on val, and score each recording of test. x (n, d), y class numbers (n,)."""
+    """Fit on train, choose on val, and score each recording of test. x (n, d), y class numbers
+    (n,).
+    """
     fit = np.flatnonzero(split == "train")
     options = score(x, y, classes, fit, _share_weights(groups[fit]))
 
@@ -116,7 +121,9 @@ def object_score(x: Array, data: Recordings, score: Callable[..., Any] = linear_
 def other_finger_score(
     x: Array, data: Recordings, score: Callable[..., Any] = linear_scores
 ) -> Score:
-    """Which object is it, on test recordings of the finger whose camera the head never saw? Both directions."""
+    """Which object is it, on test recordings of the finger whose camera the head never saw? Both
+    directions.
+    """
     y = np.searchsorted(data.names, data.object)
     parts = []
     for trained, tested in (("cam0", "cam2"), ("cam2", "cam0")):

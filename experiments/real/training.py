@@ -1,4 +1,6 @@
-"""A small CNN that is trained with labels from scratch, as a head of `scores.HEADS` whose option is the epochs."""
+"""A small CNN that is trained with labels from scratch, as a head of `scores.HEADS` whose option is
+the epochs.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ SHIFT = 0.06  # of a side
 
 
 class SmallCnn(nnx.Module):
-    """Four convolutions of stride 2, each with a layer norm, their mean over the picture, and a linear head."""
+    """Four convolutions of stride 2, each with a layer norm, their mean over the picture, and a
+    linear head.
+    """
 
     def __init__(
         self, classes: int, seed: int = 0, channels: Sequence[int] = (32, 64, 128, 128)

@@ -1,14 +1,16 @@
-"""Does a head know when it does not know, and does the health check find faults? Figures on recordings of your own.
+"""Does a head know when it does not know, and does the health check find faults? Figures on
+recordings of your own.
 
     anytouch embed --data ../shared/real_touch2/manifest.csv --out known.npz --on-bad-sample skip
     anytouch embed --data ../shared/real_touch/manifest.csv --out others.npz --on-bad-sample skip
-    python -m experiments.real.trust "real, object" ../shared/real_touch2/manifest.csv --features known.npz \\
+    python -m experiments.real.trust "real, object" ../shared/real_touch2/manifest.csv --features
+    known.npz \\
         --strange others.npz
     python -m experiments.real.trust "real" ../shared/real_touch2/manifest.csv --health
 
-Recordings are split at random, again and again: 60 % to fit a head, 20 % to calibrate it with parts of the 60, and 20 %
-to test it. Intervals are 95 %, over groups of recordings. A line of each name goes to
-`experiments/results/trust.jsonl`. `make results` makes the pages from that file alone.
+Recordings are split at random, again and again: 60 % to fit a head, 20 % to calibrate it with parts
+of the 60, and 20 % to test it. Intervals are 95 %, over groups of recordings. A line of each name
+goes to `experiments/results/trust.jsonl`. `make results` makes the pages from that file alone.
 """
 
 from __future__ import annotations
@@ -91,7 +93,8 @@ def auroc(known: Array, strange: Array) -> float:
 
 
 def calibration_error(p: Array, correct: Array, bins: int = 15) -> float:
-    """Return the expected calibration error: the mean gap of confidence `p` (n,) and accuracy over bins of equal width.
+    """Return the expected calibration error: the mean gap of confidence `p` (n,) and accuracy over
+    bins of equal width.
 
     `correct` (n,) says whether the likeliest class was right (Guo et al. 2017, Eq. 5).
     """
@@ -102,7 +105,9 @@ def calibration_error(p: Array, correct: Array, bins: int = 15) -> float:
 
 
 def over_groups(value: Callable[[Array], float], groups: Array) -> list[float]:
-    """Return a figure of row numbers, and the ends of its interval under a bootstrap over groups."""
+    """Return a figure of row numbers, and the ends of its interval under a bootstrap over
+    groups.
+    """
     rng = np.random.default_rng(0)
     names = np.unique(groups)
     members = [np.flatnonzero(groups == name) for name in names]
@@ -114,7 +119,9 @@ def over_groups(value: Callable[[Array], float], groups: Array) -> list[float]:
 
 
 def random_split(groups: Array, seed: int) -> tuple[Array, Array, Array]:
-    """Return masks (n,) of the rows to fit on, to calibrate on and to test, 60, 20 and 20 % of the groups."""
+    """Return masks (n,) of the rows to fit on, to calibrate on and to test, 60, 20 and 20 % of the
+    groups.
+    """
     names, ids = np.unique(groups, return_inverse=True)
     place = np.random.default_rng(seed).permutation(len(names))[ids] / len(names)
     return place < 0.6, (place >= 0.6) & (place < 0.8), place >= 0.8
@@ -143,7 +150,9 @@ def fitted(data: Touches, fit: Array, val: Array, options: TrustOptions) -> Line
 
 
 def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
-    """Return accuracy, calibration error, coverage and false alarms on recordings that a head never met."""
+    """Return accuracy, calibration error, coverage and false alarms on recordings that a head never
+    met.
+    """
     columns: dict[str, list[Array]] = defaultdict(list)
     counts = []
     for seed in range(options.repeats):
@@ -192,7 +201,9 @@ def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
 
 
 def classes_never_met(data: Touches, options: TrustOptions) -> dict[str, list[float]]:
-    """Return the AUROC of the novelty, and of a low probability, for classes that are left out of the fit in turn."""
+    """Return the AUROC of the novelty, and of a low probability, for classes that are left out of
+    the fit in turn.
+    """
     classes = np.random.default_rng(0).permutation(np.unique(data.y))
     parts = []
     for fold in range(options.held_out):
@@ -256,7 +267,9 @@ def sensors_never_met(data: Touches, options: TrustOptions) -> dict[str, dict[st
 
 
 def thinned(unit: health.UnitFrames) -> health.UnitFrames:
-    """Return the unit with some nine recordings of two frames: faults of all pictures take minutes."""
+    """Return the unit with some nine recordings of two frames: faults of all pictures take
+    minutes.
+    """
     step = max(1, len(unit.recordings) // 8)
     return replace(unit, recordings=[recording[:3:2] for recording in unit.recordings[::step]])
 
@@ -264,7 +277,8 @@ def thinned(unit: health.UnitFrames) -> health.UnitFrames:
 def health_record(
     units: Sequence[health.UnitFrames], gels: Mapping[str, list[Array]]
 ) -> dict[str, Any]:
-    """Return false alarms on the units, and {fault: [reported, made, undecided]} of faults made from each.
+    """Return false alarms on the units, and {fault: [reported, made, undecided]} of faults made
+    from each.
 
     `gels` are pictures of more untouched gels by sensor.
     """

@@ -34,7 +34,9 @@ def cut(
 
 
 def mark(folder: Path, share: float) -> None:
-    """Write the simulated manifest as WHOLE, with `label.contact`: which frames are touched (`anytouch contact`)."""
+    """Write the simulated manifest as WHOLE, with `label.contact`: which frames are touched
+    (`anytouch contact`).
+    """
     table = manifests.read(folder / MADE)
     manifests.write(mark_contact(table, contact_scores(table), share=share)[0], folder / WHOLE)
 

@@ -1,7 +1,7 @@
 """Execution of the plan: runs that are missing are made, and each leaves a record.
 
-Several processes may work in one folder. Each leaves to the others what they have claimed, and waits only when there is
-nothing else to do.
+Several processes may work in one folder. Each leaves to the others what they have claimed, and
+waits only when there is nothing else to do.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ PAUSE = 5.0  # s between two looks at what others work on
 
 
 class Outcome(NamedTuple):
-    """Keys of the runs made in this call and of those made before it, and {key: error} of those that failed."""
+    """Keys of the runs made in this call and of those made before it, and {key: error} of those
+    that failed.
+    """
 
     made: list[str]
     kept: list[str]
@@ -37,7 +39,9 @@ def is_done(leaf: Leaf, out: Path) -> bool:
 
 
 def check_results(leaves: Sequence[Leaf], out: Path) -> None:
-    """Raise UserError where `out` has results of these questions by another simulator or other settings."""
+    """Raise UserError where `out` has results of these questions by another simulator or other
+    settings.
+    """
     if not leaves:
         return
     size = leaves[0].size
@@ -47,7 +51,10 @@ def check_results(leaves: Sequence[Leaf], out: Path) -> None:
         if theirs.get("question") not in questions:
             continue
         if simulated(theirs) != ours["simulator"]:
-            what = f"version {simulated(theirs)} of the simulator, and these runs are of version {ours['simulator']}"
+            what = (
+                f"version {simulated(theirs)} of the simulator, and these runs are of version "
+                f"{ours['simulator']}"
+            )
         elif wrong := differences(
             compared([theirs, ours | {"scoring": plan.scoring(theirs["question"])}])
         ):
@@ -55,8 +62,10 @@ def check_results(leaves: Sequence[Leaf], out: Path) -> None:
         else:
             continue
         raise UserError(
-            f"{out} holds results of {theirs['question']} of {what}: give a new folder, for example "
-            f"make experiments OUT=runs/study, or remove the lines of {theirs['question']} to run them again"
+            f"{out} holds results of {theirs['question']} of {what}: give a new folder, for "
+            "example "
+            f"make experiments OUT=runs/study, or remove the lines of {theirs['question']} to run "
+            "them again"
         )
 
 
@@ -68,7 +77,10 @@ def execute(
     log: Callable[[str], None] = print,
     pause: Callable[[float], None] = time.sleep,
 ) -> Outcome:
-    """Make the missing runs in order, a record each. A run that fails is logged, and the others go on."""
+    """Make the missing runs in order, a record each.
+
+    A run that fails is logged, and the others go on.
+    """
     result = Outcome([], [], {})
     waiting = list(leaves)
     while waiting:
@@ -107,7 +119,9 @@ def missing(leaf: Leaf, ready: set[str]) -> tuple[list[Scenes], list[Training]]:
 
 
 def _make(leaf: Leaf, work: Work, out: Path, log: Callable[[str], None]) -> bool:
-    """Make what a run needs, then the run; False where another process is about to make a part of it."""
+    """Make what a run needs, then the run; False where another process is about to make a part of
+    it.
+    """
     for one in missing(leaf, work.ready(leaf))[0]:
         with work.claim(one.name) as mine:
             if mine and one.name not in work.ready(leaf):

@@ -1,4 +1,7 @@
-"""What the paper reports: Tables 1, 2, 3, 4 and 6 of AnyTouch (ICLR 2025). Accuracies in %, errors in g."""
+"""What the paper reports: Tables 1, 2, 3, 4 and 6 of AnyTouch (ICLR 2025).
+
+Accuracies in %, errors in g.
+"""
 
 from __future__ import annotations
 

@@ -19,9 +19,11 @@ COLOURED = 12  # touches that get a colour and their lines; the others are grey
 
 
 def q2(runs: Sequence[Run], path: Path) -> None:
-    """Touches by three sensors in four spaces (Figure 4): a mark a sensor, a colour and dashed lines a touch.
+    """Touches by three sensors in four spaces (Figure 4): a mark a sensor, a colour and dashed
+    lines a touch.
 
-    All panels are of one seed, the smallest that every stage has. Without such a seed nothing is drawn.
+    All panels are of one seed, the smallest that every stage has. Without such a seed nothing is
+    drawn.
     """
     every = {(run.name, run.seed): run.about["points"] for run in runs if run.question == "q2"}
     stages = [(name, text) for name, text in STAGES if any(name == one for one, _ in every)]

@@ -1,13 +1,15 @@
-"""The plan of the matrix: for each question of the paper its runs, as a graph of data, stage 1, stage 2 and scores.
+"""The plan of the matrix: for each question of the paper its runs, as a graph of data, stage 1,
+stage 2 and scores.
 
-A `Training` is its configuration, its data and the training that it starts from; two that are equal are one, so what
-can be shared is shared. Nothing here computes.
+A `Training` is its configuration, its data and the training that it starts from; two that are equal
+are one, so what can be shared is shared. Nothing here computes.
 
-Data: `own` is the data set of each sensor by itself (touches of no other sensor). `fine` and `coarse`
-are its TacQuad (four sensors at one place, by one motion or by hand), `other` a data set never trained on, of other
-individuals (more than half of its kinds, primitive by texture by material, occur in `own` as well). Objects held out
-are held out in `own`, `fine` and `coarse` alike (`work.check_objects` refuses sizes at which they are not). `own` also
-has DuraGel, which no run trains on: it is the unseen sensor, as Taxim and TACTO are in the paper.
+Data: `own` is the data set of each sensor by itself (touches of no other sensor). `fine` and
+`coarse` are its TacQuad (four sensors at one place, by one motion or by hand), `other` a data set
+never trained on, of other individuals (more than half of its kinds, primitive by texture by
+material, occur in `own` as well). Objects held out are held out in `own`, `fine` and `coarse` alike
+(`work.check_objects` refuses sizes at which they are not). `own` also has DuraGel, which no run
+trains on: it is the unseen sensor, as Taxim and TACTO are in the paper.
 """
 
 from __future__ import annotations
@@ -29,26 +31,31 @@ ALIGNED = ("fine", "coarse")
 STACK = Stack(128, 2, 4, 512)
 DECODER = Stack(128, 2, 4, 512)
 LABELS = ("name", "seeds")  # fields of a size that no single run hangs on
-# Versions of how a question is scored, 1 where it is not named. 2: contact frames are those with force.
+# Versions of how a question is scored, 1 where it is not named. 2: contact frames are those with
+# force.
 SCORING = dict.fromkeys(("q1", "q3", "ablations"), 2)
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large everything is. Touches of each data set, objects, frames a touch, pixels; steps and batches; network.
+    """How large everything is.
 
-    Preset tiny with less of everything that costs time and teaches nothing here, so that three seeds fit in the time:
-    `image` pixels (36 patches instead of 64), `stack` of all three towers (in the same time it learns more than the
-    preset's 192 x 6). Stage 1 is long enough to help: contrast after 150 steps of it is slower than from scratch.
+    Touches of each data set, objects, frames a touch, pixels; steps and batches; network.
 
-    Towers from scratch learn nothing in minutes from matching one pair against one other, as the paper does on CLIP's
-    weights. So `match_head` is "cosine", each touch against all others of the batch, on a share `match_keep` of the
-    patches and weighed by `match_weight`, all of a step's touches to be found by one sensor (`negatives`), so that the
-    sensor is no clue; only frames in contact are drawn, those with a share `contact` of the
-    strongest of their recording (`anytouch data contact`), as the paper's are contact frames; a row of question q2 has
-    the paper's head. The softmax starts mild (`temperature`): a sharp one only punishes untrained towers. Touches are
-    background-subtracted, and their colours are not jittered, since colours show slopes. `seeds` are those of
-    questions whose sign is claimed; the others take the first.
+    Preset tiny with less of everything that costs time and teaches nothing here, so that three
+    seeds fit in the time: `image` pixels (36 patches instead of 64), `stack` of all three towers
+    (in the same time it learns more than the preset's 192 x 6). Stage 1 is long enough to help:
+    contrast after 150 steps of it is slower than from scratch.
+
+    Towers from scratch learn nothing in minutes from matching one pair against one other, as the
+    paper does on CLIP's weights. So `match_head` is "cosine", each touch against all others of the
+    batch, on a share `match_keep` of the patches and weighed by `match_weight`, all of a step's
+    touches to be found by one sensor (`negatives`), so that the sensor is no clue; only frames in
+    contact are drawn, those with a share `contact` of the strongest of their recording (`anytouch
+    data contact`), as the paper's are contact frames; a row of question q2 has the paper's head.
+    The softmax starts mild (`temperature`): a sharp one only punishes untrained towers. Touches are
+    background-subtracted, and their colours are not jittered, since colours show slopes. `seeds`
+    are those of questions whose sign is claimed; the others take the first.
     """
 
     name: str = "full"
@@ -119,7 +126,10 @@ class Scenes:
 
 @dataclass(frozen=True)
 class Training:
-    """One stage of one model. `config.data.manifests` are names (see `Work.manifest`), not files."""
+    """One stage of one model.
+
+    `config.data.manifests` are names (see `Work.manifest`), not files.
+    """
 
     config: Config
     init: Training | None = None
@@ -143,7 +153,9 @@ class Training:
 
 @dataclass(frozen=True)
 class Leaf:
-    """One run of a question: the model `name` with a seed, scored. What is scored hangs on the question alone.
+    """One run of a question: the model `name` with a seed, scored.
+
+    What is scored hangs on the question alone.
 
     `model` None: nothing is trained. `tower`: the image tower of `model` serves as touch encoder.
     """
@@ -182,7 +194,10 @@ def scoring(question: str) -> int:
 
 
 def simulator() -> int:
-    """The version of the simulator: what a seed gives hangs on it. Imported late, since it brings jax."""
+    """The version of the simulator: what a seed gives hangs on it.
+
+    Imported late, since it brings jax.
+    """
     from anytouch_jax.sim.dataset import VERSION
 
     return VERSION
@@ -194,7 +209,9 @@ def settings(size: Size) -> dict[str, Any]:
 
 
 def chosen(config: Any) -> Any:
-    """The settings of a configuration that are not the default: a later version's new default is no other training."""
+    """The settings of a configuration that are not the default: a later version's new default is no
+    other training.
+    """
     if not dataclasses.is_dataclass(config):
         return config
     fields = {
@@ -206,7 +223,10 @@ def chosen(config: Any) -> Any:
 
 
 def scenes(size: Size) -> tuple[Scenes, ...]:
-    """The simulated data sets. All but `other` share their objects and which of them are held out."""
+    """The simulated data sets.
+
+    All but `other` share their objects and which of them are held out.
+    """
     return (
         Scenes("own", (*SENSORS, UNSEEN), size.own, "fine", 0, 0.25),
         Scenes("fine", SENSORS, size.fine, "fine", 0, 0.25, first=size.own),
@@ -291,7 +311,9 @@ def leaves(size: Size) -> list[Leaf]:
 def _of_seed(
     size: Size, seed: int, *, first: bool
 ) -> Iterator[tuple[str, str, Training | None, bool]]:
-    """(question, name, model, tower) of one seed; what makes no claim is run with the first seed alone."""
+    """(question, name, model, tower) of one seed; what makes no claim is run with the first seed
+    alone.
+    """
 
     def own(recipe: str, **settings: Any) -> Training:
         return training(size, recipe, seed, **settings)

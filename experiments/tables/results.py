@@ -41,7 +41,9 @@ class Run:
 
 
 class Column(NamedTuple):
-    """What a column of a table reads: `view`, `task` and `metric` of a row; `factor` brings it to what is printed."""
+    """What a column of a table reads: `view`, `task` and `metric` of a row; `factor` brings it to
+    what is printed.
+    """
 
     view: str
     task: str
@@ -50,7 +52,10 @@ class Column(NamedTuple):
 
 
 def read(path: Path) -> list[Run]:
-    """Return the runs of a file of results, in the order of keys. Raises UserError for a record that is no run."""
+    """Return the runs of a file of results, in the order of keys.
+
+    Raises UserError for a record that is no run.
+    """
     runs = []
     for key, about in read_records(path).items():
         try:
@@ -81,8 +86,9 @@ def simulated(about: Mapping[str, Any]) -> int:
 def compared(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return what records of one table must share, by name.
 
-    That is simulator, scoring, settings, and, within a seed, the content of every data set by its name: signs are taken
-    seed by seed. The data of another seed may be of another processor, where the same scenes gave another content hash.
+    That is simulator, scoring, settings, and, within a seed, the content of every data set by its
+    name: signs are taken seed by seed. The data of another seed may be of another processor, where
+    the same scenes gave another content hash.
     """
     names = {name for about in records for name in about["settings"] if name not in LABELS}
     return [

@@ -1,10 +1,9 @@
 """The matrix of experiments: `make experiments [QUICK=1]`, or `python -m experiments.tables.run`.
 
-Makes the missing runs, one line of `matrix.jsonl` each, and then the pages of results.
-`plan.py` lists the runs, and `--plan` prints them. Stop it at any time: the same command continues. The same command in
-a second terminal shares the work.
-The results of a question are of one version of the simulator and of one size. Give those of another a new folder with
-`--out`.
+Makes the missing runs, one line of `matrix.jsonl` each, and then the pages of results. `plan.py`
+lists the runs, and `--plan` prints them. Stop it at any time: the same command continues. The same
+command in a second terminal shares the work. The results of a question are of one version of the
+simulator and of one size. Give those of another a new folder with `--out`.
 """
 
 from __future__ import annotations
@@ -46,7 +45,10 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="sizes: steps1=400 own=600 seeds=[0,1]",
     )
     parser.add_argument("--work", type=Path, help="folder of data and runs (default: runs/matrix)")
-    about = "folder of the pages and of matrix.jsonl (default: experiments/results; with --quick or --set in --work)"
+    about = (
+        "folder of the pages and of matrix.jsonl (default: experiments/results; with --quick or "
+        "--set in --work)"
+    )
     parser.add_argument("--out", type=Path, help=about)
     return parser.parse_args(argv)
 

@@ -1,7 +1,8 @@
-"""What is measured of a run's encoder, question by question: rows {view, task, protocol, metric, mean, low, high, ...}.
+"""What is measured of a run's encoder, question by question: rows {view, task, protocol, metric,
+mean, low, high, ...}.
 
-A view says of which data and how: `seen` (the sensors trained on), `seen, other data` (a data set never trained on),
-`unseen` and `unseen, other data` (a sensor never trained on), `clips`.
+A view says of which data and how: `seen` (the sensors trained on), `seen, other data` (a data set
+never trained on), `unseen` and `unseen, other data` (a sensor never trained on), `clips`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ TOUCHES = 30
 
 
 def score(leaf: Leaf, work: Work) -> dict[str, Any]:
-    """The results of a run: `rows`, `data` (names of the manifests read), and what else the question wants."""
+    """The results of a run: `rows`, `data` (names of the manifests read), and what else the
+    question wants.
+    """
     return _OF[leaf.question](leaf, work)
 
 
@@ -75,7 +78,9 @@ def _probes(
     encoder: Encoder | None,
     **options: Any,
 ) -> list[Row]:
-    """Results of `probe_tasks` on a manifest (by its file name in a data set), for an encoder or (None) raw pixels."""
+    """Results of `probe_tasks` on a manifest (by its file name in a data set), for an encoder or
+    (None) raw pixels.
+    """
     dataset, _, file = name.partition("/")
     table = manifests.read(work.folder / dataset / file)
     shared: dict[str, Any] = {"seeds": leaf.size.refits, "max_rows": leaf.size.max_rows} | options
@@ -94,7 +99,8 @@ def _probes(
 def _four_columns(
     leaf: Leaf, work: Work, seen: Sequence[str], tasks: Sequence[str] = ("material",)
 ) -> list[Row]:
-    """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor (OF 1.0, OF 2.0).
+    """The columns of the paper's tables: `seen` sensors (TAG), other data (Feel), an unseen sensor
+    (OF 1.0, OF 2.0).
 
     Of each the material and the form of the indenter; of the first also `tasks`.
     """
@@ -138,7 +144,9 @@ def _dynamic(leaf: Leaf, work: Work) -> list[Row]:
 
 
 def _q2(leaf: Leaf, work: Work) -> dict[str, Any]:
-    """The space of the test touches by the sensors trained on: numbers, and the t-SNE of some touches."""
+    """The space of the test touches by the sensors trained on: numbers, and the t-SNE of some
+    touches.
+    """
     table = manifests.read(work.folder / "own" / cuts.STATIC)
     sensors = table.text_column("sensor")
     rows = table.rows_of("test")

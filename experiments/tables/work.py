@@ -1,7 +1,8 @@
 """The work of a run on disk: data sets are simulated and cut, stages trained, encoders scored.
 
-Under one folder: the data sets by name, `trained/<key>` a run folder each, `cache` features by content. `done.json` in
-a folder says that it is finished, and of what: one of other data is made again, one without it is gone on with.
+Under one folder: the data sets by name, `trained/<key>` a run folder each, `cache` features by
+content. `done.json` in a folder says that it is finished, and of what: one of other data is made
+again, one without it is gone on with.
 """
 
 from __future__ import annotations
@@ -125,7 +126,9 @@ class Work:
                 self.make(one, size)
 
     def runs(self, asked: Mapping[str, Training], size: Size) -> dict[str, Path]:
-        """The run folders of trainings by name; what is not trained yet is, and its data are made."""
+        """The run folders of trainings by name; what is not trained yet is, and its data are
+        made.
+        """
         for name, last in asked.items():
             self.make_sets(last.manifests, size)
             leaf = Leaf("encoders", name, last.config.run.seed, last, size)
@@ -179,10 +182,12 @@ class Work:
 
 
 def check_objects(size: Size) -> None:
-    """Raise UserError where an object would stand in two splits of data sets that share their objects.
+    """Raise UserError where an object would stand in two splits of data sets that share their
+    objects.
 
-    What is held out of `own` must not be met in training on `aligned`. Data sets of one seed draw from one catalogue,
-    in which a name is one object; which of them are held out hangs on how many there are.
+    What is held out of `own` must not be met in training on `aligned`. Data sets of one seed draw
+    from one catalogue, in which a name is one object; which of them are held out hangs on how many
+    there are.
     """
     known: dict[tuple[int, str], tuple[str, str]] = {}
     for one in plan.scenes(size):
@@ -192,7 +197,8 @@ def check_objects(size: Size) -> None:
             if before != split:
                 least = min(other.touches for other in plan.scenes(size) if other.seed == one.seed)
                 raise UserError(
-                    f"the object {thing.name} would be in {before} of {name} and in {split} of {one.name}: give both "
+                    f"the object {thing.name} would be in {before} of {name} and in {split} of "
+                    f"{one.name}: give both "
                     f"the same objects, for example --set objects={min(size.objects, least)}"
                 )
 

@@ -1,7 +1,7 @@
 """Encoders of the translation study: trained without the objects of its pairs.
 
-The paper takes the coarse data of the objects that a translation is tested on out of pre-training (App. "Cross-sensor
-generation"). Here every row of such an object is left out.
+The paper takes the coarse data of the objects that a translation is tested on out of pre-training
+(App. "Cross-sensor generation"). Here every row of such an object is left out.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ NOT_TUNED = (("stage1", "fine"),)  # it explains a frozen row
 
 
 def write_remaining(path: Path, taken: Manifest) -> Path:
-    """Write the manifest at `path` without the objects of `taken` next to it. Raises UserError when no row is left."""
+    """Write the manifest at `path` without the objects of `taken` next to it.
+
+    Raises UserError when no row is left.
+    """
     whole = manifests.read(path)
     kept = pairs.without_objects(whole, taken)
     target = path.with_name(f"{path.stem}{LESS}{path.suffix}")
@@ -51,7 +54,9 @@ def reduced(one: Training) -> Training:
 
 
 def train(work: Work, size: Size, seed: int, taken: Manifest) -> dict[str, Path]:
-    """Train what is not trained yet on the data sets of `work`, and return the run folders by name."""
+    """Train what is not trained yet on the data sets of `work`, and return the run folders by
+    name.
+    """
     wanted = trainings(size, seed)
     names = sorted({name for one in wanted.values() for name in one.manifests})
     work.make_sets(names, size)

@@ -1,9 +1,10 @@
 """Translations between two sensors: their design, how they are applied, saved and loaded.
 
-The source's image goes through a ViT encoder with its sensor's tokens. A ViT decoder paints the target's image from all
-tokens, as the generator of a ViTGAN (Lee et al., 2021); a field is regressed by an MLP from the patch tokens (App.
-"Cross-sensor generation"). Without an encoder the network is one of the two references, a U-Net or an MLP on pixels.
-What is predicted is the difference from the mean target of the training pairs.
+The source's image goes through a ViT encoder with its sensor's tokens. A ViT decoder paints the
+target's image from all tokens, as the generator of a ViTGAN (Lee et al., 2021); a field is
+regressed by an MLP from the patch tokens (App. "Cross-sensor generation"). Without an encoder the
+network is one of the two references, a U-Net or an MLP on pixels. What is predicted is the
+difference from the mean target of the training pairs.
 """
 
 from __future__ import annotations
@@ -46,10 +47,12 @@ _GREY = (0, 128, 255)
 
 @dataclass(frozen=True)
 class Fit:
-    """How a translation is trained. `adversarial`: weight of the critic's verdict added to the mean squared error, as a
-    share of the error of copying the mean target, so that it means the same in every unit; 0 for no critic. `penalty`:
-    on the critic's slope at real touches (R1, on features), which keeps the two in step. `tune` fine also trains the
-    encoders, at a tenth of the rate.
+    """How a translation is trained.
+
+    `adversarial`: weight of the critic's verdict added to the mean squared error, as a share of the
+    error of copying the mean target, so that it means the same in every unit; 0 for no critic.
+    `penalty`: on the critic's slope at real touches (R1, on features), which keeps the two in step.
+    `tune` fine also trains the encoders, at a tenth of the rate.
     """
 
     steps: Count[int] = 800
@@ -66,7 +69,8 @@ class Fit:
 
 @dataclass(frozen=True)
 class Design:
-    """What a generator is: sensors, shapes, where its encoder came from (None: it reads pixels), how it was trained.
+    """What a generator is: sensors, shapes, where its encoder came from (None: it reads pixels),
+    how it was trained.
 
     `subtracts`: source images are background-subtracted.
     """
@@ -88,12 +92,16 @@ class Design:
 
     @property
     def critic(self) -> Part:
-        """Return the network that distinguishes real touches from generated ones by an encoder's features."""
+        """Return the network that distinguishes real touches from generated ones by an encoder's
+        features.
+        """
         return Part(Critic, self.shape)
 
     @property
     def has_critic(self) -> bool:
-        """Images are judged by an encoder where the weight is not 0; fields and references never."""
+        """Images are judged by an encoder where the weight is not 0; fields and references
+        never.
+        """
         return self.encoder is not None and not self.shape.field and self.fit.adversarial > 0
 
 
@@ -110,7 +118,9 @@ def features(design: Design, encoder: Params | None, images: Array) -> Array:
 
 
 def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, states: int = 1) -> Array:
-    """Tokens f32 (B, 1 + S + N, states * D) of normalised images, with those of `sensor`, or the universal ones."""
+    """Tokens f32 (B, 1 + S + N, states * D) of normalised images, with those of `sensor`, or the
+    universal ones.
+    """
     model = design.shape.model
     row = model.sensors.index(sensor) if sensor in model.sensors else model.universal_row
     rows = jnp.full(len(pixels), row, jnp.int32)
@@ -119,7 +129,8 @@ def encoded(design: Design, encoder: Params, pixels: Array, sensor: str, states:
 
 
 def judged(design: Design, encoder: Params, pixels: Array, gel: Array | None) -> Array:
-    """What a critic reads of normalised images of the target: class token and mean of the patch tokens (B, 2 D).
+    """What a critic reads of normalised images of the target: class token and mean of the patch
+    tokens (B, 2 D).
 
     `gel`: the target's untouched gel, alike, which is taken off for an encoder that `subtracts`.
     """
@@ -134,7 +145,9 @@ def judged(design: Design, encoder: Params, pixels: Array, gel: Array | None) ->
 
 
 def predict(design: Design, params: Params, x: Array) -> Array:
-    """The normalised target f32 from features: the mean target plus the head's answer in units of its spread."""
+    """The normalised target f32 from features: the mean target plus the head's answer in units of
+    its spread.
+    """
     fixed = params["fixed"]
     wide = lambda value, to: jnp.expand_dims(value, range(to.ndim - value.ndim))  # noqa: E731
     x = x - wide(fixed["mean"], x)
@@ -144,7 +157,9 @@ def predict(design: Design, params: Params, x: Array) -> Array:
 
 
 def units(design: Design, fixed: Params) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and scale (channels,) by which targets are normalised: ImageNet's on 0..255, or the training fields' own."""
+    """Mean and scale (channels,) by which targets are normalised: ImageNet's on 0..255, or the
+    training fields' own.
+    """
     if not design.shape.field:
         return 255 * np.asarray(IMAGENET_MEAN, np.float32), 255 * np.asarray(
             IMAGENET_STD, np.float32
@@ -154,8 +169,9 @@ def units(design: Design, fixed: Params) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Generator:
-    """A trained translation: called on images u8 (n, H, W, 3) of the source sensor, at the model's size, it gives the
-    target's images u8 (n, H, W, 3), or fields f32 (n, 20, 20, 6) in mm and N."""
+    """A trained translation: called on images u8 (n, H, W, 3) of the source sensor, at the model's
+    size, it gives the target's images u8 (n, H, W, 3), or fields f32 (n, 20, 20, 6) in mm and N.
+    """
 
     design: Design
     params: Params = field(repr=False)
@@ -168,11 +184,15 @@ class Generator:
         return np.rint(np.clip(out, 0, 255)).astype(np.uint8)
 
     def normalised(self, images: np.ndarray) -> np.ndarray:
-        """The prediction f32 in the normalised units of the error. Raises UserError for images of another shape."""
+        """The prediction f32 in the normalised units of the error.
+
+        Raises UserError for images of another shape.
+        """
         side = self.design.shape.model.image_size
         if images.dtype != np.uint8 or images.shape[1:] != (side, side, 3):
             raise UserError(
-                f"images must be uint8 RGB of {side} x {side} pixels, not {images.dtype} {images.shape}; "
+                f"images must be uint8 RGB of {side} x {side} pixels, not {images.dtype} "
+                f"{images.shape}; "
                 "data.transforms.touch_evaluation resizes them"
             )
         return run_in_batches(partial(_program(nameless(self.design)), self.params), images)
@@ -207,7 +227,9 @@ def _heads(design: Design) -> Any:
 
 
 def save(generator: Generator, folder: str | Path) -> Path:
-    """Write a generator into `folder`, whole or not at all: one safetensors file, its design as JSON in the header."""
+    """Write a generator into `folder`, whole or not at all: one safetensors file, its design as
+    JSON in the header.
+    """
     path = Path(folder) / GENERATOR
     arrays = {name: np.asarray(value) for name, value in flatten(generator.params).items()}
     write_safetensors(path, arrays, {"generator": to_json(generator.design)})
@@ -215,14 +237,18 @@ def save(generator: Generator, folder: str | Path) -> Path:
 
 
 def load(folder: str | Path) -> Generator:
-    """The generator in a folder (or file). Raises UserError when there is none, or another kind of file."""
+    """The generator in a folder (or file).
+
+    Raises UserError when there is none, or another kind of file.
+    """
     path = Path(folder)
     path = path / GENERATOR if path.is_dir() else path
     if not path.is_file():
         others = sorted(file.parent.name for file in path.parent.glob(f"*/{GENERATOR}"))
         there = f" (there are {', '.join(others)})" if others else ""
         raise UserError(
-            f"there is no generator in {folder}{there}; train one with python -m experiments.translation.run --fit"
+            f"there is no generator in {folder}{there}; train one with python -m "
+            "experiments.translation.run --fit"
         )
     arrays, about = read_safetensors(path)
     try:

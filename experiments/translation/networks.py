@@ -1,6 +1,7 @@
-"""Networks that turn one sensor's touch into another's: a ViT decoder and a critic as in ViTGAN (Lee et al., 2021), a
-regression of fields, and the U-Net (Ronneberger et al., 2015) and MLP they are compared with (App. "Cross-sensor
-generation")."""
+"""Networks that turn one sensor's touch into another's: a ViT decoder and a critic as in ViTGAN
+(Lee et al., 2021), a regression of fields, and the U-Net (Ronneberger et al., 2015) and MLP they
+are compared with (App. "Cross-sensor generation").
+"""
 
 from __future__ import annotations
 
@@ -32,10 +33,11 @@ STATES = 5
 
 @dataclass(frozen=True)
 class Translation:
-    """What decides the shapes: the encoder's `model`, the ViT `decoder`, `hidden` channels of the MLPs, and the shape
-    of the `field` to regress; () for an image of the encoder's size. `states`: hidden states of the encoder that are
-    read (`TouchEncoder.states`). `few`: channels of a patch that a field's MLP reads; `channels`: of the U-Net, from
-    its finest level to its coarsest."""
+    """What decides the shapes: the encoder's `model`, the ViT `decoder`, `hidden` channels of the
+    MLPs, and the shape of the `field` to regress; () for an image of the encoder's size. `states`:
+    hidden states of the encoder that are read (`TouchEncoder.states`). `few`: channels of a patch
+    that a field's MLP reads; `channels`: of the U-Net, from its finest level to its coarsest.
+    """
 
     model: ModelConfig
     decoder: Stack = DECODER
@@ -57,7 +59,8 @@ class Translation:
 
 
 class Painter(nnx.Module):
-    """ViT decoder: every token of the encoder (B, 1 + S + N, D) -> an image (B, H, W, 3), a patch from each position.
+    """ViT decoder: every token of the encoder (B, 1 + S + N, D) -> an image (B, H, W, 3), a patch
+    from each position.
 
     A linear head paints a patch; ViTGAN's implicit one costs a network a pixel.
     """
@@ -96,7 +99,9 @@ class FieldHead(nnx.Module):
 
 
 class FeatureField(FieldHead):
-    """A field from an encoder's patch tokens: a few channels of each of (B, 1 + S + N, D), then the MLP over all."""
+    """A field from an encoder's patch tokens: a few channels of each of (B, 1 + S + N, D), then the
+    MLP over all.
+    """
 
     def __init__(self, options: Translation) -> None:
         super().__init__(options, options.model.patches * options.few)
@@ -115,7 +120,9 @@ class PixelField(FieldHead):
 
 
 class Critic(nnx.Module):
-    """Logit (B,) that a touch is real, from an encoder's class token and the mean of its patch tokens, (B, 2 D)."""
+    """Logit (B,) that a touch is real, from an encoder's class token and the mean of its patch
+    tokens, (B, 2 D).
+    """
 
     def __init__(self, options: Translation) -> None:
         width = 2 * options.model.touch.width
@@ -127,7 +134,9 @@ class Critic(nnx.Module):
 
 
 class Conv(nnx.Module):
-    """A 3 x 3 convolution with zero padding, its kernel stored as a matrix (9 * inputs, outputs)."""
+    """A 3 x 3 convolution with zero padding, its kernel stored as a matrix (9 * inputs,
+    outputs).
+    """
 
     def __init__(self, inputs: int, outputs: int, model: ModelConfig) -> None:
         self.kernel = table(9 * inputs, outputs)
@@ -143,7 +152,9 @@ class Conv(nnx.Module):
 
 
 class UNet(nnx.Module):
-    """A small U-Net (B, H, W, 3) -> (B, H, W, 3): halved while the side is even and there are channels, and back."""
+    """A small U-Net (B, H, W, 3) -> (B, H, W, 3): halved while the side is even and there are
+    channels, and back.
+    """
 
     def __init__(self, options: Translation) -> None:
         model, side = options.model, options.model.image_size
@@ -186,5 +197,7 @@ def doubled(x: Array) -> Array:
 
 
 def thumbnail_side(side: int) -> int:
-    """Side of the largest thumbnail of at most 28 pixels whose pixels are whole squares of the image's."""
+    """Side of the largest thumbnail of at most 28 pixels whose pixels are whole squares of the
+    image's.
+    """
     return max(t for t in range(1, 29) if side % t == 0)

@@ -1,4 +1,6 @@
-"""Fine-aligned pairs: the same frame of the same touch by two sensors, and their pixels or fields as arrays."""
+"""Fine-aligned pairs: the same frame of the same touch by two sensors, and their pixels or fields
+as arrays.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +22,18 @@ _THREADS = 2
 
 
 class Pairs(NamedTuple):
-    """Manifest rows i64 (n,) of the sensor that is given and of the one that is wanted, in manifest order."""
+    """Manifest rows i64 (n,) of the sensor that is given and of the one that is wanted, in manifest
+    order.
+    """
 
     source: np.ndarray
     target: np.ndarray
 
 
 class Split(NamedTuple):
-    """The pairs to train on, those that choose when to stop (there may be none), and those to test on: of objects
-    never seen in training."""
+    """The pairs to train on, those that choose when to stop (there may be none), and those to test
+    on: of objects never seen in training.
+    """
 
     train: Pairs
     val: Pairs
@@ -36,9 +41,11 @@ class Split(NamedTuple):
 
 
 def find_pairs(manifest: Manifest, source: str, target: str) -> Split:
-    """Pairs by split, of frames with equal `touch` and `frame_index`, grade fine where rows have a grade.
+    """Pairs by split, of frames with equal `touch` and `frame_index`, grade fine where rows have a
+    grade.
 
-    Raises UserError when a sensor has no rows, nothing pairs, a sensor felt a frame twice, or an object is in both.
+    Raises UserError when a sensor has no rows, nothing pairs, a sensor felt a frame twice, or an
+    object is in both.
     """
     if source == target:
         raise UserError(f"{source} is both sensors; name two")
@@ -53,7 +60,8 @@ def find_pairs(manifest: Manifest, source: str, target: str) -> Split:
         both = sorted(_objects(manifest, part.source) & _objects(manifest, test.source))
         if both:
             raise UserError(
-                f"object {both[0]!r} is in the splits {name} and test (and {len(both) - 1} others): "
+                f"object {both[0]!r} is in the splits {name} and test (and {len(both) - 1} "
+                "others): "
                 "test pairs must be of objects never seen; move its rows to one split"
             )
     return Split(train, val, test)
@@ -64,7 +72,8 @@ def _pairs(manifest: Manifest, source: str, target: str, split: str) -> Pairs:
     shared = [key for key in first if key in second]
     if not shared and split != "val":
         raise UserError(
-            f"split {split} has no frame of one touch felt by both {source} and {target}; give fine-aligned data "
+            f"split {split} has no frame of one touch felt by both {source} and {target}; give "
+            "fine-aligned data "
             f"(anytouch data simulate --grade fine --units one --sensors {source},{target})"
         )
     return Pairs(*(np.array([rows[key] for key in shared], np.int64) for rows in (first, second)))
@@ -87,7 +96,8 @@ def _frames(manifest: Manifest, sensor: str, split: str) -> dict[tuple[int, int]
         key = (int(touch[row]), int(frame[row]))
         if key in result:
             raise UserError(
-                f"{manifest.where(row)}: {sensor} felt frame {key[1]} of touch {manifest.value(row, 'touch')!r} twice "
+                f"{manifest.where(row)}: {sensor} felt frame {key[1]} of touch "
+                f"{manifest.value(row, 'touch')!r} twice "
                 f"(row {manifest.number[result[key]]}); keep one unit of it"
             )
         result[key] = row
@@ -105,10 +115,12 @@ def _objects(manifest: Manifest, rows: np.ndarray) -> set[str]:
 
 
 def without_objects(manifest: Manifest, pairs: Manifest) -> Manifest:
-    """The rows of `manifest` of objects that `pairs` does not have, in any split: what an encoder may be trained on.
+    """The rows of `manifest` of objects that `pairs` does not have, in any split: what an encoder
+    may be trained on.
 
-    The paper takes the coarse rows that overlap with the fine data out of training (App. "Cross-sensor generation");
-    here that is every row of such an object. Rows without an object stay. Raises UserError when nothing is left.
+    The paper takes the coarse rows that overlap with the fine data out of training (App.
+    "Cross-sensor generation"); here that is every row of such an object. Rows without an object
+    stay. Raises UserError when nothing is left.
     """
     names = manifest.text_column("object")
     kept = ~np.isin(names, list(set(pairs.text_column("object")) - {""}))
@@ -122,7 +134,8 @@ def without_objects(manifest: Manifest, pairs: Manifest) -> Manifest:
 def read_pairs(
     manifest: Manifest, pairs: Pairs, size: int, *, subtract: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Source images u8 (n, size, size, 3), and the targets: images alike, or fields f32 (n, 20, 20, 6).
+    """Source images u8 (n, size, size, 3), and the targets: images alike, or fields f32 (n, 20, 20,
+    6).
 
     `subtract`: source images less their backgrounds, for an encoder that `subtracts`.
     """
@@ -136,7 +149,10 @@ def read_pairs(
 def read_pixels(
     manifest: Manifest, rows: np.ndarray, size: int, *, subtract: bool = False
 ) -> np.ndarray:
-    """Return images u8 (n, size, size, 3) of manifest rows, background-subtracted or not. Raises UserError."""
+    """Return images u8 (n, size, size, 3) of manifest rows, background-subtracted or not.
+
+    Raises UserError.
+    """
     out = np.empty((len(rows), size, size, 3), np.uint8)
     model = replace(preset("tiny").model, image_size=size)
     reader = SampleReader(
@@ -150,7 +166,9 @@ def read_pixels(
 
 
 def read_fields(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
-    """Fields f32 (n, 20, 20, 6), displacement mm and force N, of manifest rows (column `field_path`)."""
+    """Fields f32 (n, 20, 20, 6), displacement mm and force N, of manifest rows (column
+    `field_path`).
+    """
     out = np.empty((len(rows), *FIELD), np.float32)
 
     def one(k: int) -> None:
@@ -168,7 +186,8 @@ def read_fields(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
             ) from None
         if field.shape != FIELD or not np.isfinite(field).all():
             raise UserError(
-                f"{manifest.where(row)}: {file} is {field.shape}; a field is {FIELD} of finite numbers"
+                f"{manifest.where(row)}: {file} is {field.shape}; a field is {FIELD} of finite "
+                "numbers"
             )
         out[k] = field
 

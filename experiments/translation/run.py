@@ -27,13 +27,17 @@ from experiments.translation import generator, pairs, training
 
 @dataclass(frozen=True)
 class Translate:
-    """Translate images of one sensor into images, or fields, of another. With --fit, train that translation.
+    """Translate images of one sensor into images, or fields, of another.
 
-    Example: python -m experiments.translation.run frame.png --model runs/stage2 --source gelsight_mini --target duragel
+    With --fit, train that translation.
 
-    Train it first, with --fit --data pairs/manifest.parquet. Pairs are frames with equal touch and frame_index
-    (anytouch data simulate --grade fine --units one). A translation is stored in MODEL/generators/SOURCE-TARGET. Images
-    come out at the model's size as PNG, fields (tac3d) as .npy, in mm and N.
+    Example: python -m experiments.translation.run frame.png --model runs/stage2 --source
+    gelsight_mini --target duragel
+
+    Train it first, with --fit --data pairs/manifest.parquet. Pairs are frames with equal touch and
+    frame_index (anytouch data simulate --grade fine --units one). A translation is stored in
+    MODEL/generators/SOURCE-TARGET. Images come out at the model's size as PNG, fields (tac3d) as
+    .npy, in mm and N.
     """
 
     images: tuple[Path, ...]
@@ -47,7 +51,9 @@ class Translate:
     background: Path | None = None
     """Picture of the untouched gel, for an encoder trained on background-subtracted frames."""
     out: Path | None = None
-    """File or folder to write (default: the folder of each image). With --fit, the folder of the translation."""
+    """File or folder to write (default: the folder of each image). With --fit, the folder of the
+    translation.
+    """
     generator: Path | None = None
     """Folder of a translation that is not in the run."""
     fit: bool = False
@@ -63,7 +69,9 @@ class Translate:
     tune: Literal["frozen", "fine"] = "frozen"
     """Freeze the encoder, or train it too at a tenth of the rate."""
     adversarial: float = 0.02
-    """Weight of the critic of images, in units of the error of copying the mean image. 0 trains without a critic."""
+    """Weight of the critic of images, in units of the error of copying the mean image. 0 trains
+    without a critic.
+    """
     seed: int = 0
     """Seed of everything drawn."""
 
@@ -84,7 +92,8 @@ def _home(options: Translate, folder: Path | None) -> Path:
         return folder
     if options.model is None or not options.model.is_dir():
         raise UserError(
-            f"--model {options.model} is no run folder, which stores translations. Give --generator."
+            f"--model {options.model} is no run folder, which stores translations. Give "
+            "--generator."
         )
     return options.model / "generators" / f"{options.source}-{options.target}"
 
@@ -102,7 +111,8 @@ def _fit(options: Translate) -> int:
     split = pairs.find_pairs(table, options.source, options.target)
     encoder.sensor_row(options.source, log)
     log(
-        f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of held-out objects to test on"
+        f"{len(split.train.source)} pairs to train on, {len(split.test.source)} of held-out "
+        "objects to test on"
     )
     size = encoder.config.model.image_size
     (x, y), val, (test_x, test_y) = (
@@ -151,7 +161,10 @@ def _translate(options: Translate) -> int:
 
 
 def _targets(options: Translate, suffix: str) -> list[Path]:
-    """Return where each result goes. Raises UserError for a file that is read, and for two results in one place."""
+    """Return where each result goes.
+
+    Raises UserError for a file that is read, and for two results in one place.
+    """
     out = options.out
     images = options.images
     if out is not None and out.suffix and not out.is_dir():

@@ -1,4 +1,6 @@
-"""What the runs of the translation study are of, and what they must share to make a table together."""
+"""What the runs of the translation study are of, and what they must share to make a table
+together.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ TUNES = {"frozen": "frozen", "fine": "fine-tuned", "scratch": "from scratch"}
 
 
 def shared(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the settings of runs must share by name: the view of a touch, an encoder a seed, pairs a task.
+    """Return what the settings of runs must share by name: the view of a touch, an encoder a seed,
+    pairs a task.
 
     Errors of pictures of another size are no rivals.
     """

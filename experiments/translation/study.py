@@ -1,9 +1,12 @@
-"""The translation study: one sensor's touch as another feels it (App. "Cross-sensor generation", Table 7).
+"""The translation study: one sensor's touch as another feels it (App.
 
-Images of a DuraGel are painted from those of a GelSight Mini. The 20 x 20 field of a Tac3D is regressed from a GelSight
-Mini or a DIGIT. The pairs are simulated: one device of each sensor and one motion for all, frame by frame. A quarter of
-the objects, by whole pairs of primitive and texture, is tested on. Training stops where the error on a third split is
-smallest. Each translation is compared with copying the mean target, and with a network on pixels from scratch.
+"Cross-sensor generation", Table 7).
+
+Images of a DuraGel are painted from those of a GelSight Mini. The 20 x 20 field of a Tac3D is
+regressed from a GelSight Mini or a DIGIT. The pairs are simulated: one device of each sensor and
+one motion for all, frame by frame. A quarter of the objects, by whole pairs of primitive and
+texture, is tested on. Training stops where the error on a third split is smallest. Each translation
+is compared with copying the mean target, and with a network on pixels from scratch.
 """
 
 from __future__ import annotations
@@ -44,8 +47,10 @@ Known = dict[str, dict[int, Encoder]]  # encoders by name and seed
 
 @dataclass(frozen=True)
 class Options:
-    """Run what is missing of the translation study. It trains the encoders too, on the scenes of `make experiments`
-    without the objects of the pairs.
+    """Run what is missing of the translation study.
+
+    It trains the encoders too, on the scenes of `make experiments` without the objects of the
+    pairs.
 
     Example: python -m experiments.translation.study --runs anytouch=runs/stage2 t3=a,b,c
     """
@@ -57,7 +62,9 @@ class Options:
     work: Path = Path("runs/translation")
     """Folder of the pairs."""
     out: Path | None = None
-    """File of results (default: translation.jsonl in experiments/results, with the steps of --steps1 in its name)."""
+    """File of results (default: translation.jsonl in experiments/results, with the steps of
+    --steps1 in its name).
+    """
     steps1: Count[int | None] = None
     """Steps of stage 1 of the encoders that the study trains."""
     touches: Count[int] = 400
@@ -226,7 +233,8 @@ def run(options: Options) -> int:
             record = one_run(about, encoder, data)
             write_record(out, key, record)
             print(
-                f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, {record['seconds']} s"
+                f"{key}: error {record['error']:.4f}, mean target {record['mean_target']:.4f}, "
+                f"{record['seconds']} s"
             )
     return 0
 

@@ -1,8 +1,8 @@
 """Training and scoring translations between sensors (App. "Cross-sensor generation").
 
-The error is the paper's mean squared error between what is generated and the truth. The paper does not say in which
-units; here images are in the normalised pixels that its encoder reads (ImageNet's mean and deviation), fields have
-each of their six channels in deviations over the training fields.
+The error is the paper's mean squared error between what is generated and the truth. The paper does
+not say in which units; here images are in the normalised pixels that its encoder reads (ImageNet's
+mean and deviation), fields have each of their six channels in deviations over the training fields.
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ VERSION = 3  # of how a translation learns from the same pairs
 
 
 class Batch(NamedTuple):
-    """Source features, or images u8 where they are computed in the step; normalised targets f32; the critic's features
-    (B, 2 D) of the real targets where its encoder is frozen, else None."""
+    """Source features, or images u8 where they are computed in the step; normalised targets f32;
+    the critic's features (B, 2 D) of the real targets where its encoder is frozen, else None.
+    """
 
     x: Any
     y: Any
@@ -52,7 +53,9 @@ class Batch(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """What may differ between runs of one compiled step: learning rate, weight of the critic's verdict, its penalty."""
+    """What may differ between runs of one compiled step: learning rate, weight of the critic's
+    verdict, its penalty.
+    """
 
     learning_rate: Any
     adversarial: Any
@@ -60,7 +63,9 @@ class Rates(NamedTuple):
 
 
 class State(NamedTuple):
-    """What a training step carries on: the generator's and the critic's trained parameters, and their optimisers'."""
+    """What a training step carries on: the generator's and the critic's trained parameters, and
+    their optimisers'.
+    """
 
     made: Params
     critic: Params
@@ -80,11 +85,13 @@ def fit(
     shape: Translation | None = None,
     log: Log | None = None,
 ) -> tuple[Generator, list[dict[str, float]]]:
-    """Train a translation on pairs: source `images` u8 (n, H, W, 3), `targets` images u8 alike or fields f32.
+    """Train a translation on pairs: source `images` u8 (n, H, W, 3), `targets` images u8 alike or
+    fields f32.
 
-    `encoder` None trains the reference that reads pixels; it needs a `shape`. `val`: pairs of other objects; of the
-    states after every twentieth of the steps the one with the smallest error on them is kept, else the last. Gives
-    back the generator and its losses at these steps. Raises UserError when the error stops being finite.
+    `encoder` None trains the reference that reads pixels; it needs a `shape`. `val`: pairs of other
+    objects; of the states after every twentieth of the steps the one with the smallest error on
+    them is kept, else the last. Gives back the generator and its losses at these steps. Raises
+    UserError when the error stops being finite.
     """
     options = options or Fit()
     design = _design(encoder, images, targets, source, target, options, shape)
@@ -122,7 +129,10 @@ def _design(
     options: Fit,
     shape: Translation | None,
 ) -> Design:
-    """What is trained. Raises UserError for a reference without a shape, and pictures of another size."""
+    """What is trained.
+
+    Raises UserError for a reference without a shape, and pictures of another size.
+    """
     if shape is None:
         if encoder is None:
             raise UserError("a reference without an encoder needs its shape")
@@ -134,15 +144,18 @@ def _design(
         targets.dtype == np.uint8 and targets.shape[1:] != images.shape[1:]
     ):
         raise UserError(
-            f"images must be {side} x {side} pixels of three colours, not {images.shape}, {targets.shape}"
+            f"images must be {side} x {side} pixels of three colours, not {images.shape}, "
+            f"{targets.shape}"
         )
     whence, less = (None, False) if encoder is None else (encoder.source, encoder.subtracts)
     return Design(source, target, shape, whence, options, len(images), less)
 
 
 class _Pairs(NamedTuple):
-    """What a fit reads: of every pair the source's features (else its image), the target, and the critic's features of
-    it; `mean`, `scale` of the targets. `val`: source, target of other objects, and the source's features."""
+    """What a fit reads: of every pair the source's features (else its image), the target, and the
+    critic's features of it; `mean`, `scale` of the targets. `val`: source, target of other objects,
+    and the source's features.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -197,7 +210,9 @@ def _finite(step: int, metrics: dict[str, Any], error: float | None) -> dict[str
 def start(
     design: Design, encoder: Encoder | None, images: np.ndarray, targets: np.ndarray
 ) -> Params:
-    """Return the first parameters: `encoder`, a new `head`, and constants `fixed` of the training pairs."""
+    """Return the first parameters: `encoder`, a new `head`, and constants `fixed` of the training
+    pairs.
+    """
     key = jax.random.fold_in(jax.random.key(design.fit.seed), 0)
     params: Params = {"head": design.head.init(key)}
     if encoder is not None:
@@ -229,11 +244,12 @@ def _moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def whitening(tokens: np.ndarray) -> np.ndarray:
-    """The matrix (D, D) that gives centred tokens (..., D) equal variances in all directions, but for those of less
-    than `_FAINT` of the largest (ZCA).
+    """The matrix (D, D) that gives centred tokens (..., D) equal variances in all directions, but
+    for those of less than `_FAINT` of the largest (ZCA).
 
-    An encoder's channels go together: ten of a hundred directions hold nearly all of their variance, and what a picture
-    needs in addition is learned late or never where each channel is divided by its own deviation.
+    An encoder's channels go together: ten of a hundred directions hold nearly all of their
+    variance, and what a picture needs in addition is learned late or never where each channel is
+    divided by its own deviation.
     """
     flat = tokens.reshape(-1, tokens.shape[-1]).astype(np.float64)
     variance, axes = np.linalg.eigh(np.cov(flat, rowvar=False))
@@ -242,14 +258,18 @@ def whitening(tokens: np.ndarray) -> np.ndarray:
 
 
 def untouched(targets: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The untouched gel of the target, normalised: the median of its images, few of which touch a given place."""
+    """The untouched gel of the target, normalised: the median of its images, few of which touch a
+    given place.
+    """
     return ((np.median(targets, axis=0) - mean) / scale).astype(np.float32)
 
 
 def mean_target(
     targets: np.ndarray, mean: np.ndarray, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of normalised targets, and the deviation from it by channel: the first reference, and a unit."""
+    """The mean of normalised targets, and the deviation from it by channel: the first reference,
+    and a unit.
+    """
     total = np.zeros(targets.shape[1:])
     square = np.zeros(targets.shape[1:])
     for first in range(0, len(targets), _CHUNK):
@@ -273,7 +293,8 @@ def _judged(design: Design) -> Any:
     return jax.jit(lambda read, images: judged(design, read[0], normalise_touch(images), read[1]))
 
 
-# One step -----------------------------------------------------------------------------------------------------------
+# One step
+# --------------------------------------------------------------------------------------------------
 
 
 # AdamW before its learning rate, gradients clipped.
@@ -283,9 +304,12 @@ _TX = optax.chain(
 
 
 def rates(design: Design, fixed: Params, step: int) -> Rates:
-    """The rates of a step: a short warm-up and cosine decay; the weight times the mean target's own error."""
+    """The rates of a step: a short warm-up and cosine decay; the weight times the mean target's own
+    error.
+    """
     options = design.fit
-    # A warm-up in steps that starts above 0 and a decay that ends below the last step: no step is without effect.
+    # A warm-up in steps that starts above 0 and a decay that ends below the last step: no step is
+    # without effect.
     ahead = {"warmup": max(1, options.steps // 20), "total": options.steps + 1}
     rate = learning_rate(step + 1, peak=options.learning_rate, floor=0.0, decay="cosine", **ahead)
     weight = options.adversarial * np.mean(np.square(fixed["spread"]))
@@ -310,7 +334,9 @@ def begin(design: Design, params: Params) -> tuple[State, Params]:
 
 @lru_cache(maxsize=8)
 def _step(design: Design) -> Any:
-    """(state, still parameters, batch, rates) -> (state, metrics), compiled: one step of both networks."""
+    """(state, still parameters, batch, rates) -> (state, metrics), compiled: one step of both
+    networks.
+    """
     frozen = design.fit.tune == "frozen"
 
     def judge_features(critic: Params, still: Params, pixels: Array) -> Array:
@@ -372,7 +398,8 @@ def _updated(rate: Array, grads: Params, moments: Any, params: Params) -> tuple[
     return {part: moved(part) for part in params}, moments
 
 
-# Scores -------------------------------------------------------------------------------------------------------------
+# Scores
+# --------------------------------------------------------------------------------------------------
 
 
 def errors(generator: Generator, images: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -381,7 +408,9 @@ def errors(generator: Generator, images: np.ndarray, targets: np.ndarray) -> np.
 
 
 def mean_errors(generator: Generator, targets: np.ndarray) -> np.ndarray:
-    """As `errors`, of copying the mean target of the generator's training pairs: the first reference."""
+    """As `errors`, of copying the mean target of the generator's training pairs: the first
+    reference.
+    """
     middle = np.asarray(generator.params["fixed"]["target"])[None]
     return _errors(generator, np.broadcast_to(middle, (len(targets), *middle.shape[1:])), targets)
 

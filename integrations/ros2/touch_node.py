@@ -1,8 +1,10 @@
-"""A ROS 2 node of a live camera: /touch/features, /touch/contact, /touch/wrench (N, N m) and /touch/points (m).
+"""A ROS 2 node of a live camera: /touch/features, /touch/contact, /touch/wrench (N, N m) and
+/touch/points (m).
 
-ros2 run needs a package. This file runs alone: python integrations/ros2/touch_node.py --ros-args -p sensor:=digit
-Wrench and points need an encoder that measures. Their frame is the parameter frame: x to the right of the picture, y
-down, z into the gel. The wrench is that of the object on the gel, about the centre of pressure.
+ros2 run needs a package. This file runs alone: python integrations/ros2/touch_node.py --ros-args -p
+sensor:=digit Wrench and points need an encoder that measures. Their frame is the parameter frame: x
+to the right of the picture, y down, z into the gel. The wrench is that of the object on the gel,
+about the centre of pressure.
 """
 
 import contextlib

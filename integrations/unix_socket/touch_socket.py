@@ -1,4 +1,5 @@
-"""Features, contact and force of a live camera over a Unix socket: one JSON line a frame, without ROS.
+"""Features, contact and force of a live camera over a Unix socket: one JSON line a frame, without
+ROS.
 
 python integrations/unix_socket/touch_socket.py 0 digit /tmp/touch.sock gel.png
 """
@@ -13,7 +14,10 @@ from typing import Any
 
 
 def serve(embedded: Any, path: str) -> None:
-    """Send each frame of a stream to all clients of the socket at `path`. A client that is too slow is dropped."""
+    """Send each frame of a stream to all clients of the socket at `path`.
+
+    A client that is too slow is dropped.
+    """
     clients = list[socket.socket]()
     file = Path(path)
     if file.exists():

@@ -14,10 +14,12 @@ _display: Any = None  # of the outermost bar that is open
 
 @contextmanager
 def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
-    """Give a function for the number of items that are done. It moves a bar once the work has taken 3 s.
+    """Give a function for the number of items that are done.
 
-    `words` names the items. Nothing is shown where the error stream is no terminal. Without a `total` there is no time
-    left. A bar inside another one is shown below it.
+    It moves a bar once the work has taken 3 s.
+
+    `words` names the items. Nothing is shown where the error stream is no terminal. Without a
+    `total` there is no time left. A bar inside another one is shown below it.
     """
     global _display
     if not sys.stderr.isatty():
@@ -67,7 +69,10 @@ def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
 
 
 def tracked(items: Iterable[Item], words: str, total: int | None = None) -> Iterator[Item]:
-    """Yield items, and show how many are done and the time left, as `bar` does. `total` is the length of a sequence."""
+    """Yield items, and show how many are done and the time left, as `bar` does.
+
+    `total` is the length of a sequence.
+    """
     with bar(len(items) if isinstance(items, Sized) else total, words) as advance:
         for done, item in enumerate(items, 1):
             yield item

@@ -1,7 +1,8 @@
 """Batches that travel from the loader to the device: NamedTuples of arrays.
 
-The shape is the data type: T is 1 for stills, 3 for clips, 4 for clips with their next frame. Pixels are uint8,
-channel last (RGB); normalisation happens on the device. B batch, V image slots, L text slots, S text length.
+The shape is the data type: T is 1 for stills, 3 for clips, 4 for clips with their next frame.
+Pixels are uint8, channel last (RGB); normalisation happens on the device. B batch, V image slots, L
+text slots, S text length.
 """
 
 from typing import Any, NamedTuple
@@ -15,10 +16,11 @@ Array = Any  # a numpy or a jax array
 class FieldBatch(NamedTuple):
     """Touches with exact fields of their last frame (h, w), free of scale as in `nn.fields`.
 
-    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `aspect` f32 (B,) logarithm of height over width. `depth` (B, h, w)
-    and `shear` (B, h, w, 2) are shares of the picture's width, `pressure` (B, h, w) is over the gel's modulus. `force`
-    (B, 3), tangential x and y and normal, is over modulus times width squared, `torque` (B,) over modulus times width
-    cubed. `slip` (B,) is the share of the contact that slides.
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `aspect` f32 (B,) logarithm of height over width.
+    `depth` (B, h, w) and `shear` (B, h, w, 2) are shares of the picture's width, `pressure` (B, h,
+    w) is over the gel's modulus. `force` (B, 3), tangential x and y and normal, is over modulus
+    times width squared, `torque` (B,) over modulus times width cubed. `slip` (B,) is the share of
+    the contact that slides.
     """
 
     clip: Array
@@ -34,7 +36,9 @@ class FieldBatch(NamedTuple):
 
 @shown_short
 class TouchBatch(NamedTuple):
-    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table, touches with fields or None."""
+    """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table, touches with
+    fields or None.
+    """
 
     clip: Array
     sensor: Array
@@ -45,8 +49,9 @@ class TouchBatch(NamedTuple):
 class AlignBatch(NamedTuple):
     """Stage 2, alignment. Images and texts are packed into V and L slots; an unused slot has row B.
 
-    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `image` u8 (V, H, W, 3), `text` i32 (L, S). `text_mask` bool (L, S) is
-    True for tokens. `image_row` i32 (V,) and `text_row` i32 (L,) are the rows of the batch that the slots belong to.
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `image` u8 (V, H, W, 3), `text` i32 (L, S).
+    `text_mask` bool (L, S) is True for tokens. `image_row` i32 (V,) and `text_row` i32 (L,) are the
+    rows of the batch that the slots belong to.
     """
 
     clip: Array
@@ -62,8 +67,8 @@ class AlignBatch(NamedTuple):
 class MatchBatch(NamedTuple):
     """Stage 2, matching triples: three times (clip u8 (B, T, H, W, 3), sensor i32 (B,)).
 
-    If the other pairs of the batch are the negatives, there is no third touch. Then `place` i32 (B,) is equal for
-    pairs of one place, which are not negatives of each other.
+    If the other pairs of the batch are the negatives, there is no third touch. Then `place` i32
+    (B,) is equal for pairs of one place, which are not negatives of each other.
     """
 
     clip: Array
@@ -77,7 +82,9 @@ class MatchBatch(NamedTuple):
 
 @shown_short
 class Stage2Batch(NamedTuple):
-    """One stage-2 step: both parts (recipe paper) or one of them (recipe release), and touches with fields or None."""
+    """One stage-2 step: both parts (recipe paper) or one of them (recipe release), and touches with
+    fields or None.
+    """
 
     align: AlignBatch | None
     match: MatchBatch | None

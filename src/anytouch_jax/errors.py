@@ -12,14 +12,18 @@ _LETTERS = 500  # of a message
 
 
 def shorten(text: str) -> str:
-    """Return a message without its middle if it is long, as one that quotes a damaged file can be."""
+    """Return a message without its middle if it is long, as one that quotes a damaged file can
+    be.
+    """
     if len(text) <= _LETTERS:
         return text
     return f"{text[:350]} ... {text[-140:]}"
 
 
 def letters_apart(one: str, other: str) -> int:
-    """Return how many letters must be added, removed, replaced or exchanged with the next to get the other word."""
+    """Return how many letters must be added, removed, replaced or exchanged with the next to get
+    the other word.
+    """
     before = list[int]()
     last = list(range(len(other) + 1))
     for i, letter in enumerate(one):
@@ -34,7 +38,10 @@ def letters_apart(one: str, other: str) -> int:
 
 
 class UserError(ValueError):
-    """A user's mistake. The message is one sentence that says what is wrong, where, and what to do."""
+    """A user's mistake.
+
+    The message is one sentence that says what is wrong, where, and what to do.
+    """
 
     def __str__(self) -> str:
         return shorten(super().__str__())
@@ -45,12 +52,18 @@ class ConfigError(UserError):
 
 
 class CheckError(UserError):
-    """A check that failed, such as an export that differs from its model. The command line exits with 1."""
+    """A check that failed, such as an export that differs from its model.
+
+    The command line exits with 1.
+    """
 
 
 @contextlib.contextmanager
 def handled(handler: Callable[[int, Any], Any], *names: signal.Signals) -> Iterator[None]:
-    """Let signals call `handler` while the block runs. Outside the main thread Python has no handlers."""
+    """Let signals call `handler` while the block runs.
+
+    Outside the main thread Python has no handlers.
+    """
     before: dict[signal.Signals, Any] = {}
     try:
         for name in names if threading.current_thread() is threading.main_thread() else ():
@@ -69,7 +82,10 @@ _inherited = False  # whether this process was forked from one whose jax was run
 
 
 def _look() -> None:
-    """After a fork: what jax is asked for would hang, so it raises. A change of settings makes it look."""
+    """After a fork: what jax is asked for would hang, so it raises.
+
+    A change of settings makes it look.
+    """
     global _inherited
     # jax has no public question for it
     bridge = sys.modules.get("jax._src.xla_bridge")
@@ -87,6 +103,7 @@ def refuse_forked() -> None:
     """Raise UserError in a process that was forked after its parent had used jax."""
     if _inherited:
         raise UserError(
-            "This process was forked from one that has used jax, so it cannot compute. Start workers with "
+            "This process was forked from one that has used jax, so it cannot compute. Start "
+            "workers with "
             'multiprocessing.get_context("spawn"), or load the encoder in the workers alone.'
         )

@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 def atomic_path(path: str | Path, *, sync: bool = True, part: Path | None = None) -> Iterator[Path]:
     """Give a path to write to, and move that file to `path` when the block ends.
 
-    After an error or a kill, `path` is unchanged. Its folder is created. With `sync` the bytes are on the disk before
-    the name is; leave it out for thousands of files that another file vouches for. `part` is the path to write to, for
-    a single process: a leftover of a killed one is overwritten. Raises OSError with the file's name.
+    After an error or a kill, `path` is unchanged. Its folder is created. With `sync` the bytes are
+    on the disk before the name is; leave it out for thousands of files that another file vouches
+    for. `part` is the path to write to, for a single process: a leftover of a killed one is
+    overwritten. Raises OSError with the file's name.
     """
     path = Path(path)
     part = part or part_path(path)
@@ -49,14 +50,19 @@ def atomic_path(path: str | Path, *, sync: bool = True, part: Path | None = None
 def atomic_write(
     path: str | Path, data: bytes | str, *, sync: bool = True, part: Path | None = None
 ) -> None:
-    """Write a whole file or none, text as UTF-8, see `atomic_path`. Raises OSError with the file's name."""
+    """Write a whole file or none, text as UTF-8, see `atomic_path`.
+
+    Raises OSError with the file's name.
+    """
     with atomic_path(path, sync=sync, part=part) as target:
         target.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Give a folder to fill, and move it to `path` (missing or empty) when the block ends; remove it on an error."""
+    """Give a folder to fill, and move it to `path` (missing or empty) when the block ends; remove
+    it on an error.
+    """
     part = part_path(path)
     try:
         part.mkdir(parents=True)
@@ -69,7 +75,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def placeholder(file: str | Path | bytes) -> str | None:
-    """Return what takes the place of data in a file, or in its bytes, and what to do; None for any other content."""
+    """Return what takes the place of data in a file, or in its bytes, and what to do; None for any
+    other content.
+    """
     if not isinstance(file, bytes):
         with open(file, "rb") as opened:
             file = opened.read(512)
@@ -82,7 +90,10 @@ def placeholder(file: str | Path | bytes) -> str | None:
 
 
 def csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the first line, from 1, and the cells of each row of a CSV file. Raises csv.Error for a quote left open."""
+    """Yield the first line, from 1, and the cells of each row of a CSV file.
+
+    Raises csv.Error for a quote left open.
+    """
     with path.open(encoding="utf-8-sig", newline="") as file:
         line = 1
         rows = csv.reader(file, strict=True)
@@ -101,10 +112,13 @@ def csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 def read_arrays(
     file: str | Path | IO[bytes], *, only: Callable[[str], bool] = lambda _: True
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file by name. Raises OSError, or ValueError for a file that is not one.
+    """Return the arrays of an .npz file by name.
 
-    Every header is read before any array. Pickled objects, sizes that the file does not have, and more than 1 GiB in a
-    file a quarter as large are refused. Arrays whose names are not `only` are zeros of their shape that take no memory.
+    Raises OSError, or ValueError for a file that is not one.
+
+    Every header is read before any array. Pickled objects, sizes that the file does not have, and
+    more than 1 GiB in a file a quarter as large are refused. Arrays whose names are not `only` are
+    zeros of their shape that take no memory.
     """
     import numpy as np
 
@@ -137,7 +151,10 @@ def read_arrays(
 
 
 def _check_header(file: IO[bytes], file_size: int, name: str) -> np.ndarray:
-    """Return zeros of the form of an array. Raises ValueError if it does not have the bytes that its header gives."""
+    """Return zeros of the form of an array.
+
+    Raises ValueError if it does not have the bytes that its header gives.
+    """
     import numpy as np
 
     version = np.lib.format.read_magic(file)
@@ -157,7 +174,9 @@ def _check_header(file: IO[bytes], file_size: int, name: str) -> np.ndarray:
 
 
 def check_array(name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str = "f") -> None:
-    """Raise ValueError unless an array has a shape and a kind of type in `kinds`, and finite values."""
+    """Raise ValueError unless an array has a shape and a kind of type in `kinds`, and finite
+    values.
+    """
     import numpy as np
 
     if array.shape != shape or array.dtype.kind not in kinds:
@@ -167,12 +186,16 @@ def check_array(name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str
 
 
 def cache_folder() -> Path:
-    """Return the user's folder of what can be made again: anytouch_jax under $XDG_CACHE_HOME or ~/.cache."""
+    """Return the user's folder of what can be made again: anytouch_jax under $XDG_CACHE_HOME or
+    ~/.cache.
+    """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "anytouch_jax"
 
 
 def remove_old(folder: Path, pattern: str, days: float = 60) -> None:
-    """Remove the files of a folder that match a pattern and were not written or touched for so many days."""
+    """Remove the files of a folder that match a pattern and were not written or touched for so many
+    days.
+    """
     old = time.time() - days * 86400
     for file in folder.glob(pattern):
         # another process may remove it, or own it
@@ -188,10 +211,12 @@ def part_path(path: Path) -> Path:
 
 @contextlib.contextmanager
 def lock(path: str | Path) -> Iterator[bool]:
-    """Lock a file until the block or the process ends; give whether it was free. The file is created if needed.
+    """Lock a file until the block or the process ends; give whether it was free.
 
-    The lock belongs to the file, not to its name: a file that replaces it is not locked. Where the system or the disk
-    has no locks, the file is always free.
+    The file is created if needed.
+
+    The lock belongs to the file, not to its name: a file that replaces it is not locked. Where the
+    system or the disk has no locks, the file is always free.
     """
     try:
         import fcntl

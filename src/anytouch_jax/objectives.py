@@ -1,8 +1,9 @@
-"""Training objectives of both stages: Eq. 8 (stage 1) and Eq. 9 (stage 2), assembled from `ops` over a network.
+"""Training objectives of both stages: Eq. 8 (stage 1) and Eq. 9 (stage 2), assembled from `ops`
+over a network.
 
-`*_terms` are deterministic: every random draw is an argument. The parity check runs them. `*_loss` normalise the
-pixels, draw masks and sensor tokens from a key, then call the terms. Training runs them. Arrays may be numpy's, lists
-or numbers.
+`*_terms` are deterministic: every random draw is an argument. The parity check runs them. `*_loss`
+normalise the pixels, draw masks and sensor tokens from a key, then call the terms. Training runs
+them. Arrays may be numpy's, lists or numbers.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
 
 def _arrays(batch: Batch) -> Batch:
-    """Return a batch, or several, with arrays in the place of lists and numbers. Arrays and None are kept."""
+    """Return a batch, or several, with arrays in the place of lists and numbers.
+
+    Arrays and None are kept.
+    """
 
     def convert(x: Any) -> Any:
         if hasattr(x, "_fields"):
@@ -44,7 +48,9 @@ def _arrays(batch: Batch) -> Batch:
 
 
 def normalise_touch(clip: Array) -> Array:
-    """Return uint8 RGB (..., 3) as float32, normalised by ImageNet's statistics (the release's choice for touch)."""
+    """Return uint8 RGB (..., 3) as float32, normalised by ImageNet's statistics (the release's
+    choice for touch).
+    """
     return _normalise(clip, IMAGENET_MEAN, IMAGENET_STD)
 
 
@@ -71,11 +77,13 @@ def stage1_terms(
     config: Config,
     decoder_sensor: Array | None = None,
 ) -> tuple[Array, Metrics]:
-    """Return the loss of stage 1 and its terms: masked reconstruction and, for clips, the next frame (Eq. 8).
+    """Return the loss of stage 1 and its terms: masked reconstruction and, for clips, the next
+    frame (Eq. 8).
 
-    `clip` float (B, T, H, W, 3), normalised: T = 1 a still, 3 a clip, 4 a clip and its next frame. `sensor` i32 (B,)
-    rows of the token table, already drawn. `noise` (B, N) decides the masks. `decoder_sensor` i32 (B,): rows of the
-    tokens that the decoder of the release gets. Both results are float32 scalars.
+    `clip` float (B, T, H, W, 3), normalised: T = 1 a still, 3 a clip, 4 a clip and its next frame.
+    `sensor` i32 (B,) rows of the token table, already drawn. `noise` (B, N) decides the masks.
+    `decoder_sensor` i32 (B,): rows of the tokens that the decoder of the release gets. Both results
+    are float32 scalars.
     """
     clip, sensor, noise = _arrays((clip, sensor, noise))
     if not config.objective.next_frame:
@@ -162,8 +170,9 @@ LEAST_FORCE = 1e-3
 def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, Metrics]:
     """Return the loss of predicted fields and force, and errors in contact. Not in the paper.
 
-    Every error has a predicted Laplace deviation (Kendall and Gal 2017, "What uncertainties do we need"). Pixels in
-    contact weigh as much as all others together. `batch` has normalised pixels and drawn sensor rows.
+    Every error has a predicted Laplace deviation (Kendall and Gal 2017, "What uncertainties do we
+    need"). Pixels in contact weigh as much as all others together. `batch` has normalised pixels
+    and drawn sensor rows.
     """
     batch = _arrays(batch)
     out = net.measure(params, batch.clip, batch.sensor, batch.aspect)
@@ -215,9 +224,11 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
 
 
 def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tuple[str, bool], ...]:
-    """Return rules (regex over parameter names, trained?) for a batch of `stage1_loss` or `stage2_loss`.
+    """Return rules (regex over parameter names, trained?) for a batch of `stage1_loss` or
+    `stage2_loss`.
 
-    The first match decides. A parameter that is not trained has no gradient, and PyTorch's optimiser skips it.
+    The first match decides. A parameter that is not trained has no gradient, and PyTorch's
+    optimiser skips it.
     """
     batch = _arrays(batch)
     align, match = (None, None) if isinstance(batch, TouchBatch) else batch[:2]
@@ -245,7 +256,9 @@ def trained_by(batch: TouchBatch | Stage2Batch, *, config: Config) -> tuple[tupl
 
 
 class Embeddings(NamedTuple):
-    """Unit-norm embeddings of a batch: touch (B, E); image, text (B, E) with rows that may be absent, or None."""
+    """Unit-norm embeddings of a batch: touch (B, E); image, text (B, E) with rows that may be
+    absent, or None.
+    """
 
     touch: Array
     image: Array | None
@@ -261,10 +274,12 @@ def touch_embeddings(
     net: Net,
     keep_ids: Array | None = None,
 ) -> list[Array]:
-    """Return unit-norm embeddings (B, E) of several batches of (clip (B, T, H, W, 3) float, sensor i32 (B,)).
+    """Return unit-norm embeddings (B, E) of several batches of (clip (B, T, H, W, 3) float, sensor
+    i32 (B,)).
 
-    Batches of one shape share a pass of the encoder: one stack to compile and larger products. Their rows are
-    interleaved, so that each row stays on its device. `keep_ids` (M, B, K): patches to keep of M batches.
+    Batches of one shape share a pass of the encoder: one stack to compile and larger products.
+    Their rows are interleaved, so that each row stays on its device. `keep_ids` (M, B, K): patches
+    to keep of M batches.
     """
     touches = [_arrays(touch) for touch in touches]
     z: list[Array] = [jnp.zeros(0)] * len(touches)
@@ -286,10 +301,12 @@ def touch_embeddings(
 
 
 def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Net) -> Embeddings:
-    """Return `touch` (B, E) and the embeddings of packed images and texts, scattered to the rows they belong to.
+    """Return `touch` (B, E) and the embeddings of packed images and texts, scattered to the rows
+    they belong to.
 
-    A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised floats. The content of
-    an unused slot is replaced first: NaN would reach the gradients although the slot's value is dropped.
+    A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised
+    floats. The content of an unused slot is replaced first: NaN would reach the gradients although
+    the slot's value is dropped.
     """
     batch = _arrays(batch)
     (touch,) = _arrays((touch,))
@@ -308,7 +325,10 @@ def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Ne
 
 
 def _scatter(packed: Array, row: Array, rows: int) -> tuple[Array, Array]:
-    """Scatter slots (V, E) to their rows (B, E), and report which rows were filled. A slot of row B is dropped."""
+    """Scatter slots (V, E) to their rows (B, E), and report which rows were filled.
+
+    A slot of row B is dropped.
+    """
     full = jnp.zeros((rows, packed.shape[1]), packed.dtype).at[row].set(packed, mode="drop")
     return full, jnp.zeros(rows, bool).at[row].set(True, mode="drop")
 
@@ -325,9 +345,10 @@ def stage2_terms(
 ) -> tuple[Array, Metrics]:
     """Return L_align + lambda L_match (Eq. 9) and every term, unweighted.
 
-    Pixels are normalised floats, sensor rows are already drawn. A part of `batch` that is None is not computed. The
-    release recipe adds the stage-1 loss of the align batch, if `noise` (B, N) is given. `match_noise` (M, B, N) decides
-    which patches the M touches of matching keep; None keeps all.
+    Pixels are normalised floats, sensor rows are already drawn. A part of `batch` that is None is
+    not computed. The release recipe adds the stage-1 loss of the align batch, if `noise` (B, N) is
+    given. `match_noise` (M, B, N) decides which patches the M touches of matching keep; None keeps
+    all.
     """
     (align, match, _) = _arrays(batch)
     objective = config.objective

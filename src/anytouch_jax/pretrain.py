@@ -1,4 +1,6 @@
-"""Pre-training runs: config, data, network, first parameters and loss, put together for `train.loop.fit`."""
+"""Pre-training runs: config, data, network, first parameters and loss, put together for
+`train.loop.fit`.
+"""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -53,10 +55,10 @@ def pretrain(
 ) -> FitResult:
     """Train stage 1 or stage 2 in the folder `run`, or resume it (Sec. 3.6).
 
-    `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch encoder of stage 1
-    (see `load_start`). `clip` is CLIP weights for the towers, and for the touch encoder of stage 1. A resumed run reads
-    neither. `mesh` is the devices to train on. `curve` and `until` are as in `fit`. Raises UserError for a mistake in
-    the settings, the data or the folder.
+    `init` is a stage-1 run or AnyTouch weights that stage 2 starts from, or weights for the touch
+    encoder of stage 1 (see `load_start`). `clip` is CLIP weights for the towers, and for the touch
+    encoder of stage 1. A resumed run reads neither. `mesh` is the devices to train on. `curve` and
+    `until` are as in `fit`. Raises UserError for a mistake in the settings, the data or the folder.
     """
     refuse_forked()
     run, mesh = Path(run), mesh or make_mesh(fsdp=config.run.fsdp)
@@ -139,7 +141,9 @@ def pretrain(
 
 
 def _check(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> None:
-    """Raise UserError for settings that this machine or this stage cannot follow, and for missing weights."""
+    """Raise UserError for settings that this machine or this stage cannot follow, and for missing
+    weights.
+    """
     model = config.model
     has_x64 = jax.config.read("jax_enable_x64")
     cudnn = model.attention == "cudnn"
@@ -157,23 +161,27 @@ def _check(config: Config, run: Path, init: Any, clip: Any, resumes: bool) -> No
         "--model.attention cudnn computes in 16 bits: add --model.dtype bfloat16, or leave it out": cudnn
         and wide,
         "--model.dtype float64 needs JAX_ENABLE_X64=1 in the environment, else jax computes in float32": lacks_x64,
-        "JAX_ENABLE_X64 is set, which changes the random numbers and the checkpoints of a run: unset it, or add "
+        "JAX_ENABLE_X64 is set, which changes the random numbers and the checkpoints of a run: "
+        "unset it, or add "
         "--model.dtype float64": has_x64 and not float64,
-        "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong to rows of the "
+        "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots belong "
+        "to rows of the "
         "whole batch; lower --batch instead": slots and config.optim.accumulate > 1,
         "--model.match-head linear is the head of the release; add --recipe release, or choose mlp": linear,
         "--init and --clip-weights both give stage 1 its touch encoder; leave one out": config.stage
         == 1
         and twice,
         f"{run} is a file, not a folder; choose another --run": run.is_file(),
-        "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with tokenizer.json in the same "
+        "--towers pretrained needs CLIP weights: add --clip-weights <folder or file>, with "
+        "tokenizer.json in the same "
         "folder": lacks_clip,
     }
     if sentences := [sentence for sentence, is_so in wrong.items() if is_so]:
         raise UserError(sentences[0])
     if (earlier := begun_with(run)) is not None and earlier.stage != config.stage:
         raise UserError(
-            f"{run} has a run of stage {earlier.stage}; choose another --run for stage {config.stage}"
+            f"{run} has a run of stage {earlier.stage}; choose another --run for stage "
+            f"{config.stage}"
         )
 
 
@@ -191,10 +199,13 @@ def _check_resume(
     log: Log,
     **paths: str | Path | None,
 ) -> None:
-    """Raise UserError if a run resumes on other rows; log weights that differ from those that it started from."""
+    """Raise UserError if a run resumes on other rows; log weights that differ from those that it
+    started from.
+    """
     if stored.get("data") not in (None, _content(manifest)):
         raise UserError(
-            f"the rows of the manifests have changed since {run} was started; restore them, or start another run "
+            f"the rows of the manifests have changed since {run} was started; restore them, or "
+            "start another run "
             f"with --init {run}, whose touch encoder and decoder it starts from"
         )
     source = stored.get("source") or {}
@@ -207,12 +218,15 @@ def _check_resume(
         ):
             option = "--clip-weights" if name == "clip" else "--init"
             log(
-                f"{run} resumes and was started with {option} {before or '(nothing)'}: {path} is not read"
+                f"{run} resumes and was started with {option} {before or '(nothing)'}: {path} is "
+                "not read"
             )
 
 
 def _with_warmup(config: Config, run: Path, loader: Loader | SimulatedLoader) -> Config:
-    """Return the config with a warm-up of one epoch (appendix "Implementation details"), or less in a short run."""
+    """Return the config with a warm-up of one epoch (appendix "Implementation details"), or less in
+    a short run.
+    """
     earlier = begun_with(run)
     if config.optim.warmup is not None or (earlier is not None and earlier.optim.warmup is None):
         return config
@@ -222,7 +236,9 @@ def _with_warmup(config: Config, run: Path, loader: Loader | SimulatedLoader) ->
 def _choose_tokenizer(
     config: Config, run: Path, manifest: Any, clip: Any, resumes: bool, simulates: bool
 ) -> tuple[Config, Any]:
-    """Return the config and the tokenizer of stage 2: the run's, the option's, CLIP's, or one trained on captions."""
+    """Return the config and the tokenizer of stage 2: the run's, the option's, CLIP's, or one
+    trained on captions.
+    """
     if config.model.text is None:
         return config, None
     file = None
@@ -267,7 +283,9 @@ def _draw_reconstructions(
 
 
 class _Callable(ModuleType):
-    """A module that is called as its function: an import of this module hides the public name `at.pretrain`."""
+    """A module that is called as its function: an import of this module hides the public name
+    `at.pretrain`.
+    """
 
     def __call__(self, *args: Any, **options: Any) -> FitResult:
         return pretrain(*args, **options)

@@ -1,4 +1,6 @@
-"""Short `repr` of records and objects: arrays by their type and shape, trees of arrays by their size."""
+"""Short `repr` of records and objects: arrays by their type and shape, trees of arrays by their
+size.
+"""
 
 import dataclasses
 import math
@@ -12,7 +14,9 @@ _ITEMS = 12
 
 
 def shown_short(kind: type[T]) -> type[T]:
-    """Give a dataclass or a NamedTuple a short `repr`: Name(field=value, ...), without fields at their default."""
+    """Give a dataclass or a NamedTuple a short `repr`: Name(field=value, ...), without fields at
+    their default.
+    """
     kind.__repr__ = _repr  # type: ignore[method-assign]
     return kind
 
@@ -73,7 +77,10 @@ def _short(value: Any) -> str:
         return repr(value)
     arrays = list(leaves(value))
     if len(arrays) > 1 or (isinstance(value, Mapping) and arrays):
-        return f"<{len(arrays)} arrays, {count_of(sum(math.prod(one.shape) for one in arrays))} numbers>"
+        return (
+            f"<{len(arrays)} arrays, {count_of(sum(math.prod(one.shape) for one in arrays))} "
+            "numbers>"
+        )
     if isinstance(value, tuple | list | Mapping) and len(value) > _ITEMS:
         return f"<{len(value)} entries>"
     if type(value) in (tuple, list):

@@ -1,7 +1,7 @@
 """Batches of simulated touches for training, alone or mixed with real recordings.
 
-Touches are simulated inside the training program (`sim.endless`), and none repeats. Real recordings are kept on the
-device at the model's size. A batch depends on the seed and the step alone.
+Touches are simulated inside the training program (`sim.endless`), and none repeats. Real recordings
+are kept on the device at the model's size. A batch depends on the seed and the step alone.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -40,14 +40,18 @@ MOST_PIXELS = 4_000_000_000  # bytes of real frames that are kept on the device
 FIELD_SHARE = 0.5  # of a batch's touches: those whose fields are learned
 FIELDS = ("displacement", "shear", "pressure")
 SUBTRACTED = 0.7  # share of touches whose background is subtracted with --data.background either
-# Largest deviation, in pixels, of the place of a gel since its picture: 0.2 on still recordings of a GelSight Mini.
+# Largest deviation, in pixels, of the place of a gel since its picture: 0.2 on still recordings of
+# a GelSight Mini.
 MOVED = 0.5
 Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 
 
 class Real(NamedTuple):
-    """Real frames on the device. `windows` and `pairs` have an entry for stills and one for clips, or None."""
+    """Real frames on the device.
+
+    `windows` and `pairs` have an entry for stills and one for clips, or None.
+    """
 
     frame: Any  # u8 (N, S, S, 3)
     # u8 (G, 2, S, S, 3): the stored picture of the untouched gel, and the median of the unit
@@ -60,7 +64,9 @@ class Real(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """Touches that others share: rows (W, T), and for each its group among `order`, which sorts them by place."""
+    """Touches that others share: rows (W, T), and for each its group among `order`, which sorts
+    them by place.
+    """
 
     rows: Any  # i32 (W, T)
     share: Any  # f32 (W,) cumulative
@@ -72,7 +78,9 @@ class _Pairs(NamedTuple):
 
 
 class Texts(NamedTuple):
-    """Token ids (n, S) and masks of all captions: WORDINGS for each simulated object, then those of real rows."""
+    """Token ids (n, S) and masks of all captions: WORDINGS for each simulated object, then those of
+    real rows.
+    """
 
     ids: Any
     mask: Any
@@ -83,9 +91,12 @@ _sample = jax.jit(endless.sample_touches, static_argnames=("sampling", "count"))
 
 
 class SimulatedLoader:
-    """Batches for `config.stage` with the interface of `Loader`. `manifest` has real recordings, or is None.
+    """Batches for `config.stage` with the interface of `Loader`.
 
-    A text tower needs the `tokenizer` of `caption_tokenizer`. Raises UserError for settings that do not fit.
+    `manifest` has real recordings, or is None.
+
+    A text tower needs the `tokenizer` of `caption_tokenizer`. Raises UserError for settings that do
+    not fit.
     """
 
     def __init__(
@@ -199,7 +210,9 @@ class SimulatedLoader:
 
     @property
     def examples(self) -> list[tuple[Batch, Callable[[], Batch]]]:
-        """A batch of stills and one of clips, if the run has both: its shapes, and a function that makes it."""
+        """A batch of stills and one of clips, if the run has both: its shapes, and a function that
+        makes it.
+        """
 
         def shapes(step: int) -> Batch:
             key, world, sampling, count, gallery = self._sampled(step)
@@ -225,7 +238,9 @@ class SimulatedLoader:
 
 
 def training_objects(config: Config) -> tuple[Object, ...]:
-    """Return the objects that are touched in training: those of the train split, and variants of them."""
+    """Return the objects that are touched in training: those of the train split, and variants of
+    them.
+    """
     simulated = config.simulated
     scenes = scene.Scenes(objects=simulated.objects, seed=simulated.seed, depth=simulated.depth)
     return endless.objects_of(scenes, "train", variants=simulated.variants)
@@ -254,7 +269,9 @@ def real_captions(manifest: Manifest | None) -> list[str]:
 
 
 def caption_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
-    """Return the tokenizer `data.tokenizer`, or one trained on captions of the objects and of the manifest."""
+    """Return the tokenizer `data.tokenizer`, or one trained on captions of the objects and of the
+    manifest.
+    """
     if config.data.tokenizer is not None:
         return load_tokenizer(config.data.tokenizer)
     assert config.model.text is not None
@@ -263,7 +280,9 @@ def caption_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
 
 
 def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.ndarray:
-    """Return photographs u8 (objects, places, size, size, 3) of the places (objects, places, 2) mm of each object."""
+    """Return photographs u8 (objects, places, size, size, 3) of the places (objects, places, 2) mm
+    of each object.
+    """
     pairs = zip(things, places, strict=True)
     jobs = [(thing, place, (thing.seed, scene.PHOTO)) for thing, spots in pairs for place in spots]
     pictures = endless.over_cores(partial(seeded_photograph, size=size), jobs)
@@ -271,7 +290,10 @@ def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.nd
 
 
 def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) -> Real:
-    """Return the real frames of the training split on the device. Raises UserError if they are too many."""
+    """Return the real frames of the training split on the device.
+
+    Raises UserError if they are too many.
+    """
     plain = config.with_settings({"data.background": "keep"})
     pools: Pools = find_pools(manifest, plain.with_settings({"data.tokenizer": None}), None, 1)
     for note in pools.notes:
@@ -283,7 +305,8 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
     rows = np.unique(np.concatenate([part.ravel() for part in windows]))
     if len(rows) * size * size * 3 > MOST_PIXELS:
         raise UserError(
-            f"{len(rows)} real frames of {size} x {size} pixels do not fit on the device next to simulated touches; "
+            f"{len(rows)} real frames of {size} x {size} pixels do not fit on the device next to "
+            "simulated touches; "
             "give fewer recordings, or train on them without `simulated`"
         )
     place = np.full(len(manifest), -1, np.int32)
@@ -309,7 +332,9 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
 def _real_gels(
     manifest: Manifest, rows: np.ndarray, frame: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pictures of untouched gels u8 (G, 2, S, S, 3), stored and median of the unit, and that of each row."""
+    """Return pictures of untouched gels u8 (G, 2, S, S, 3), stored and median of the unit, and that
+    of each row.
+    """
     stored = manifest.codes("background_path")[rows]
     unit = manifest.codes("unit")[rows]
     sensor = manifest.codes("sensor")[rows]
@@ -457,7 +482,9 @@ def _drawn(key: Array, share: Array, count: int) -> Array:
 
 
 def _partners(key: Array, pairs: _Pairs, at: Array) -> Array:
-    """Return a touch of the same place for each of `at`: by another unit if TRIES draws find one, else another one."""
+    """Return a touch of the same place for each of `at`: by another unit if TRIES draws find one,
+    else another one.
+    """
     draw = jax.random.uniform(key, (len(at), TRIES))
     tries = pairs.order[
         pairs.low[at][:, None] + (draw * pairs.count[at][:, None]).astype(jnp.int32)
@@ -479,7 +506,9 @@ def _real_touches(key: Array, real: Real, rows: Array, config: Config) -> _Touch
 
 
 def augmented(key: Array, clip: Array, config: Config) -> Array:
-    """Return clips u8 (B, T, S, S, 3), each mirrored, turned, shifted, zoomed and stretched, its frames alike."""
+    """Return clips u8 (B, T, S, S, 3), each mirrored, turned, shifted, zoomed and stretched, its
+    frames alike.
+    """
     toss, turn = jax.random.split(key)
     across, down = jax.random.bernoulli(toss, config.data.flip, (2, len(clip), 1, 1, 1, 1))
     clip = jnp.where(across, clip[:, :, :, ::-1], clip)
@@ -491,7 +520,9 @@ def augmented(key: Array, clip: Array, config: Config) -> Array:
 
 
 def _warped(clip: Array, draw: Array, affine: tuple[float, float, float]) -> Array:
-    """Turn, zoom, stretch and shift a clip u8 (T, S, S, 3) about its centre by shares `draw` (5,) of the most."""
+    """Turn, zoom, stretch and shift a clip u8 (T, S, S, 3) about its centre by shares `draw` (5,)
+    of the most.
+    """
     degrees, share, growth = affine
     angle = jnp.deg2rad(draw[0] * degrees)
     zoom = (1 + growth) ** draw[1]
@@ -516,7 +547,9 @@ def _warped(clip: Array, draw: Array, affine: tuple[float, float, float]) -> Arr
 def prepared(
     key: Array, clip: Array, background: Array, config: Config, *, jitter: bool = True
 ) -> Array:
-    """Return clips u8 (B, T, S, S, 3), the background subtracted or not; `jitter` changes brightness and colours."""
+    """Return clips u8 (B, T, S, S, 3), the background subtracted or not; `jitter` changes
+    brightness and colours.
+    """
     choice, light = jax.random.split(key)
     frames = clip.astype(jnp.float32)
     gel = background[:, None].astype(jnp.float32)
@@ -531,7 +564,9 @@ def prepared(
 
 
 def moved_gel(key: Array, touches: SimulatedTouches, most: float = MOVED) -> SimulatedTouches:
-    """Return touches whose backgrounds are shifted by fractions of a pixel: a gel gives way in its mount."""
+    """Return touches whose backgrounds are shifted by fractions of a pixel: a gel gives way in its
+    mount.
+    """
     share, to = jax.random.split(key)
     size = touches.background.shape[:2]
     shift = most * jax.random.uniform(share, (*size, 1)) * jax.random.normal(to, (*size, 2))
@@ -548,7 +583,10 @@ def moved_gel(key: Array, touches: SimulatedTouches, most: float = MOVED) -> Sim
 def field_batch(
     key: Array, touches: SimulatedTouches, sensor: Array, config: Config, count: int
 ) -> FieldBatch:
-    """Return the first `count` touches of the last take with their fields, free of scale. `sensor` (B, M) are rows."""
+    """Return the first `count` touches of the last take with their fields, free of scale.
+
+    `sensor` (B, M) are rows.
+    """
     clip = touches.clip[:count, -1, -config.model.frames :]
     width = touches.width[:count, -1]
     labels = {name: x[:count, -1, -1] for name, x in touches.labels.items()}

@@ -47,7 +47,9 @@ def mistake(anytouch: Callable[..., Outcome]) -> Callable[..., str]:
 
 @pytest.fixture
 def pressed(tmp_path: Path) -> Path:
-    """A manifest of one recording by a DIGIT: two background frames, four free ones, four pressed ever deeper."""
+    """A manifest of one recording by a DIGIT: two background frames, four free ones, four pressed
+    ever deeper.
+    """
     depths = [0, 0, 0, 0, 0, 0, 30, 50, 70, 90]
     for i, depth in enumerate(depths):
         cv2.imwrite(str(tmp_path / f"{i}.png"), press(depth))

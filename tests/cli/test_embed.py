@@ -151,7 +151,9 @@ def test_no_clip_spans_two_fingers_or_a_missing_number(embed, tmp_path, world):
 
 
 def test_a_folder_names_what_it_lacks(embed, tmp_path, world, tiny_run, mistake):
-    """A missing sensor is noted once, a misspelled one refused, and so is a folder without pictures."""
+    """A missing sensor is noted once, a misspelled one refused, and so is a folder without
+    pictures.
+    """
     assert embed(world.parent)["done"].err.count("--sensor") == 1
     assert "--sensor" not in embed(world.parent, "--sensor", "universal")["done"].err
     folder = tmp_path / "mine"

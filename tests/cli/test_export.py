@@ -123,7 +123,8 @@ def test_weights_go_to_the_authors_names_and_back(tmp_path, tiny_run, weights):
 
 
 def test_the_universal_tokens_go_to_the_last_row(tmp_path, weights):
-    # A sensor added at the end of the table is after them, and the authors' code reads the last row.
+    # A sensor added at the end of the table is after them, and the authors' code reads the last
+    # row.
     model = touch_model(sensors=(*SENSORS, "mine"))
     params = build(model).init(jax.random.key(0))
     export_safetensors(

@@ -15,7 +15,9 @@ from tests.weights import test_families as forms
 from tests.weights.test_start import mae
 
 OTHERS = ROOT / "tests" / "parity" / "golden_others"
-MADE = {  # small files of the other families: title, (width, depth, heads, mlp), patch, what else differs, pixels
+# small files of the other families: title, (width, depth, heads, mlp), patch, what else differs,
+# pixels
+MADE = {
     "sparsh_video": (
         forms.VIDEO,
         (20, 1, 5, 30),
@@ -46,7 +48,10 @@ def touches(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A file of each family. AnyTouch 2 takes clips of 4 frames, needs a background and knows sensors."""
+    """A file of each family.
+
+    AnyTouch 2 takes clips of 4 frames, needs a background and knows sensors.
+    """
     folder = tmp_path_factory.mktemp("files")
     made = {}
     for name, (title, stack, *more) in MADE.items():
@@ -127,7 +132,10 @@ def test_a_run_starts_from_a_family_whose_form_and_export_are_known(
         export.load(exported)(frames), encoder.encode_touch(frames), atol=1e-5
     )
     assert "non-commercial" in anytouch("info", files["vit_mae"]).out
-    size = "--model.image-size 28 --model.patch 7 --model.touch.width 16 --model.touch.depth 2 --model.touch.heads 2"
+    size = (
+        "--model.image-size 28 --model.patch 7 --model.touch.width 16 --model.touch.depth 2 "
+        "--model.touch.heads 2"
+    )
     size += " --model.touch.mlp 32 --model.norm-eps 1e-12 --model.decoder.width 8 --model.decoder.depth 1"
     words = [
         "--run",

@@ -16,7 +16,9 @@ def weights(tmp_path_factory):
 
 @pytest.fixture
 def frames(tmp_path):
-    """A folder of five pictures of a DIGIT and of its untouched gel, and the same as a film and as a manifest."""
+    """A folder of five pictures of a DIGIT and of its untouched gel, and the same as a film and as
+    a manifest.
+    """
     folder = tmp_path / "frames"
     folder.mkdir()
     pictures = []

@@ -20,7 +20,9 @@ WORK = {
 
 @pytest.fixture
 def no_work(monkeypatch, pressed):
-    """no_work(command): the long work of that command must not begin; the folder is that of `pressed`."""
+    """no_work(command): the long work of that command must not begin; the folder is that of
+    `pressed`.
+    """
     monkeypatch.chdir(pressed.parent)
     (pressed.parent / "afile").write_text("")
 

@@ -43,7 +43,8 @@ def test_options_that_do_not_go_together_are_named(mistake, tmp_path, monkeypatc
     [
         "label --label slip --frames 3 --pooling mean --protocol published --seeds 2",
         "label --leave-out object --where force 1 --sensor digit",
-        "tasks --tasks all --order shuffled --cache c --join sum --frames 6 --max-rows 9 --heads linear knn",
+        "tasks --tasks all --order shuffled --cache c --join sum --frames 6 --max-rows 9 --heads "
+        "linear knn",
         "tasks --tasks slip force --train-sensors digit gelslim --test-units cam0_* b",
         "benchmark --benchmark feel_grasp --train-sensors digit --seeds 2 --cache c",
     ],

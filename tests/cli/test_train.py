@@ -188,7 +188,9 @@ sys.exit(run(TrainRequest(options, config_of(Path({world!r}), {stage}, **{more!r
 
 
 def config_of(world: Path, stage: int, *, steps: int = 20, **run):
-    """Stage 1, or stage 2 with photographs and captions for some; a rate at which rounding stays rounding."""
+    """Stage 1, or stage 2 with photographs and captions for some; a rate at which rounding stays
+    rounding.
+    """
     config = run_config(world, stage, steps=steps, **({"save_every": 5} | run))
     data = replace(config.data, clip_share=1.0) if stage == 2 else config.data
     return replace(config, data=data, optim=replace(config.optim, learning_rate=1e-4))
@@ -203,9 +205,11 @@ def processes(world, run_dir, stage, **more):
 
 
 def agree(run: Path, other: Path) -> None:
-    """The losses of two runs to 1e-5, their terms and the gradient's norm to 1e-4 (a term of few rows is small).
+    """The losses of two runs to 1e-5, their terms and the gradient's norm to 1e-4 (a term of few
+    rows is small).
 
-    Not the update's: Adam makes a whole step of the sign of a gradient that is only noise (a key's bias).
+    Not the update's: Adam makes a whole step of the sign of a gradient that is only noise (a key's
+    bias).
     """
     rows = [read_metrics(folder) for folder in (run, other)]
     assert [[row["step"] for row in lines] for lines in rows] == [list(range(20))] * 2

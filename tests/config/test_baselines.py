@@ -13,7 +13,10 @@ EVERY = [(name, stage) for name, one in presets.BASELINES.items() for stage in o
 @pytest.mark.parametrize("recipe", ["paper", "release"])
 @pytest.mark.parametrize(("name", "stage"), EVERY)
 def test_a_baseline_trains_as_the_paper_model_does(name: str, stage: int, recipe: str) -> None:
-    """Only parts, data and terms differ. What each leaves out, the tests of pools, objectives and training say."""
+    """Only parts, data and terms differ.
+
+    What each leaves out, the tests of pools, objectives and training say.
+    """
     config = preset("tiny", stage=stage, recipe=recipe)
     made = presets.apply_baseline(name, config)
     assert (made.optim, made.run, made.recipe, made.stage) == (

@@ -122,7 +122,9 @@ def test_a_name_of_several_cameras_and_of_none(system):
 
 
 class Played:
-    """A cv2.VideoCapture of a camera that has 640 x 480 and 320 x 240 only, and 30 frames a second."""
+    """A cv2.VideoCapture of a camera that has 640 x 480 and 320 x 240 only, and 30 frames a
+    second.
+    """
 
     def __init__(self, *_):
         self.values = {

@@ -40,7 +40,9 @@ def test_the_median_of_pressed_frames_is_the_untouched_gel(look):
 
 @pytest.fixture
 def world(tmp_path):
-    """world([(frames, cells)]): a manifest of frames with equal cells; "gel.png" is a stored picture, all grey."""
+    """world([(frames, cells)]): a manifest of frames with equal cells; "gel.png" is a stored
+    picture, all grey.
+    """
 
     def build(*groups):
         cv2.imwrite(str(tmp_path / "gel.png"), np.full((120, 160, 3), 90, np.uint8))
@@ -96,7 +98,10 @@ def test_a_stored_picture_comes_first_and_the_median_of_training_frames_of_the_u
 
 
 def test_a_unit_of_few_sequences_does_not_subtract_its_own_press(world):
-    """Such as a column `unit` that names the object. A unit of another look has only its own frames."""
+    """Such as a column `unit` that names the object.
+
+    A unit of another look has only its own frames.
+    """
 
     def press(number, tint=0):
         frames = [
@@ -112,7 +117,8 @@ def test_a_unit_of_few_sequences_does_not_subtract_its_own_press(world):
         and distance(rule.read(32), tint=60) < 12
     )
     assert rule.report(np.arange(40)) == (
-        "untouched gel: the median of its sensor of 40 frames for 32 rows; the median of 8 frames for 8 rows"
+        "untouched gel: the median of its sensor of 40 frames for 32 rows; the median of 8 frames "
+        "for 8 rows"
     )
 
 

@@ -57,7 +57,9 @@ def test_flips_are_exact_mirrors_in_all_four_forms():
 
 
 def _blob(affine, key):
-    """Share of the picture, and place of the middle (share of the side from the picture's), of a disc after a map."""
+    """Share of the picture, and place of the middle (share of the side from the picture's), of a
+    disc after a map.
+    """
     disc = cv2.circle(np.zeros((64, 64, 3), np.uint8), (32, 32), 10, (255, 255, 255), -1)
     out = t.touch_transform([disc], 64, _rng(key), replace(PLAIN, affine=affine))[0, ..., 0] / 255
     rows, columns = np.indices(out.shape)
@@ -178,7 +180,8 @@ def test_an_odd_excess_is_cropped_as_clip_crops_it(excess, start):
 
 
 def test_vision_resize_is_bicubic():
-    # Twice as large: OpenCV's kernel differs (a = -0.75), so the weights are written out: a = -0.5 at +-1/4, +-3/4 ...
+    # Twice as large: OpenCV's kernel differs (a = -0.75), so the weights are written out: a = -0.5
+    # at +-1/4, +-3/4 ...
     ramp = np.zeros((8, 8, 3), np.uint8)
     ramp[:, 4] = 128
     out = t.vision_evaluation(ramp, 16)[8, :, 0].astype(float)

@@ -22,7 +22,9 @@ RNG = np.random.default_rng(0)
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Three sensors at the same places: digit and gelsight are known, gelslim stands for the new one."""
+    """Three sensors at the same places: digit and gelsight are known, gelslim stands for the new
+    one.
+    """
     return make_touches(
         tmp_path_factory.mktemp("touches"), touches={"train": 12, "val": 4}, frames=2, each=3
     )

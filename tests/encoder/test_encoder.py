@@ -68,7 +68,8 @@ def test_a_sensor_of_the_table_that_training_never_used_is_reported(encoder, tmp
         np.testing.assert_array_equal(
             encoder.encode_touch(CLIPS[:, 0], "tacto"), encoder.encode_touch(CLIPS[:, 0])
         )
-    # without universal tokens the mean of the others serves, also where the universal ones are asked for
+    # without universal tokens the mean of the others serves, also where the universal ones are
+    # asked for
     own = replace(encoder, universal_drawn=False)
     lines = []
     assert [

@@ -90,7 +90,8 @@ def test_an_artefact_needs_no_code_of_the_network(artefact):
         "import sys, numpy as np; from anytouch_jax.encoder.export import load\n"
         f"z = load({str(artefact[0])!r})(np.zeros((2, 3, 28, 28, 3), np.uint8), 'digit')\n"
         "assert z.shape == (2, 12)\n"
-        "ours = {m for m in sys.modules if m.startswith(('anytouch_jax.nn', 'anytouch_jax.objectives', 'flax'))}\n"
+        "ours = {m for m in sys.modules if m.startswith(('anytouch_jax.nn', "
+        "'anytouch_jax.objectives', 'flax'))}\n"
         "assert not ours, ours"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

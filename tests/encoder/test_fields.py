@@ -39,7 +39,9 @@ def encoder(tmp_path_factory):
 
 
 def output(**changes) -> FieldOutput:
-    """A square of 10 x 10 pixels in contact, in the upper left quarter, at a tenth of the modulus."""
+    """A square of 10 x 10 pixels in contact, in the upper left quarter, at a tenth of the
+    modulus.
+    """
     inside = np.zeros((1, SIDE, SIDE), bool)
     inside[:, :10, :10] = True
     zeros = np.zeros((1, SIDE, SIDE))

@@ -101,7 +101,10 @@ def test_a_good_unit_that_looks_odd_raises_no_alarm():
 
 @pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
 def test_a_lamp_that_is_stronger_is_no_fault_and_a_turned_or_recoloured_unit_is(sensor):
-    """Real units of a family, each against the others. One side is up to a fifth brighter in one colour."""
+    """Real units of a family, each against the others.
+
+    One side is up to a fifth brighter in one colour.
+    """
     for number, gel_of_unit in enumerate(gels := health.known_gels(sensor)):
         others = gels[:number] + gels[number + 1 :]
         side = np.linspace(-1, 1, gel_of_unit.shape[1])

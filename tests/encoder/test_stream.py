@@ -34,7 +34,9 @@ def video(tmp_path_factory):
 
 
 class Camera:
-    """A camera whose frames come when the test says so: frame i is all of value 10 i, BGR with an offset by channel."""
+    """A camera whose frames come when the test says so: frame i is all of value 10 i, BGR with an
+    offset by channel.
+    """
 
     def __init__(self, ready: int = 0) -> None:
         self.allowed = ready
@@ -81,7 +83,9 @@ class Camera:
 
 
 def features_of(encoder, frames, numbers):
-    """What `embed` gives of clips that end at frame i: frames RGB, numbers of the frames of each clip."""
+    """What `embed` gives of clips that end at frame i: frames RGB, numbers of the frames of each
+    clip.
+    """
     small = touch_evaluation(frames, encoder.config.model.image_size)
     return encoder.encode_touch(np.stack([small[list(one)] for one in numbers]), "digit")
 
@@ -158,7 +162,10 @@ def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_camera_that_misses_a_read_goes_on_and_then_fails(encoder, kind):
-    """The picture of another shape is a missed read. No clip spans it, and the end of a camera is never normal."""
+    """The picture of another shape is a missed read.
+
+    No clip spans it, and the end of a camera is never normal.
+    """
     camera = FaultyCamera(kind)
     logged = []
     result = streams.collect(
@@ -236,7 +243,10 @@ def embedded_clips(monkeypatch):
 
 @pytest.mark.parametrize("frames", [1, 3])
 def test_reuse_of_equal_clips_changes_no_bit(encoder, embedded_clips, frames):
-    """Pictures stand still, move, and stand still again. One changed pixel of the network's input is a new clip."""
+    """Pictures stand still, move, and stand still again.
+
+    One changed pixel of the network's input is a new clip.
+    """
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 256, (28, 28, 3), np.uint8)
     dotted = picture.copy()
@@ -260,7 +270,10 @@ def test_reuse_of_equal_clips_changes_no_bit(encoder, embedded_clips, frames):
 
 
 def test_noise_is_reused_and_a_small_touch_is_not():
-    """The noise is learned first. A slow drift adds up, since clips are compared with the one that was embedded."""
+    """The noise is learned first.
+
+    A slow drift adds up, since clips are compared with the one that was embedded.
+    """
     rng = np.random.default_rng(0)
 
     def noisy(level=0.0, touch=0.0):

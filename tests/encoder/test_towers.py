@@ -26,7 +26,9 @@ STILLS = RNG.integers(0, 256, (4, 28, 28, 3), np.uint8)
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
-    """A stage-2 run with fresh weights and a trained tokenizer: its folder, configuration and parameters."""
+    """A stage-2 run with fresh weights and a trained tokenizer: its folder, configuration and
+    parameters.
+    """
     run = tmp_path_factory.mktemp("aligned") / "stage2"
     config = run_config(run / "manifest.csv", 2)
     params = build(config.model).init(jax.random.key(1))

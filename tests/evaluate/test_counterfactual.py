@@ -37,7 +37,9 @@ def test_a_shifted_row_is_half_a_recording_later_in_the_same_recording(frames):
 
 
 def test_touch_matters_where_only_touch_has_the_label():
-    """Features have the material, and the recording's own number, which predicts nothing of other objects."""
+    """Features have the material, and the recording's own number, which predicts nothing of other
+    objects.
+    """
     material = np.unique(WORLD.column("label.material").to_pylist(), return_inverse=True)[1]
     values = np.eye(4, dtype=np.float32)[material] + 0.1 * np.random.default_rng(0).standard_normal(
         (len(WORLD), 4)

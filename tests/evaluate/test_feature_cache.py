@@ -39,7 +39,9 @@ def paint(file: Path, grey: int) -> None:
 
 
 def world(folder: Path, gel: int) -> Manifest:
-    """Three touches over a gel of grey `gel`; pictures without compression, so that all are of one size."""
+    """Three touches over a gel of grey `gel`; pictures without compression, so that all are of one
+    size.
+    """
     folder.mkdir()
     files = {"path": [f"{i}.bmp" for i in ROWS], "background_path": ["background.bmp"] * 3}
     for i in ROWS:

@@ -43,7 +43,9 @@ def test_silhouettes_know_the_labels_that_made_the_space() -> None:
 
 
 def test_a_space_in_figures() -> None:
-    """Two sensors feel thirty touches of ten objects: once the sensor decides where they lie, once the object."""
+    """Two sensors feel thirty touches of ten objects: once the sensor decides where they lie, once
+    the object.
+    """
     sensors = np.repeat(["digit", "gelslim"], 30)
     touches = np.tile(np.arange(30), 2)
     objects = touches // 3
@@ -123,7 +125,9 @@ def test_an_offset_changes_no_r2_interval() -> None:
 
 
 def test_seeds_and_groups_are_drawn_independently() -> None:
-    """Seed k is right on group k alone: drawn alike, seeds and groups would meet in every draw, 0.2 at least."""
+    """Seed k is right on group k alone: drawn alike, seeds and groups would meet in every draw, 0.2
+    at least.
+    """
     group = np.arange(50) // 10
     low, high = statistics._bootstrap_interval(
         [classification_sums(group == k, group) for k in range(5)], statistics._mean_of

@@ -104,7 +104,9 @@ def test_votes():
 
 @pytest.mark.parametrize("classes", [0, 2, 4])
 def test_the_gradient_head_takes_adamw_steps_of_its_loss(classes):
-    """The first step of Adam is the sign of the gradient; decoupled decay shrinks weights and bias."""
+    """The first step of Adam is the sign of the gradient; decoupled decay shrinks weights and
+    bias.
+    """
     rng = np.random.default_rng(1)
     x = rng.normal(size=(6, 3)).astype(np.float32)
     params = [rng.normal(size=(3, max(1, classes * (classes > 2))))]

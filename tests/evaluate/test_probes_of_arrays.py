@@ -20,7 +20,9 @@ def table(
     val: bool = True,
     seed: int = 0,
 ) -> tuple[Array, Array, Array, Array]:
-    """Gaussian blobs, `apart` standard deviations from the origin: features, labels, groups, split."""
+    """Gaussian blobs, `apart` standard deviations from the origin: features, labels, groups,
+    split.
+    """
     rng = np.random.default_rng(seed)
     group = np.repeat(np.arange(groups), each)
     label = group % classes

@@ -113,7 +113,9 @@ def test_a_number_in_the_features_is_predicted():
 
 
 def test_a_split_that_shares_objects_is_not_honest():
-    """Features that know the object, not its material: a split by picture rewards them, the honest one does not."""
+    """Features that know the object, not its material: a split by picture rewards them, the honest
+    one does not.
+    """
     shared = simulated(objects=40, each=4, shared=True)
     names = shared.codes("object")
     store = planted(lambda rows: np.eye(40)[names[rows]])

@@ -53,7 +53,9 @@ def test_the_guesses_without_a_model(frames):
 
 @pytest.mark.parametrize("background", ["keep", "subtract"])
 def test_scores_are_means_over_clips(tmp_path, monkeypatch, background):
-    """Five clips in batches of two, under one mask: the row that fills up the last batch does not count."""
+    """Five clips in batches of two, under one mask: the row that fills up the last batch does not
+    count.
+    """
     manifest = manifests.read(
         make_touches(tmp_path, touches={"test": 5}, sensors=("digit",), frames=4, size=28)
     )
@@ -131,7 +133,9 @@ def test_a_clip_is_shown_with_its_mask_reconstruction_and_next_frame():
 
 
 def test_normalised_patches_are_brought_back_to_pixels(monkeypatch):
-    """A network that predicts each normalised patch exactly is shown as the original, but for rounding."""
+    """A network that predicts each normalised patch exactly is shown as the original, but for
+    rounding.
+    """
 
     def perfect(params, clip, sensor, noise, *, net, config):
         return normalise_patches(patchify(normalise_touch(clip), 7)), random_mask(noise, 4)[2]

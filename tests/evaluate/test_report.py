@@ -110,7 +110,8 @@ def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
     )
     assert path.read_text() == (
         "# Title\n\n## First\n\nWords.\n\n![First](figures/shot.png)\n\n"
-        "| a | b\\|c |\n| --- | --- |\n| 1 | two lines |\n\nAfter.\n\n## Second\n\n![Second](figures/mine.png)\n"
+        "| a | b\\|c |\n| --- | --- |\n| 1 | two lines |\n\nAfter.\n\n## "
+        "Second\n\n![Second](figures/mine.png)\n"
     )
     assert [one.name for one in pictures_of(path)] == ["shot.png", "mine.png"]
     plain = json.loads((out / "report.json").read_text())
@@ -203,8 +204,8 @@ def test_the_numbers_of_the_demo_report(demo: tuple[Path, list[str]], touched: P
     text = path.read_text()
     assert pixels["clips"] > 0 and f"error on {pixels['clips']} clips in contact" in text
     assert (
-        f"| hidden patches | {pixels['reconstruction']:.4f} | {pixels['plain reconstruction']:.4f} |"
-        in text
+        f"| hidden patches | {pixels['reconstruction']:.4f} | {pixels['plain reconstruction']:.4f} "
+        "|" in text
     )
     kinds = numbers["retrieval"]["found"]
     assert set(kinds) == {"fine", "coarse"} and set(kinds["fine"]) == {"matched", "by chance"}

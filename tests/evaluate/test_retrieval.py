@@ -47,7 +47,9 @@ def ask(
     centre: bool = False,
     seeds: int = 5,
 ) -> retrieval.Retrieval:
-    """Touches of `names` by digit are queries among those of `others` by gelsight; `match` has a row for each other."""
+    """Touches of `names` by digit are queries among those of `others` by gelsight; `match` has a
+    row for each other.
+    """
     near = (
         {}
         if match is None
@@ -119,7 +121,9 @@ def test_neither_scale_nor_offset_changes_an_order_of_distances(
 
 
 def test_a_tie_is_counted_as_a_lot_would_be() -> None:
-    """Two kinds of touches: the own kind ties with all of its kind, so that top 5 is 5 of those in the gallery."""
+    """Two kinds of touches: the own kind ties with all of its kind, so that top 5 is 5 of those in
+    the gallery.
+    """
     kind = np.eye(2)[np.arange(COUNT) % 2]
     drawn = draw_galleries(NAMES, NAMES, seeds=1)
     top1, top5 = score_galleries(kind, kind, drawn)
@@ -203,7 +207,9 @@ def test_centring_takes_away_what_a_sensor_adds() -> None:
 
 
 def test_a_units_own_touches_never_enter_its_gallery() -> None:
-    """The same array as query and gallery: only touches by another unit may be looked for, or be distractors."""
+    """The same array as query and gallery: only touches by another unit may be looked for, or be
+    distractors.
+    """
     names = np.repeat(NAMES, 2)
     units = np.tile(["unit a", "unit b"], COUNT)
     features = noise(2 * COUNT)
@@ -394,7 +400,9 @@ def test_features_that_say_nothing_are_at_chance(triads: Any, rows: np.ndarray) 
 
 
 def test_a_matcher_that_sees_only_the_sensors_is_found_out(triads: Any, rows: np.ndarray) -> None:
-    """It says yes to two different sensors: above chance with any negatives, and not with those of one sensor."""
+    """It says yes to two different sensors: above chance with any negatives, and not with those of
+    one sensor.
+    """
     sensor = np.unique(column(triads, rows, "sensor"), return_inverse=True)[1]
     differ = lambda a, b: 0.5 - (a * b).sum(1)  # noqa: E731
     free, bound = scored(triads, rows, np.eye(3)[sensor], differ)

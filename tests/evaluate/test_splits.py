@@ -8,7 +8,9 @@ N = 240
 
 
 def rows(kind: str = "apart", **changes) -> RowRoles:
-    """60 groups of 4 rows. apart: three quarters teach; shared: every group does both; new: test has other classes."""
+    """60 groups of 4 rows. apart: three quarters teach; shared: every group does both; new: test
+    has other classes.
+    """
     group = np.arange(N) // 4
     test = {"apart": group % 4 == 3, "shared": np.arange(N) % 4 == 3, "new": group % 4 == 3}[kind]
     y = np.where(test, 3 + group // 4 % 3, group % 3) if kind == "new" else group // 4 % 3
@@ -47,7 +49,9 @@ def test_a_split_that_parts_the_groups_is_kept():
 
 @pytest.mark.parametrize("protocol", ["honest", "published"])
 def test_a_sensor_of_test_alone_is_folded_within_test(protocol):
-    """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its class has."""
+    """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its
+    class has.
+    """
     roles = rows()
     roles = roles._replace(
         y=np.linspace(0, 1, N), measured=True, may_fit=roles.test, may_test=roles.test

@@ -87,7 +87,8 @@ def test_a_file_with_scores_takes_scored_contact_only():
         for i in range(2)
     ]
     assert select(table(marked), TASKS["object"]).rows.tolist() == [[1]]
-    # A mark is what training goes by, whatever the score (it has a limit of its own for each sensor); words are marks.
+    # A mark is what training goes by, whatever the score (it has a limit of its own for each
+    # sensor); words are marks.
     both = [
         row(
             path=f"{i}.png",

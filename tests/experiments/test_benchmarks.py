@@ -75,7 +75,10 @@ def test_the_rival_gets_the_same_numbers(tmp_path):
 @pytest.mark.slow
 def test_the_simulator_is_measured_and_stored(tmp_path):
     out = tmp_path / "simulator.jsonl"
-    options = "--sensors digit --sizes 28 --frames 2 --batch 2 --rounds 1 --objects 8 --peak-size 64 --out"
+    options = (
+        "--sensors digit --sizes 28 --frames 2 --batch 2 --rounds 1 --objects 8 --peak-size 64 "
+        "--out"
+    )
     assert simulator.main([*options.split(), str(out)]) == 0
     fast, exact = (read_records(out)[f"cpu, 28, 2, digit, {name}"] for name in ("fast", "exact"))
     assert 0 < fast["mm"] < 0.1 and 0 < fast["levels"] < 10 and "mm" not in exact

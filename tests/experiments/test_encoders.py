@@ -32,7 +32,9 @@ RNG = np.random.default_rng(0)
 
 @pytest.mark.slow
 def test_it_learns_a_field_that_no_mean_shows(monkeypatch):
-    """The first two values of a token change with the field of a turn, whose mean over the picture is zero."""
+    """The first two values of a token change with the field of a turn, whose mean over the picture
+    is zero.
+    """
     monkeypatch.setattr(motion, "EPOCHS", 30)
     n = 300
     side = 4

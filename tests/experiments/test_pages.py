@@ -156,7 +156,9 @@ def test_the_pages_are_few_and_short_and_so_are_the_studies(committed):
 
 
 def planted(gain):
-    """Every seed has a level; `gain(question, name)` is what a model is better by, and there is noise of 0.3 points."""
+    """Every seed has a level; `gain(question, name)` is what a model is better by, and there is
+    noise of 0.3 points.
+    """
 
     def mean(question, name, seed, view, task):
         noise = 0.003 * ((seed * 7 + len(name) * 5 + len(view) * 3 + len(task)) % 3 - 1)

@@ -92,7 +92,9 @@ def test_nothing_flows_below_the_angle_of_repose(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_two_fingers_balance_gravity_and_its_moment(seed):
-    """Forces and moments by vectors: a finger stands at +R n, with the gel, and one at -R n; both bear f k and f e."""
+    """Forces and moments by vectors: a finger stands at +R n, with the gel, and one at -R n; both
+    bear f k and f e.
+    """
     setup = setup_of(seed, share=0.5, relax=0.0)
     tilt = 0.8
     slope = 0.4

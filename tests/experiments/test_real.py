@@ -46,7 +46,9 @@ RNG = np.random.default_rng(0)
 
 @pytest.fixture(scope="module")
 def data() -> Recordings:
-    """Sixty recordings of six objects by two fingers, two frames a finger; slip goes with the object's number."""
+    """Sixty recordings of six objects by two fingers, two frames a finger; slip goes with the
+    object's number.
+    """
     rows = [(r, f, t) for r in range(60) for f in (0, 2) for t in range(2)]
     recording = np.array([r for r, _, _ in rows])
     objects = recording % 6
@@ -76,7 +78,9 @@ def test_features_that_name_the_object_are_right_and_noise_is_not(data, head):
 
 
 def test_the_other_finger_is_scored_on_the_camera_that_the_head_never_saw(data):
-    """A feature that shows the object on one camera, and another object on the other, is always wrong there."""
+    """A feature that shows the object on one camera, and another object on the other, is always
+    wrong there.
+    """
     x = planted(data, 0.01)
     x[data.finger == "cam2"] = np.roll(x[data.finger == "cam2"], 1, axis=1)
     assert scores.object_score(x, data).share > 0.4

@@ -183,7 +183,9 @@ SENSORS = {"source": "gelsight_mini", "target": "duragel"}
 
 @pytest.mark.slow
 def test_the_state_that_does_best_on_other_objects_is_kept():
-    """What is right for the training pairs is wrong for these: the first state is the best, and it is the one kept."""
+    """What is right for the training pairs is wrong for these: the first state is the best, and it
+    is the one kept.
+    """
     options = Fit(steps=40, batch=8, learning_rate=1e-2)
     val = X[:8], FIELDS[:8]
     result, losses = training.fit(

@@ -1,4 +1,6 @@
-"""The fit of a sensor: hidden parameters of simulated devices come back, and unfit pictures are refused."""
+"""The fit of a sensor: hidden parameters of simulated devices come back, and unfit pictures are
+refused.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ from anytouch_jax.sim.sensing.sensors import SENSORS, look
 
 
 def step_of(markers, half, away):
-    """The distance of dots `away` mm from the middle of a picture, whose corners are `half` mm away."""
+    """The distance of dots `away` mm from the middle of a picture, whose corners are `half` mm
+    away.
+    """
     return markers.pitch / (1 - markers.bend + markers.bend * (away / half) ** 2)
 
 

@@ -1,4 +1,6 @@
-"""Tokens trained on simulated touches: only they move, an interrupted training goes on, worse ones are not saved."""
+"""Tokens trained on simulated touches: only they move, an interrupted training goes on, worse ones
+are not saved.
+"""
 
 from itertools import count
 from types import SimpleNamespace

@@ -1,4 +1,6 @@
-"""What hostile inputs are made from: a small world, a run, weights, features and a head that are whole."""
+"""What hostile inputs are made from: a small world, a run, weights, features and a head that are
+whole.
+"""
 
 import json
 from dataclasses import dataclass
@@ -18,7 +20,9 @@ from anytouch_jax.encoder.linear_head import LinearHead, save_head
 
 @dataclass(frozen=True)
 class Things:
-    """Whole inputs: a manifest, a folder with one picture, a run, its weights, features of the manifest and a head."""
+    """Whole inputs: a manifest, a folder with one picture, a run, its weights, features of the
+    manifest and a head.
+    """
 
     manifest: Path
     frames: Path

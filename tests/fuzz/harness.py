@@ -1,4 +1,6 @@
-"""Judging of hostile inputs: a command must answer each with a sentence, soon, in little memory, and never wrongly."""
+"""Judging of hostile inputs: a command must answer each with a sentence, soon, in little memory,
+and never wrongly.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ _RULE = re.compile(r"[-|: ]*[╭╰─╮╯│]")  # the option parser draws bo
 class Case(NamedTuple):
     """A hostile input: what was done, the command that reads it, and whether its status may be 0.
 
-    `words` is an argv, or a function to call as a command does. `check` returns what is wrong with an accepted input.
+    `words` is an argv, or a function to call as a command does. `check` returns what is wrong with
+    an accepted input.
     """
 
     name: str
@@ -55,7 +58,8 @@ class _HangError(BaseException):
 
 
 def try_all(kind: str, make: Make, count: int, folder: Path, things: Any, capfd: Any) -> list[str]:
-    """Try `count` inputs of a kind and return a line for each fault; FUZZ_FIRST is the number of the first input.
+    """Try `count` inputs of a kind and return a line for each fault; FUZZ_FIRST is the number of
+    the first input.
 
     Each input has its own random numbers: input 7 is the same in a run of 10 and of 1000.
     """

@@ -60,7 +60,9 @@ EXPORTED = {
 
 
 def spoiled(rng, text: str) -> tuple[str, bytes, bool]:
-    """Return (name, bytes, whether no reader may accept them) of an object in JSON, changed in one place."""
+    """Return (name, bytes, whether no reader may accept them) of an object in JSON, changed in one
+    place.
+    """
     data = json.loads(text)
     whole = text.rstrip().encode()
     kind = pick(rng, KINDS)
@@ -95,7 +97,9 @@ def spoiled(rng, text: str) -> tuple[str, bytes, bool]:
 
 
 def make(rng, folder: Path, things) -> Case:
-    """A file of JSON as a command meets it: a description of weights, an index, an export, a folder under way."""
+    """A file of JSON as a command meets it: a description of weights, an index, an export, a folder
+    under way.
+    """
     kind = pick(rng, "weights, model, index, exported, simulate, pack, answers")
     arrays, metadata = read_safetensors(things.weights if kind == "model" else things.release)
     name, data, bad = spoiled(

@@ -73,7 +73,8 @@ def csv_bytes(rows, names=None, **options) -> bytes:
     return stream.getvalue().encode("utf-8", "surrogatepass")
 
 
-# Each returns (name, bytes, is it wrong for every command, is it wrong for commands that open files). ---------------
+# Each returns (name, bytes, is it wrong for every command, is it wrong for commands that open
+# files). ---------------
 
 
 def cell(rng, rows):

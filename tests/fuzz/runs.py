@@ -59,7 +59,8 @@ def odd_for(rng, value: Any) -> Any:
     return pick(rng, [one for one in ODD if type(one) is not type(value) and one != value])
 
 
-# Each changes the record of a checkpoint and returns (name, refused where it is described, refused where it is used).
+# Each changes the record of a checkpoint and returns (name, refused where it is described, refused
+# where it is used).
 
 
 def field(rng, record):
@@ -152,7 +153,8 @@ def bytes_damaged(rng, folder: Path):
             kind, lambda *_: b"<html></html>" * (kind == "text")
         )
         file.write_bytes(changed(rng, data))
-    # `info` describes a damaged checkpoint too; a flipped bit of the record's white space is no damage.
+    # `info` describes a damaged checkpoint too; a flipped bit of the record's white space is no
+    # damage.
     return f"{file.name} {kind}", False, file.name != "checkpoint.json" or kind != "flipped"
 
 

@@ -94,7 +94,8 @@ def odd_shape(rng):
     answer = chat(GOOD)
     part = pick(
         rng,
-        "usage, tokens, choices, message, finish_reason, content, parts, caption, object, captions, whole",
+        "usage, tokens, choices, message, finish_reason, content, parts, caption, object, "
+        "captions, whole",
     )
     choice = answer["choices"][0]
     caption = {"caption": value, "object": value, "captions": [value]}

@@ -54,7 +54,8 @@ def header(rng, arrays, metadata):
     other = pick(rng, [one for one in arrays if one != name])
     kind = pick(
         rng,
-        "offset, overlap, shape, dtype, missing, more, twice, deep, digits, metadata, empty, length, list",
+        "offset, overlap, shape, dtype, missing, more, twice, deep, digits, metadata, empty, "
+        "length, list",
     )
 
     def edit(header):
@@ -156,7 +157,8 @@ def other_arrays(rng, arrays, metadata):
     }
     kind = pick(rng, made)
     changed = {key: np.asarray(one) for key, one in made[kind].items()}
-    # The authors' files do not name their sensors, so that a longer table of tokens is another whole file.
+    # The authors' files do not name their sensors, so that a longer table of tokens is another
+    # whole file.
     wrong = kind not in ("prefix", "type") and not (
         kind == "long" and (array.ndim == 0 or name == "sensor_token")
     )
@@ -189,7 +191,9 @@ def bytes_damaged(rng, arrays, metadata):
 
 
 def raw_pickle(rng, arrays, metadata):
-    """Bytes for the pickle machine: a flood of operations, deep containers, long numbers, operations at random."""
+    """Bytes for the pickle machine: a flood of operations, deep containers, long numbers,
+    operations at random.
+    """
     codes = [op.code.encode("latin1") for op in pickletools.opcodes]
     programs = {
         "deep list": b"\x80\x02" + b"](" * 200_000 + b"e" * 200_000 + b".",

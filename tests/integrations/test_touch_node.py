@@ -13,7 +13,9 @@ from places import ROOT
 
 
 class Ros:
-    """What the node sees of ROS: parameters keep the type of their default, and nothing is published after the end."""
+    """What the node sees of ROS: parameters keep the type of their default, and nothing is
+    published after the end.
+    """
 
     def __init__(self, given: dict, frames: int) -> None:
         self.given = given

@@ -20,7 +20,8 @@ EVALUATE_LINES = 3_570
 # Names that every file of a room has, by convention: a command runs, a reader reads.
 BY_CONVENTION = {("cli", "run"), ("data.readers", "read"), ("data.readers", "READER")}
 
-# room -> what of ours it may import; a dotted name is one module of a room. A room may always import itself.
+# room -> what of ours it may import; a dotted name is one module of a room. A room may always
+# import itself.
 MAY_IMPORT: dict[str, set[str]] = {
     "ops": set(),
     "errors": set(),
@@ -202,7 +203,9 @@ def faults(module: str, source: str) -> list[str]:
 
 
 def graph() -> dict[str, set[str]]:
-    """module -> modules of ours that it imports, for types too: who reads one file needs the other."""
+    """module -> modules of ours that it imports, for types too: who reads one file needs the
+    other.
+    """
     edges: dict[str, set[str]] = {}
     for module, path in MODULES.items():
         names = {
@@ -215,7 +218,9 @@ def graph() -> dict[str, set[str]]:
 
 
 def cycle(edges: dict[str, set[str]]) -> list[str]:
-    """One cycle of the graph, or nothing: nodes without outgoing edges are taken away until none is left."""
+    """One cycle of the graph, or nothing: nodes without outgoing edges are taken away until none is
+    left.
+    """
     edges = {node: set(targets) for node, targets in edges.items()}
     while free := [node for node, targets in edges.items() if not targets]:
         for node in free:
@@ -225,7 +230,8 @@ def cycle(edges: dict[str, set[str]]) -> list[str]:
     return sorted(edges)
 
 
-# These write elsewhere than into the file that `atomic_path` gives: they append, or rename a whole folder.
+# These write elsewhere than into the file that `atomic_path` gives: they append, or rename a whole
+# folder.
 WRITERS = {
     "files",
     "weights.checkpoint",
@@ -352,7 +358,9 @@ def test_data_workers_never_load_jax() -> None:
 
 
 def _loaded_after_each(modules: list[str]) -> dict[str, set[str]]:
-    """Return the top-level names in sys.modules after importing each of `modules` in turn, in one fresh interpreter."""
+    """Return the top-level names in sys.modules after importing each of `modules` in turn, in one
+    fresh interpreter.
+    """
     code = (
         "import importlib, json, sys\nloaded = {}\n"
         f"for module in {modules!r}:\n"

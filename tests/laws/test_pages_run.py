@@ -1,4 +1,6 @@
-"""Every command and every Python block of the README and the pages runs, in page order, and prints what is shown."""
+"""Every command and every Python block of the README and the pages runs, in page order, and prints
+what is shown.
+"""
 
 from __future__ import annotations
 
@@ -58,8 +60,9 @@ HERE = {
     " ...": "",
     "info FILE": "info runs/stage1",
 }
-# Two need files of the size of ViT-L or ViT-B: tests of weights and of `train --init` run them with small ones.
-# The viewer serves until it is stopped: it has tests that stop it. So has a user's own sensor.
+# Two need files of the size of ViT-L or ViT-B: tests of weights and of `train --init` run them with
+# small ones. The viewer serves until it is stopped: it has tests that stop it. So has a user's own
+# sensor.
 ELSEWHERE = ("--preset large", "--preset base", "anytouch view", "mine.sensor", "--sensor mine ")
 # Numbers that no two runs share: times, rates, and the last digits of a float32.
 FREE = re.compile(
@@ -113,7 +116,9 @@ def run(line: str) -> str:
 
 
 def make_recordings(file: Path) -> None:
-    """Three objects of different textures, pressed ever deeper by two sensors, twelve times each."""
+    """Three objects of different textures, pressed ever deeper by two sensors, twelve times
+    each.
+    """
     rng = np.random.default_rng(0)
     rows = []
     for thing in ("coin", "cup", "key"):
@@ -212,7 +217,9 @@ class Camera:
 
 @pytest.fixture(scope="module", autouse=True)
 def optimised() -> Any:
-    """Encoders of full size run here: ten times faster with the optimisations that conftest.py turns off."""
+    """Encoders of full size run here: ten times faster with the optimisations that conftest.py
+    turns off.
+    """
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", True)
@@ -302,14 +309,17 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run("anytouch train --stage 2 --data manifest.parquet --run runs/stage2 --init runs/stage1")
         run("anytouch embed --data manifest.parquet --out mine.npz")
         run(
-            "anytouch probe label --data recordings.parquet --label object --save recordings/head.npz"
+            "anytouch probe label --data recordings.parquet --label object --save "
+            "recordings/head.npz"
         )
     return folder
 
 
 @pytest.fixture
 def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The current folder: a copy of `base`, with shards in an object store, a server for captions and no physics."""
+    """The current folder: a copy of `base`, with shards in an object store, a server for captions
+    and no physics.
+    """
     import fsspec
 
     folder = tmp_path / "here"
@@ -355,7 +365,9 @@ def is_equal(shown: str, printed: str) -> bool:
 
 
 def missing(block: str, printed: str) -> list[str]:
-    """Return the lines of a block that were not printed one below the other. A line of dots leaves some out.
+    """Return the lines of a block that were not printed one below the other.
+
+    A line of dots leaves some out.
 
     A list of files that are there is fine too.
     """

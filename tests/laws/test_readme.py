@@ -25,7 +25,9 @@ TEXT = "\n".join(PAGES.values())
 
 
 def typed(program: str) -> list[str]:
-    """What these pages show to be typed after `program`: lines of code and table cells, without comments."""
+    """What these pages show to be typed after `program`: lines of code and table cells, without
+    comments.
+    """
     lines = re.findall(rf"^ {{4}}{program} (.*)$", TEXT, re.MULTILINE)
     cells = re.findall(rf"^\|.*?`{program} ([^`]*)`", TEXT, re.MULTILINE)
     return [

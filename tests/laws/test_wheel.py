@@ -24,7 +24,9 @@ def ran(*command, cwd: Path) -> str:
 
 @pytest.mark.slow
 def test_the_wheel_works_in_an_empty_folder(tmp_path):
-    """Without a network: the tools that build and what is imported are those of this environment."""
+    """Without a network: the tools that build and what is imported are those of this
+    environment.
+    """
     source, empty, home = (tmp_path / name for name in ("source", "empty", "venv"))
     empty.mkdir()
     shutil.copytree(
@@ -68,7 +70,10 @@ def test_the_wheel_works_in_an_empty_folder(tmp_path):
     ).startswith(str(place))
     assert "usage: anytouch COMMAND" in ran(home / "bin" / "anytouch", "--help", cwd=empty)
     assert "--on-bad-sample" in ran(home / "bin" / "anytouch", "train", "--help", cwd=empty)
-    shape = "at.load_encoder('anytouch-tiny').encode_touch(at.example_touches()[0].frame[:112, :112]).shape"
+    shape = (
+        "at.load_encoder('anytouch-tiny').encode_touch(at.example_touches()[0].frame[:112, "
+        ":112]).shape"
+    )
     assert (
         ran(python, "-c", f"import anytouch_jax as at; print({shape})", cwd=empty).strip()
         == "(1, 192)"

@@ -27,7 +27,10 @@ def exact_gelu(x):
 
 @pytest.mark.parametrize(("dtype", "step"), [(np.float32, 0.0), (jnp.bfloat16, 2**-8)])
 def test_gelu_is_the_exact_form_in_value_and_derivative(dtype, step):
-    """The tanh form differs by more than 1e-4. Sixteen bits are rounded once, and keep the negative tail."""
+    """The tanh form differs by more than 1e-4.
+
+    Sixteen bits are rounded once, and keep the negative tail.
+    """
     x = X.astype(dtype)
     for function, wanted in zip((gelu, jax.vmap(jax.grad(gelu))), exact_gelu(x), strict=True):
         result = jax.jit(function)(x)
@@ -104,7 +107,10 @@ def test_what_is_read_alone_is_what_the_whole_stack_gives_there(depth, remat):
 
 
 def test_the_last_block_works_for_the_token_that_is_read():
-    """Of one block: keys and values of all tokens, all else of one. The stack before it is not copied."""
+    """Of one block: keys and values of all tokens, all else of one.
+
+    The stack before it is not copied.
+    """
     model = full_model(image_size=56)  # 64 patches
     args = np.zeros((2, 1, 56, 56, 3), "f4"), ROWS
 

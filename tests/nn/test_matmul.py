@@ -60,7 +60,9 @@ def test_other_types_are_computed_as_they_are(dtype):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_narrow_products_have_the_one_form_that_a_cpu_computes_in_16_bits(shape):
-    """A float32 result, the first operand contracted over its last axis (else XLA widens both, or cannot run it)."""
+    """A float32 result, the first operand contracted over its last axis (else XLA widens both, or
+    cannot run it).
+    """
     x, kernel, g = draw(shape)
     program = both.lower(x, kernel, g, "bfloat16").compile().as_text()
     dots = [line for line in program.splitlines() if " dot(" in line]

@@ -34,7 +34,9 @@ def test_a_still_is_a_clip_of_equal_frames():
 
 
 def test_states_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
-    """The first is what the first block gets, the last is `hidden`; each hangs on the blocks before it alone."""
+    """The first is what the first block gets, the last is `hidden`; each hangs on the blocks before
+    it alone.
+    """
     model = touch_model(touch=Stack(8, 5, 2, 16))
     net = build(model)
     clip = clips(1)
@@ -46,7 +48,8 @@ def test_states_are_hidden_states_evenly_spaced_from_the_embedded_tokens():
 
     result = states(params, 3)
     assert result.shape == (2, 1 + 5 + 16, 3 * 8)
-    # Depths 0, 2 (2.5 is rounded to even) and 5 of the same stack: the blocks behind add nothing when they are zero.
+    # Depths 0, 2 (2.5 is rounded to even) and 5 of the same stack: the blocks behind add nothing
+    # when they are zero.
     for depth, part in ((0, result[..., :8]), (2, result[..., 8:16]), (5, result[..., 16:])):
         blocks = jax.tree.map(
             lambda x, n=depth: np.where(np.arange(5).reshape(-1, *[1] * (x.ndim - 1)) < n, x, 0),

@@ -17,7 +17,8 @@ HIDDEN = np.array([[1, 1, 0, 0, 1]] * 6, bool)
 CLIP = RNG.standard_normal((6, 2, 8, 4, 3)).astype("f4")
 NOISE = RNG.random((6, 5)).astype("f4")
 IDS = np.array([[3, 1]] * 6)
-# Every function of losses and tokens with the arrays that it takes: the first axis of each is the batch.
+# Every function of losses and tokens with the arrays that it takes: the first axis of each is the
+# batch.
 CALLS = {
     "normalise": (losses.normalise, Z),
     "normalise_patches": (losses.normalise_patches, PRED),

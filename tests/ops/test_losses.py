@@ -82,7 +82,9 @@ def test_info_nce_is_finite_on_duplicates_and_zeros(dtype):
 
 
 def test_the_products_of_info_nce_are_whole_on_every_device():
-    """An accelerator's default is TF32 or bfloat16: a hundredth of a logit that is multiplied by 100."""
+    """An accelerator's default is TF32 or bfloat16: a hundredth of a logit that is multiplied by
+    100.
+    """
     a = np.ones((4, 8), np.float32)
     present = np.ones(4, bool)
     text = str(jax.make_jaxpr(jax.grad(info_nce, argnums=(0, 1)))(a, a, np.float32(100.0), present))
@@ -138,7 +140,10 @@ def test_normalised_patches_use_the_unbiased_variance_and_survive_constants():
 
 
 def test_normalise_is_exact_and_has_a_finite_gradient_at_zero():
-    """Below eps a vector is divided by 1e-12, as in torch. A gradient above 1e13 would be infinite further down."""
+    """Below eps a vector is divided by 1e-12, as in torch.
+
+    A gradient above 1e13 would be infinite further down.
+    """
     x = np.concatenate([RNG.standard_normal((4, 6)), np.zeros((1, 6)), np.full((1, 6), 1e-13)])
     expected = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
     np.testing.assert_allclose(normalise(x), expected, rtol=1e-6)
@@ -225,7 +230,9 @@ def test_absent_rows_are_not_in_the_mean_nor_in_the_gradient(garbage):
 
 
 def test_the_gradient_does_not_vanish_near_the_collapsed_point():
-    """Almost equal embeddings: without centring nothing pulls them apart, with it the pull grows as they near."""
+    """Almost equal embeddings: without centring nothing pulls them apart, with it the pull grows as
+    they near.
+    """
     near = tuple(np.float32(1.0) + np.float32(1e-3) * x for x in draw())
 
     def pull(center):

@@ -16,7 +16,8 @@ def test_patchify_orders_row_col_colour():
     ramp = np.arange(1 * 1 * 4 * 4 * 3).reshape(1, 1, 4, 4, 3)
     patches = np.asarray(patchify(ramp, 2))
     assert patches.shape == (1, 4, 1, 12)
-    # The second patch is the top right one: pixels (0, 2), (0, 3), (1, 2), (1, 3), three colours each.
+    # The second patch is the top right one: pixels (0, 2), (0, 3), (1, 2), (1, 3), three colours
+    # each.
     assert patches[0, 1, 0].tolist() == [6, 7, 8, 9, 10, 11, 18, 19, 20, 21, 22, 23]
 
 

@@ -1,7 +1,9 @@
-"""Numerical parity with the authors' PyTorch code: run every golden case of a folder through what training runs.
+"""Numerical parity with the authors' PyTorch code: run every golden case of a folder through what
+training runs.
 
-One runner a kind of case, found by the letter its name starts with. Nothing is assembled a second time here: losses
-come from `objectives`, gradients from `jax.grad` of them, steps from `train.step`, weights from `weights.convert`.
+One runner a kind of case, found by the letter its name starts with. Nothing is assembled a second
+time here: losses come from `objectives`, gradients from `jax.grad` of them, steps from
+`train.step`, weights from `weights.convert`.
 """
 
 import re
@@ -54,7 +56,9 @@ Params = dict[str, Any]
 
 
 def run(folder: Path) -> list[Row]:
-    """Compare every case of `folder`; a case or an array that is not understood is a failing row."""
+    """Compare every case of `folder`; a case or an array that is not understood is a failing
+    row.
+    """
     found = read_cases(folder)
     rows = [row for case in found for row in run_case(case)]
     others = {name for case in found for name in case.info.get("files", ())}
@@ -144,7 +148,9 @@ def _probe_head(case: Case, name: str, head_input: jax.Array) -> None:
 
 
 def _optimizer(case: Case) -> None:
-    """Five AdamW steps through `make_step`; an epoch is as many steps as make all recorded epochs whole numbers."""
+    """Five AdamW steps through `make_step`; an epoch is as many steps as make all recorded epochs
+    whole numbers.
+    """
     net, config, params = setup(case, 1)
     args = case.info["args"]
     epochs = case.info["epoch_fraction"]
@@ -201,7 +207,9 @@ def _compare_schedule(case: Case) -> None:
 
 
 def _optimizer_batch(case: Case, net: Net, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Batch of step i: the still batch of case A or the clip batch of case B, with this case's noise."""
+    """Batch of step i: the still batch of case A or the clip batch of case B, with this case's
+    noise.
+    """
     kinds = case.info.get("data_type", 0)
     source = (
         "A_stage1_image"
@@ -215,7 +223,9 @@ def _optimizer_batch(case: Case, net: Net, i: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _compare_final(case: Case, params: Params, state: TrainState, config: Config) -> None:
-    """Parameters after the steps: movement within 1e-5 absolute, untouched ones bit-equal, per-parameter counts."""
+    """Parameters after the steps: movement within 1e-5 absolute, untouched ones bit-equal,
+    per-parameter counts.
+    """
     before = convert.to_release(params, config.model)
     after = convert.to_release(merge(state.trainable, state.frozen), config.model)
     noisy = case.info.get("rounding_sensitive", {}).get("parameters", {})

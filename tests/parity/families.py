@@ -1,4 +1,6 @@
-"""Encoders of other families against outputs of their authors' code: from raw frames, through the public interface."""
+"""Encoders of other families against outputs of their authors' code: from raw frames, through the
+public interface.
+"""
 
 import re
 from collections.abc import Callable, Iterator
@@ -202,7 +204,9 @@ def preprocess(case: Case) -> None:
 
 
 def full_size(case: Case) -> None:
-    """Read the key lists of the released files into abstract shapes, without a missing or an unknown key."""
+    """Read the key lists of the released files into abstract shapes, without a missing or an
+    unknown key.
+    """
     for name, rows in key_lists(case.info):
         zeros = {key: np.broadcast_to(np.float32(0), shape) for key, shape, *_ in rows}
         family = families.find_family(zeros)

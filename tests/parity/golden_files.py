@@ -1,6 +1,8 @@
-"""Golden folders: cases of arrays recorded from the authors' PyTorch code, and the comparison with ours.
+"""Golden folders: cases of arrays recorded from the authors' PyTorch code, and the comparison with
+ours.
 
-A case is `<name>.json` and `<name>.npz`: arrays in/..., out/..., grad/..., final/... and what they mean.
+A case is `<name>.json` and `<name>.npz`: arrays in/..., out/..., grad/..., final/... and what they
+mean.
 """
 
 import json
@@ -40,7 +42,9 @@ KEY_BIAS = ("k_proj.bias", "key.bias")
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison: the worst error of an array against its tolerance, both in units of the array's maximum."""
+    """One comparison: the worst error of an array against its tolerance, both in units of the
+    array's maximum.
+    """
 
     case: str
     array: str
@@ -79,14 +83,18 @@ class Case:
     def compare(
         self, name: str, ours: Any, relative: float = OUTPUT, absolute: float = 0.0
     ) -> None:
-        """Compare `ours` with the recorded array `name`; tolerance as in the issue: relative, or 5 x noise."""
+        """Compare `ours` with the recorded array `name`; tolerance as in the issue: relative, or 5
+        x noise.
+        """
         self.seen.add(name)
         self.check(name, ours, self.arrays[name], relative, max(absolute, 5 * self.noise(name)))
 
     def check(
         self, name: str, ours: Any, theirs: Any, relative: float, absolute: float = 0.0
     ) -> None:
-        """Compare two arrays; the tolerance is the larger of `relative` x max |theirs| and `absolute`."""
+        """Compare two arrays; the tolerance is the larger of `relative` x max |theirs| and
+        `absolute`.
+        """
         ours = np.asarray(ours, np.float64)
         theirs = np.asarray(theirs, np.float64)
         if ours.shape != theirs.shape:
@@ -185,14 +193,18 @@ def golden_config(info: dict[str, Any], *, stage: int, sensors: int = 10) -> Con
 
 
 def _sensor_names(rows: int) -> tuple[str, ...]:
-    """Names for a table of `rows` sensors whose last row is the universal one (the reference's id -1)."""
+    """Names for a table of `rows` sensors whose last row is the universal one (the reference's id
+    -1).
+    """
     if rows == len(SENSORS):
         return SENSORS
     return (*(f"sensor_{i}" for i in range(rows - 1)), UNIVERSAL)
 
 
 def golden_params(folder: Path, file: str, model: ModelConfig, scale: Any = None) -> dict[str, Any]:
-    """Parameters of a golden `.npz` in our layout; keys of parts that `model` leaves out are dropped."""
+    """Parameters of a golden `.npz` in our layout; keys of parts that `model` leaves out are
+    dropped.
+    """
     weights = read_arrays(folder / file)
     if not model.decoder_sensor_tokens:
         weights = {k: v for k, v in weights.items() if not k.endswith("sensor_token_proj.weight")}
@@ -202,7 +214,9 @@ def golden_params(folder: Path, file: str, model: ModelConfig, scale: Any = None
 
 
 def channel_last(pixels: np.ndarray, *, clip: bool = True) -> np.ndarray:
-    """(B, 3, H, W) or (B, T, 3, H, W) -> (B, T, H, W, 3), or (B, H, W, 3) of a photograph with `clip` False."""
+    """(B, 3, H, W) or (B, T, 3, H, W) -> (B, T, H, W, 3), or (B, H, W, 3) of a photograph with
+    `clip` False.
+    """
     pixels = np.moveaxis(pixels, -3, -1)
     if clip and pixels.ndim == 4:
         return pixels[:, None]

@@ -1,4 +1,6 @@
-"""Golden cases of the two losses: outputs, gradients and which parameters have none, through `objectives`."""
+"""Golden cases of the two losses: outputs, gradients and which parameters have none, through
+`objectives`.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -65,9 +67,11 @@ def _grad(
 def _gradients(
     value: Value, params: Params, inputs: Any, exact: Any, net: Net, config: Config
 ) -> dict[str, Any]:
-    """Gradients by the authors' key names; None for parameters that the loss does not use or the config freezes.
+    """Gradients by the authors' key names; None for parameters that the loss does not use or the
+    config freezes.
 
-    `inputs` may be padded so that cases share a program; `exact` has the shapes that say what the loss reads.
+    `inputs` may be padded so that cases share a program; `exact` has the shapes that say what the
+    loss reads.
     """
     trainable, frozen = split(params, config.frozen)
     grads = jax.device_get(_grad(trainable, frozen, inputs, value=value, net=net, config=config))
@@ -122,7 +126,9 @@ def _compare_gradients(
 def _compare_norms(
     case: Case, label: str, grads: dict[str, Any], norms: dict[str, float | None]
 ) -> None:
-    """L2 norms of all gradients and which are None, from the JSON (seven digits; absent keys are None)."""
+    """L2 norms of all gradients and which are None, from the JSON (seven digits; absent keys are
+    None).
+    """
     wrong = sorted(key for key in grads if (grads[key] is None) != (norms.get(key) is None))
     unknown = sorted(set(norms) - set(grads))
     if wrong or unknown:
@@ -198,7 +204,9 @@ def stage1(case: Case) -> None:
 
 
 def _align_batch(case: Case, net: Net, flags: str = "") -> tuple[AlignBatch, AlignBatch]:
-    """The recorded batch twice: with a slot for every sample, unused ones at row B, and with the present ones alone."""
+    """The recorded batch twice: with a slot for every sample, unused ones at row B, and with the
+    present ones alone.
+    """
     rows = len(case.arrays["in/touch"])
     slots = {}
     for kind in ("vision", "text"):

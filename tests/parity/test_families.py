@@ -1,4 +1,6 @@
-"""Encoders of other families against their authors' code; files that are cut, hostile or of no family."""
+"""Encoders of other families against their authors' code; files that are cut, hostile or of no
+family.
+"""
 
 import json
 from dataclasses import replace
@@ -105,7 +107,9 @@ def test_the_names_of_hugging_face_give_the_tokens_of_timms(tmp_path):
 
 
 def test_calibration_images_of_sitr_have_their_own_tokens(tmp_path):
-    """The class token reads them, their tokens are dropped, and without them the encoder refuses to run."""
+    """The class token reads them, their tokens are dropped, and without them the encoder refuses to
+    run.
+    """
     weights = load_file(HERE / "timm_vit.safetensors")
     rng = np.random.default_rng(0)
     weights |= {

@@ -1,4 +1,6 @@
-"""This implementation against outputs and gradients of the authors' PyTorch code; and that the check can fail."""
+"""This implementation against outputs and gradients of the authors' PyTorch code; and that the
+check can fail.
+"""
 
 import json
 import shutil
@@ -29,7 +31,9 @@ COMPARISONS = {  # at least so many: a case that compares nothing would be withi
 
 
 def copied(tmp_path: Path, name: str, info=None, **changes) -> Path:
-    """A folder with one case (and the parameters it needs), arrays changed by functions of the old ones."""
+    """A folder with one case (and the parameters it needs), arrays changed by functions of the old
+    ones.
+    """
     for file in (f"{name}.json", f"{name}.npz", *(p.name for p in HERE.glob("stage1_params.*"))):
         shutil.copy(HERE / file, tmp_path)
     with np.load(HERE / f"{name}.npz") as file:

@@ -1,4 +1,6 @@
-"""Golden cases of weights: full-size keys, shapes and decay groups, what is loaded from where, stored parameters."""
+"""Golden cases of weights: full-size keys, shapes and decay groups, what is loaded from where,
+stored parameters.
+"""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -28,7 +30,9 @@ _FRESH = "kept at its fresh initial value"
 
 
 def manifest(case: Case) -> None:
-    """Keys and shapes of the four full-size files against preset large; decay groups and freezing against our rules."""
+    """Keys and shapes of the four full-size files against preset large; decay groups and freezing
+    against our rules.
+    """
     for kind, (layout, config) in _FULL_SIZE.items():
         rows = [row for row in case.info[kind]["state_dict"] if not row[0].startswith("head.")]
         ours = release_shapes(config.model, layout)
@@ -43,7 +47,9 @@ def manifest(case: Case) -> None:
 
 
 def _groups(case: Case, kind: str, config: Config, rows: Iterable[Any]) -> None:
-    """The decay group of every array that something reads; `text` runs without gradient there (golden Q10)."""
+    """The decay group of every array that something reads; `text` runs without gradient there
+    (golden Q10).
+    """
     names = release_names(config.model)
     ours = {}
     theirs = {}
@@ -112,7 +118,9 @@ def _values(shapes: Mapping[str, Any], seed: int) -> Arrays:
 
 
 def _expected(key: str, source: str, files: Mapping[str, Arrays]) -> np.ndarray:
-    """The array at a key's source; CLIP's 2-D patch kernel is repeated over the frames (golden Q1)."""
+    """The array at a key's source; CLIP's 2-D patch kernel is repeated over the frames (golden
+    Q1).
+    """
     file, _, theirs = source.partition(":")
     array = files[file][theirs]
     repeated = key.endswith("video_patch_embedding.weight") and file == "clip"
@@ -190,7 +198,9 @@ def checkpoint(case: Case) -> None:
 
 
 def _equal(case: Case, what: str, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:
-    """A failing row for each parameter that differs in any bit or that one of the two lacks; a row with the count."""
+    """A failing row for each parameter that differs in any bit or that one of the two lacks; a row
+    with the count.
+    """
     for name in sorted(ours.keys() | theirs.keys()):
         if name not in ours or name not in theirs or not np.array_equal(ours[name], theirs[name]):
             case.fail(f"{what}/{name}", "differs from the parameters that it should be equal to")

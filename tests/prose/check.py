@@ -1,8 +1,9 @@
-"""Prose rules for pages, docstrings and error messages: `python -m tests.prose.check` prints file, line and reason.
+"""Prose rules for pages, docstrings and error messages: `python -m tests.prose.check` prints file,
+line and reason.
 
-A sentence has at most 30 words, and in a page at most three numbers and no semicolon. A table cell has at most 25
-words. Some phrases are not used anywhere. The README has at most 700 words. Code, links' addresses and tables' numbers
-are not prose.
+A sentence has at most 30 words, and in a page at most three numbers and no semicolon. A table cell
+has at most 25 words. Some phrases are not used anywhere. The README has at most 700 words. Code,
+links' addresses and tables' numbers are not prose.
 """
 
 import ast
@@ -170,7 +171,9 @@ def text_faults(file: Path, line: int, text: str) -> Iterator[Fault]:
 
 
 def code_faults(file: Path, text: str) -> Iterator[Fault]:
-    """Yield the faults of a module, in its docstrings and in its messages, which go to errors and logs."""
+    """Yield the faults of a module, in its docstrings and in its messages, which go to errors and
+    logs.
+    """
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, DOCUMENTED) and (docstring := ast.get_docstring(node)):
             for block in re.split(r"\n\s*\n|\n(?=\s*[-*>]\s)", docstring):
@@ -189,7 +192,10 @@ def code_faults(file: Path, text: str) -> Iterator[Fault]:
 
 
 def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
-    """Yield the faults of the text cells of a notebook. A line counts within the text of all of them."""
+    """Yield the faults of the text cells of a notebook.
+
+    A line counts within the text of all of them.
+    """
     cells = [
         cell["source"] for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"
     ]
@@ -200,7 +206,9 @@ def notebook_faults(file: Path, text: str) -> Iterator[Fault]:
 
 
 def texts(root: Path, patterns: Sequence[str]) -> dict[Path, str]:
-    """Return the files of `patterns` below `root` that are not made from others, and their texts."""
+    """Return the files of `patterns` below `root` that are not made from others, and their
+    texts.
+    """
     files = (file.relative_to(root) for pattern in patterns for file in root.glob(pattern))
     own = sorted({file for file in files if not file.as_posix().startswith(MADE)})
     return {file: (root / file).read_text(encoding="utf-8") for file in own}

@@ -1,6 +1,8 @@
-"""Statistics of the README and the pages in docs: `python -m tests.prose.statistics` prints them with their limits.
+"""Statistics of the README and the pages in docs: `python -m tests.prose.statistics` prints them
+with their limits.
 
-A limit holds over all pages together. That on headings holds on each page. Tables, code and headings are not prose.
+A limit holds over all pages together. That on headings holds on each page. Tables, code and
+headings are not prose.
 """
 
 import re

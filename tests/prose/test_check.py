@@ -87,7 +87,10 @@ def test_the_exit_status_says_whether_there_are_faults(tmp_path, capsys):
 
 
 def test_every_number_is_what_it_counts_and_long_sentences_and_missing_readers_break_the_limits():
-    text = "# Nine words of a heading that is no prose\n\nYou see two words. We have 3 eggs.\n\n| 1 | 2 |\n"
+    text = (
+        "# Nine words of a heading that is no prose\n\nYou see two words. We have 3 eggs.\n\n| 1 | "
+        "2 |\n"
+    )
     found = statistics({PAGE: text})
     assert [one.value for one in found] == [4, 4, 100 / 8, 200 / 8, 8]
     assert [one.holds for one in found] == [True, True, False, True, True]

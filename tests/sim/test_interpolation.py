@@ -14,7 +14,9 @@ SAMPLE = jax.jit(sample)
 
 @pytest.mark.parametrize("thing", catalogue(3, 64)[::6], ids=lambda thing: thing.name)
 def test_a_raster_of_a_tenth_of_a_millimetre_holds_the_surface(thing):
-    """What is read between the pixels is the analytic surface to 4 micrometres (RMS) where a gel can touch it."""
+    """What is read between the pixels is the analytic surface to 4 micrometres (RMS) where a gel
+    can touch it.
+    """
     shape = thing.shape
     rng = np.random.default_rng(1)
     x, y = rng.uniform(-6, 6, (2, 50, 50)).astype(np.float32)
@@ -44,7 +46,9 @@ def test_sample_gives_the_pixels_back():
 
 
 def test_sample_is_exact_on_parabolas():
-    """A Catmull-Rom spline reproduces polynomials of the second degree; a bilinear one has facets."""
+    """A Catmull-Rom spline reproduces polynomials of the second degree; a bilinear one has
+    facets.
+    """
     x, y = np.meshgrid(*[np.arange(-15, 16) * 0.1] * 2)
     surface = lambda x, y: 0.3 * x * x - 0.2 * x * y + 0.1 * y * y + 0.4 * x - 0.7  # noqa: E731
     at = np.random.default_rng(1).uniform(-1.2, 1.2, (2, 200)).astype(np.float32)

@@ -205,7 +205,9 @@ def test_labels_agree_with_the_pressure(takes):
 
 
 def test_an_object_that_turns_about_itself_does_not_slide():
-    """A ball under the gel's middle, mounted 0.6 mm aside: its twist gives a torque and no force."""
+    """A ball under the gel's middle, mounted 0.6 mm aside: its twist gives a torque and no
+    force.
+    """
     motion = np.zeros((5, 3), np.float32)
     motion[:, 2] = np.linspace(0, 0.2, 5)
     round_ = -(AXIS[:, None] ** 2 + AXIS[None, :] ** 2) / 16

@@ -122,7 +122,9 @@ def test_fine_recordings_move_alike_and_coarse_ones_share_only_the_place():
 
 
 def gesture(motion, slide=(0.0, 0.0), twist=0.0, shown=1.0, middle=0.5, lift=-1.0):
-    """A gesture whose phases lift 10 %, press 20 %, pause 10 %, move 30 %, pause 10 %, release 10 % and lift 10 %."""
+    """A gesture whose phases lift 10 %, press 20 %, pause 10 %, move 30 %, pause 10 %, release 10 %
+    and lift 10 %.
+    """
     phases = np.array([1, 2, 1, 3, 1, 1, 1]) / 10
     return Gesture(
         0.8,

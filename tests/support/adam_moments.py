@@ -8,7 +8,9 @@ from anytouch_jax.train.optim import OptState, packing
 
 
 class Moments(NamedTuple):
-    """The state of Adam for one parameter: the count `updates` i32 (), and `mu` and `nu` of its shape."""
+    """The state of Adam for one parameter: the count `updates` i32 (), and `mu` and `nu` of its
+    shape.
+    """
 
     updates: jax.Array
     mu: jax.Array

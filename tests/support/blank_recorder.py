@@ -7,7 +7,9 @@ from anytouch_jax.sim.sensing.sensors import SENSORS
 
 
 class BlankRecorder:
-    """Takes the place of `Recorder`: clips that show which recording they are of, without physics."""
+    """Takes the place of `Recorder`: clips that show which recording they are of, without
+    physics.
+    """
 
     def __init__(self, scenes, objects, batch):
         self.scenes = scenes

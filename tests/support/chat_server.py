@@ -85,7 +85,9 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def serve(behave=lambda number, body: (200, {}, chat(GOOD))):
-    """A server that answers by `behave(number, body) -> (status, headers, answer)` while the block runs."""
+    """A server that answers by `behave(number, body) -> (status, headers, answer)` while the block
+    runs.
+    """
     server = _Server(behave)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()

@@ -19,7 +19,9 @@ def patterned(picture):
 
 
 def with_patterns(make):
-    """The fixture `make`, with a pattern over every picture, because pictures of one colour are a finding."""
+    """The fixture `make`, with a pattern over every picture, because pictures of one colour are a
+    finding.
+    """
 
     def build(rows, folder="."):
         manifest = make(rows, folder)
@@ -60,7 +62,10 @@ def plain_rows(count=6, **extra):
 
 
 def image_pairs(tmp_path, make, *, swap, witness, count=24):
-    """Touch: a gel's colours with a faint dent. Vision: anything. Rows where `swap` have the two exchanged."""
+    """Touch: a gel's colours with a faint dent.
+
+    Vision: anything. Rows where `swap` have the two exchanged.
+    """
     rng = np.random.default_rng(3)
     gel = cv2.resize(
         rng.integers(60, 190, (3, 4, 3), np.uint8), (32, 24), interpolation=cv2.INTER_CUBIC

@@ -1,4 +1,6 @@
-"""A stand-in for cv2.VideoCapture that fails at one frame, as real tactile sensors do, and a video with odd times."""
+"""A stand-in for cv2.VideoCapture that fails at one frame, as real tactile sensors do, and a video
+with odd times.
+"""
 
 import time
 from collections.abc import Iterable
@@ -13,7 +15,8 @@ KINDS = ("grab", "retrieve", "none", "raise", "grey", "smaller")  # faults of a 
 class FaultyCamera:
     """A camera of `frames` frames of 32 x 40 pixels that then delivers nothing.
 
-    `kind` is a fault of read `fails_at` (KINDS), or lasts from there on: "resized", "black" or "frozen".
+    `kind` is a fault of read `fails_at` (KINDS), or lasts from there on: "resized", "black" or
+    "frozen".
     """
 
     def __init__(self, kind: str = "ok", fails_at: int = 3, frames: int = 12) -> None:
@@ -77,7 +80,9 @@ class Film:
 
 
 def write_uneven_video(path: Path, milliseconds: list[int]) -> Path:
-    """Write a Matroska video whose frame i has the time stamp milliseconds[i]; its header says 10 frames a second."""
+    """Write a Matroska video whose frame i has the time stamp milliseconds[i]; its header says 10
+    frames a second.
+    """
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 10, (40, 32))
     for number in range(len(milliseconds)):
         writer.write(np.full((32, 40, 3), 8 * number, np.uint8))

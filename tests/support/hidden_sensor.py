@@ -21,7 +21,10 @@ SHARE = 0.8  # of the touches that press
 
 
 class Hidden(NamedTuple):
-    """Pictures u8 (N, h, w, 3), the device, and the numbers of its family. A picture shows `width` mm."""
+    """Pictures u8 (N, h, w, 3), the device, and the numbers of its family.
+
+    A picture shows `width` mm.
+    """
 
     frames: Any
     background: Any
@@ -60,7 +63,9 @@ def hidden_pictures(
     deepest: float = 1.0,
     **unit_values: Any,
 ) -> Hidden:
-    """Return pictures of a device of a known family whose lights have changed places and whose parameters are drawn."""
+    """Return pictures of a device of a known family whose lights have changed places and whose
+    parameters are drawn.
+    """
     rng = np.random.default_rng([seed, 59])
     shape = SHAPE if SENSORS[name].field[0] < SENSORS[name].field[1] else SHAPE[::-1]
     touches = jax.device_get(_drawn(name, count)(jax.random.key(seed)))
@@ -115,7 +120,8 @@ def hidden_pictures(
 
 
 def colours_of_dents(look: Any, halo_mm: Any, gain: Any = 1.0, angle: float = 0.0) -> np.ndarray:
-    """Return the colours (3, 3) that a picture shows in its middle: by slope along x and y, and by mm of depth.
+    """Return the colours (3, 3) that a picture shows in its middle: by slope along x and y, and by
+    mm of depth.
 
     They are the least squares fit to round dents of several widths.
     """

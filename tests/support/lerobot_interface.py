@@ -1,6 +1,8 @@
-"""The interface of LeRobot's cameras, as its documentation and its code state it, without its dependencies.
+"""The interface of LeRobot's cameras, as its documentation and its code state it, without its
+dependencies.
 
-Source: github.com/huggingface/lerobot, `cameras/camera.py`, `cameras/configs.py`, `utils/import_utils.py`.
+Source: github.com/huggingface/lerobot, `cameras/camera.py`, `cameras/configs.py`,
+`utils/import_utils.py`.
 """
 
 import abc
@@ -64,7 +66,9 @@ class OpenCVCameraConfig(CameraConfig):
 
 
 class FilmCamera(Camera):
-    """In the place of LeRobot's OpenCV camera: its pictures come from `frames`, one after the other."""
+    """In the place of LeRobot's OpenCV camera: its pictures come from `frames`, one after the
+    other.
+    """
 
     frames: ClassVar[list[np.ndarray]] = []
 
@@ -122,7 +126,9 @@ def modules() -> dict[str, ModuleType]:
 
 
 def device_class(config: Any) -> type:
-    """Return the class of a device by LeRobot's rule: that of the settings without "Config", in the parent module."""
+    """Return the class of a device by LeRobot's rule: that of the settings without "Config", in the
+    parent module.
+    """
     kind = type(config)
     parent = kind.__module__.rpartition(".")[0]
     return getattr(sys.modules[parent], kind.__name__.removesuffix("Config"))

@@ -13,7 +13,9 @@ from anytouch_jax.weights import safetensors
 
 
 def measuring_weights(path: Path, calibration: dict | None = None, *, fields: int = 8) -> Path:
-    """Write the weights of a network with `fields` channels, and the calibration of its deviations."""
+    """Write the weights of a network with `fields` channels, and the calibration of its
+    deviations.
+    """
     model = touch_model(fields=fields)
     params = build(model).init(jax.random.key(0))
     metadata = {safetensors.MODEL_KEY: to_json(model)}

@@ -1,4 +1,6 @@
-"""Fine-aligned pairs on disk: a disc pressed at a place, as two cameras of other colours and a field sensor feel it."""
+"""Fine-aligned pairs on disk: a disc pressed at a place, as two cameras of other colours and a
+field sensor feel it.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,9 @@ CAMERAS = {"gelsight_mini": (90, 120, 60), "digit": (60, 60, 120), "duragel": (1
 
 
 def scene(rng: np.random.Generator, size: int = 28) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The images u8 (size, size, 3) of one press by name of the camera, and its field f32 (20, 20, 6)."""
+    """The images u8 (size, size, 3) of one press by name of the camera, and its field f32 (20, 20,
+    6).
+    """
     place = rng.uniform(-0.6, 0.6, 2)
     depth = rng.uniform(0.3, 1.0)
 
@@ -34,7 +38,9 @@ def scene(rng: np.random.Generator, size: int = 28) -> tuple[dict[str, np.ndarra
 
 
 def arrays(count: int, seed: int = 0, size: int = 28) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """GelSight Mini and DuraGel images u8 (n, size, size, 3), Tac3D fields f32 (n, 20, 20, 6), of `count` presses."""
+    """GelSight Mini and DuraGel images u8 (n, size, size, 3), Tac3D fields f32 (n, 20, 20, 6), of
+    `count` presses.
+    """
     rng = np.random.default_rng(seed)
     several = [scene(rng, size) for _ in range(count)]
     first, second = (
@@ -44,7 +50,9 @@ def arrays(count: int, seed: int = 0, size: int = 28) -> tuple[np.ndarray, np.nd
 
 
 def make_pairs(folder: Path, touches: dict[str, int], frames: int = 2) -> Path:
-    """A manifest of `touches` {split: number}, each of another object, felt by three cameras and a Tac3D."""
+    """A manifest of `touches` {split: number}, each of another object, felt by three cameras and a
+    Tac3D.
+    """
     rng = np.random.default_rng(5)
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []

@@ -1,4 +1,6 @@
-"""Films of a gel that is pressed for a share of the time, in three looks: lit in colours, darkening, and with dots."""
+"""Films of a gel that is pressed for a share of the time, in three looks: lit in colours,
+darkening, and with dots.
+"""
 
 import numpy as np
 
@@ -10,7 +12,9 @@ SENSORS = {"coloured": "gelsight_mini", "darkening": "9dtact", "dotted": "gelsig
 def gel_frame(
     look: str, depth: float, shape: str = "ball", shift: float = 0.0, seed: int = 0
 ) -> np.ndarray:
-    """Return one frame u8 RGB (120, 160, 3) of a gel pressed by `depth` (0 to 1) at `shift` pixels from the middle."""
+    """Return one frame u8 RGB (120, 160, 3) of a gel pressed by `depth` (0 to 1) at `shift` pixels
+    from the middle.
+    """
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float64)
     rng = np.random.default_rng(seed)
     dent = depth * _dent(shape, x - 80 - shift, y - 60)
@@ -38,7 +42,9 @@ def gel_frame(
 def press_film(
     look: str, share: float, shape: str = "ball", frames: int = 40
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the frames of one film and whether each is pressed: free, a press that slides, free."""
+    """Return the frames of one film and whether each is pressed: free, a press that slides,
+    free.
+    """
     pressed = round(share * frames)
     first = (frames - pressed + 1) // 2
     contact = (np.arange(frames) >= first) & (np.arange(frames) < first + pressed)

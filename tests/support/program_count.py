@@ -1,7 +1,7 @@
 """A pytest plugin that counts compiled programs, and fails a run of tests that compiles too many.
 
-An operation of jax outside `jax.jit` is a program for each new shape, some 30 ms each. Compute what a test expects
-with numpy, and call what it tests through one `jax.jit` with inputs of one shape.
+An operation of jax outside `jax.jit` is a program for each new shape, some 30 ms each. Compute what
+a test expects with numpy, and call what it tests through one `jax.jit` with inputs of one shape.
 """
 
 from collections import Counter

@@ -54,7 +54,9 @@ class Table:
 
 
 def check_laws(table: Table, root: Path) -> None:
-    """No sequence in two splits (background and unused are none), frames in order, every path a file in its folder."""
+    """No sequence in two splits (background and unused are none), frames in order, every path a
+    file in its folder.
+    """
     parts: dict[str, set[str]] = {}
     last: dict[str, int] = {}
     for row in table.rows.values():

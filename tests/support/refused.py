@@ -9,7 +9,9 @@ from anytouch_jax.errors import UserError
 
 
 def refused(words: str, call: Callable[..., Any], *args: Any, **options: Any) -> str:
-    """Return the sentence of the UserError that a call raises: one line in which the pattern `words` is found."""
+    """Return the sentence of the UserError that a call raises: one line in which the pattern
+    `words` is found.
+    """
     with pytest.raises(UserError, match=words) as error:
         call(*args, **options)
     assert "\n" not in str(error.value)

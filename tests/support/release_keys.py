@@ -10,7 +10,9 @@ def _keymap(model: ModelConfig, layout: str | None) -> KeyMap:
 
 
 def release_shapes(model: ModelConfig, layout: str | None = None) -> dict[str, Shape]:
-    """Key -> shape of a file of `model`, without the classifier of a probe: stage 2 if it has a tower, else stage 1."""
+    """Key -> shape of a file of `model`, without the classifier of a probe: stage 2 if it has a
+    tower, else stage 1.
+    """
     keymap = _keymap(model, layout)
     shapes = file_shapes(keymap.entries(model), param_shapes(model))
     for key, source in keymap.unused.items():

@@ -1,4 +1,6 @@
-"""A small world on disk (two sensors at the same places, one photograph, a few captions) and runs trained on it."""
+"""A small world on disk (two sensors at the same places, one photograph, a few captions) and runs
+trained on it.
+"""
 
 import csv
 import json
@@ -96,7 +98,9 @@ def run_config(
     model: dict[str, Any] | None = None,
     **run: Any,
 ) -> Config:
-    """A recipe on the smallest model and the small world; a step for each of the four devices to share."""
+    """A recipe on the smallest model and the small world; a step for each of the four devices to
+    share.
+    """
     config = tiny_config(stage, recipe, towers, **(model or {}))
     data = replace(config.data, manifests=(str(manifest),), batch_size=batch)
     settings: dict[str, Any] = {"steps": steps, "save_every": steps, "figure_every": 0} | run

@@ -23,7 +23,8 @@ def simulated(
     seed: int = 0,
     shared: bool = False,
 ) -> Manifest:
-    """Recordings as the simulator's: deepest in frame 2, slipping most in frame 3; the last quarter of objects is test.
+    """Recordings as the simulator's: deepest in frame 2, slipping most in frame 3; the last quarter
+    of objects is test.
 
     `shared`: every object is in all splits instead.
     """
@@ -78,7 +79,9 @@ def row(**changes: Any) -> dict[str, Any]:
 
 
 def blobs(n: int = 600, d: int = 24, classes: int = 4, apart: float = 1.0, seed: int = 0):
-    """Correlated features, as a network's are: spreads from 1 to 100, then standardised; class numbers."""
+    """Correlated features, as a network's are: spreads from 1 to 100, then standardised; class
+    numbers.
+    """
     rng = np.random.default_rng(seed)
     mixed = np.linalg.qr(rng.normal(size=(d, d)))[0] * np.geomspace(1, 100, d)
     y = rng.integers(classes, size=n)

@@ -34,7 +34,9 @@ def tiny_config(stage: int = 1, recipe: str = "paper", towers: str = "scratch", 
 
 
 class Compiled:
-    """The methods of a network, each under one `jax.jit`: outside of it every operation is a program for itself."""
+    """The methods of a network, each under one `jax.jit`: outside of it every operation is a
+    program for itself.
+    """
 
     def __init__(self, net: Net) -> None:
         self.net = net

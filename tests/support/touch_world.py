@@ -1,4 +1,6 @@
-"""A world on disk where several sensors feel the same places: each touch has its texture, place and force."""
+"""A world on disk where several sensors feel the same places: each touch has its texture, place and
+force.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -21,9 +23,11 @@ def make_touches(
     each: int = 5,
     seed: int = 0,
 ) -> Path:
-    """A manifest of `touches` {split: number}, `each` of an object, half of them fine and half coarse.
+    """A manifest of `touches` {split: number}, `each` of an object, half of them fine and half
+    coarse.
 
-    A frame shows the texture of its touch within a disc at (x, y), as deep as its force, over its sensor's tint.
+    A frame shows the texture of its touch within a disc at (x, y), as deep as its force, over its
+    sensor's tint.
     """
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)

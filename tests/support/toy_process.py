@@ -1,4 +1,6 @@
-"""One of several processes that train the toy problem together: a script for the tests, and how they start it."""
+"""One of several processes that train the toy problem together: a script for the tests, and how
+they start it.
+"""
 
 import json
 import os
@@ -51,7 +53,9 @@ def start(
     number: int = 0,
     **run,
 ):
-    """Start `count` processes that train in `run_dir`; process `hit` gets the signal `number` before step `at`."""
+    """Start `count` processes that train in `run_dir`; process `hit` gets the signal `number`
+    before step `at`.
+    """
     settings = json.dumps(
         {"run_dir": str(run_dir), "hit": hit, "at": at, "number": number, "run": run}
     )
@@ -65,7 +69,9 @@ def free_address() -> str:
 
 
 def spawn(words: list[str], count: int = 2, devices: int = 1, *folders: Path):
-    """Start `count` processes of Python that find each other, with the tests' helpers and `folders` in their path."""
+    """Start `count` processes of Python that find each other, with the tests' helpers and `folders`
+    in their path.
+    """
     path = [str(SRC), str(SUPPORT), *map(str, folders), os.environ.get("PYTHONPATH", "")]
     common = os.environ | {
         "PYTHONPATH": os.pathsep.join(path),

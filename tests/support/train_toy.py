@@ -1,4 +1,6 @@
-"""A small loss with two heads, its batches and configs; run as a script it trains, for the tests that kill it."""
+"""A small loss with two heads, its batches and configs; run as a script it trains, for the tests
+that kill it.
+"""
 
 import dataclasses
 import itertools
@@ -51,7 +53,8 @@ def toy_params(wide: int = WIDTH) -> dict:
 
 
 def toy_loss(params, batch, key, progress):
-    """Mean square of a head's output plus noise: the still head for one frame, the clip head for more.
+    """Mean square of a head's output plus noise: the still head for one frame, the clip head for
+    more.
 
     A sensor of -1 makes it NaN.
     """

@@ -1,7 +1,7 @@
 """Parameters that a loss uses, read from its jaxpr.
 
-A parameter is used if a gradient can flow to it from the loss. PyTorch gives all others a gradient of None. Dead code,
-integers and `stop_gradient` carry no gradient, and metrics do not count.
+A parameter is used if a gradient can flow to it from the loss. PyTorch gives all others a gradient
+of None. Dead code, integers and `stop_gradient` carry no gradient, and metrics do not count.
 """
 
 from collections.abc import Callable
@@ -29,10 +29,11 @@ _CALLS = {
 
 
 def used_parameters(loss_fn: Callable[..., Any], params: Tree, *args: Any) -> Tree:
-    """Return a tree like `params` of Python bools: whether the value of `loss_fn(params, *args)` depends on the leaf.
+    """Return a tree like `params` of Python bools: whether the value of `loss_fn(params, *args)`
+    depends on the leaf.
 
-    `loss_fn` returns a scalar, or a scalar and anything else. Arguments may be arrays, tracers or shapes, and nothing
-    is computed. Loops, branches, calls and custom derivatives are entered.
+    `loss_fn` returns a scalar, or a scalar and anything else. Arguments may be arrays, tracers or
+    shapes, and nothing is computed. Loops, branches, calls and custom derivatives are entered.
     """
     jaxpr = jax.make_jaxpr(loss_fn)(*jax.tree.map(_abstract, (params, *args))).jaxpr
     live = _live_inputs(jaxpr, [i == 0 for i in range(len(jaxpr.outvars))])
@@ -46,7 +47,9 @@ def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
 
 
 def _live_inputs(jaxpr: Any, live_outputs: list[bool]) -> list[bool]:
-    """Return which inputs of a jaxpr reach one of its live outputs through differentiable values."""
+    """Return which inputs of a jaxpr reach one of its live outputs through differentiable
+    values.
+    """
     live = {
         var
         for var, on in zip(jaxpr.outvars, live_outputs, strict=True)
@@ -67,7 +70,10 @@ def _carries_gradient(var: Any) -> bool:
 
 
 def _live_operands(eqn: Any, outputs: list[bool]) -> list[bool]:
-    """Return which operands of an equation reach its live outputs. An unknown primitive uses all of them."""
+    """Return which operands of an equation reach its live outputs.
+
+    An unknown primitive uses all of them.
+    """
     name = eqn.primitive.name
     params = eqn.params
     everything = [True] * len(eqn.invars)
@@ -99,7 +105,9 @@ def _live_operands(eqn: Any, outputs: list[bool]) -> list[bool]:
 
 
 def _live_loop(body: Any, outputs: list[bool], consts: int, carry: int) -> list[bool]:
-    """Return the live operands [constants, carry, scanned] of a loop, whose carry may be read rounds later."""
+    """Return the live operands [constants, carry, scanned] of a loop, whose carry may be read
+    rounds later.
+    """
     needed = outputs[:carry]
     while True:
         inputs = _live_inputs(body, needed + outputs[carry:])

@@ -10,7 +10,9 @@ DEPTHS = (0, 60, 90)  # of the frames of each recording
 
 
 class PressCamera:
-    """A camera at 30 frames/s of a gel that is pressed by `shape`: "ball", "bar", "pins", or "" for nothing."""
+    """A camera at 30 frames/s of a gel that is pressed by `shape`: "ball", "bar", "pins", or "" for
+    nothing.
+    """
 
     def __init__(self) -> None:
         self.shape = ""

@@ -67,7 +67,9 @@ def save_run(folder: Path, config: Config, params: Any, **metadata: Any) -> Path
 
 
 def save_clip(folder: Path, model: ModelConfig, params: Any) -> Path:
-    """The image and text towers of a model as a folder with HF CLIP weights and their head counts."""
+    """The image and text towers of a model as a folder with HF CLIP weights and their head
+    counts.
+    """
     plain = replace(model, lora_rank=0)
     arrays = to_release({n: p for n, p in params.items() if n != "lora"}, plain, allow_extra=True)
     keys = release_names(plain, "clip")

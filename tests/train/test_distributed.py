@@ -23,7 +23,9 @@ BY_HAND = ADDRESS | {"JAX_NUM_PROCESSES": "4", "JAX_PROCESS_ID": "3"}
 
 @pytest.fixture
 def initialized(monkeypatch):
-    """The arguments of each call of `jax.distributed.initialize`, which does nothing; exits raise SystemExit."""
+    """The arguments of each call of `jax.distributed.initialize`, which does nothing; exits raise
+    SystemExit.
+    """
     calls = []
     monkeypatch.setattr(jax.distributed, "initialize", lambda **kwargs: calls.append(kwargs))
     monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
@@ -151,7 +153,9 @@ def same(result, run_dir, undisturbed):
 
 
 def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, undisturbed):
-    """SIGTERM reaches one of them at step 4; parameters are shared between them; four devices take over."""
+    """SIGTERM reaches one of them at step 4; parameters are shared between them; four devices take
+    over.
+    """
     ended = finish(start(tmp_path, hit=1, at=4, number=signal.SIGTERM, steps=12, fsdp=2))
     assert [status for status, _ in ended] == [0, 0], ended
     (_, first), (_, second) = ended
@@ -175,7 +179,9 @@ def test_two_processes_train_as_one_stop_as_one_and_go_on_elsewhere(tmp_path, un
 def test_a_lost_process_ends_the_other_and_the_next_start_goes_on(
     tmp_path, undisturbed, lost, number
 ):
-    """The checkpoint of step 3 is complete before that of step 6 is begun, and at step 7 one is lost."""
+    """The checkpoint of step 3 is complete before that of step 6 is begun, and at step 7 one is
+    lost.
+    """
     ended = finish(start(tmp_path, hit=lost, at=7, number=number, steps=12, fsdp=2))
     (status, message) = ended[lost]
     (other_status, other_message) = ended[1 - lost]

@@ -56,7 +56,9 @@ def assert_same(a, b):
 
 @pytest.fixture(params=[False, True], ids=["kept", "donated"])
 def donates(request, monkeypatch):
-    """Whether a step may overwrite its state, as on an accelerator; on a CPU it can, but is not allowed to."""
+    """Whether a step may overwrite its state, as on an accelerator; on a CPU it can, but is not
+    allowed to.
+    """
     if request.param:
         with monkeypatch.context() as patch:
             patch.setattr(jax, "default_backend", lambda: "gpu")
@@ -213,7 +215,10 @@ class Step:
 def test_the_time_that_a_step_waits_for_its_batch_is_written(
     tmp_path, monkeypatch, after, first, other
 ):
-    """A batch takes 3 s and the rest of a step 1 s. What counts is the time in which no step runs."""
+    """A batch takes 3 s and the rest of a step 1 s.
+
+    What counts is the time in which no step runs.
+    """
     clock = Clock()
 
     def batches(start, stop):
@@ -231,7 +236,8 @@ def test_the_time_that_a_step_waits_for_its_batch_is_written(
     monkeypatch.setattr(loop, "LastStep", lambda: Step(clock, after))
     run(tmp_path, toy_config(save_every=0), batches=batches, stop_after=4)
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    # A line is written when the next batch has come: the first one tells of two batches, the last one of none.
+    # A line is written when the next batch has come: the first one tells of two batches, the last
+    # one of none.
     assert [line["wait"] for line in lines] == [first, other, other, 0]
     assert [line["wait_share"] for line in lines] == [first / 8, other / 4, other / 4, 0]
 

@@ -92,7 +92,8 @@ def test_the_config_is_written_once_and_read_back(tmp_path):
     assert from_json((tmp_path / "run" / "config.json").read_text()) == config
 
 
-# What may change between the parts of a run: it decides where and how fast the run goes, not what it computes.
+# What may change between the parts of a run: it decides where and how fast the run goes, not what
+# it computes.
 MAY_CHANGE = (
     "data.cache",
     "data.manifests",

@@ -17,7 +17,10 @@ from anytouch_jax.encoder.embed import Features, save_npz
 
 @pytest.fixture(scope="session")
 def touches(tmp_path_factory) -> Path:
-    """A manifest of 2 touches, each by 2 sensors, 3 frames a recording. The second touch has an odd name."""
+    """A manifest of 2 touches, each by 2 sensors, 3 frames a recording.
+
+    The second touch has an odd name.
+    """
     folder = tmp_path_factory.mktemp("touches")
     rows = []
     for touch, name in enumerate(("cup", SCRIPT)):
@@ -61,7 +64,9 @@ def touches(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def features(touches) -> Path:
-    """Features of the rows of `touches`: rows of one touch and frame are near, whatever the sensor."""
+    """Features of the rows of `touches`: rows of one touch and frame are near, whatever the
+    sensor.
+    """
     table = manifests.read(touches)
     touch, frame = (
         np.asarray(table.column(name).to_pylist(), float) for name in ("touch", "frame_index")

@@ -1,4 +1,5 @@
-"""The page in a real browser: Debian's Chromium, alone for a smoke test, and driven by Playwright for the others.
+"""The page in a real browser: Debian's Chromium, alone for a smoke test, and driven by Playwright
+for the others.
 
 `make test-all` installs Playwright, and axe from npm, which checks that everybody can use the page.
 """
@@ -87,7 +88,10 @@ def address(touches, features, camera, tiny_run, tmp_path_factory) -> Iterator[s
 
 @pytest.fixture
 def browse(address) -> Iterator[Callable[..., object]]:
-    """browse(tab, width): the page at a tab. In the end nothing may be in the console of any of them."""
+    """browse(tab, width): the page at a tab.
+
+    In the end nothing may be in the console of any of them.
+    """
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
@@ -111,7 +115,10 @@ def browse(address) -> Iterator[Callable[..., object]]:
 
 
 def until(page, expression: str, argument: object = None, seconds: float = 60) -> None:
-    """Wait until a JavaScript expression is true. The page's policy forbids eval, which Playwright's own wait needs."""
+    """Wait until a JavaScript expression is true.
+
+    The page's policy forbids eval, which Playwright's own wait needs.
+    """
     end = time.monotonic() + seconds
     while not page.evaluate(expression, argument):
         assert time.monotonic() < end, expression

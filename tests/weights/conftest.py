@@ -1,4 +1,6 @@
-"""Files as torch.save writes them, made by hand: torch is not needed, and a wicked pickle is as easy as a good one."""
+"""Files as torch.save writes them, made by hand: torch is not needed, and a wicked pickle is as
+easy as a good one.
+"""
 
 import io
 import struct
@@ -32,7 +34,9 @@ class Global:
 
 @dataclass
 class Call:
-    """A function called on arguments when the pickle is read (REDUCE), then given a state (BUILD)."""
+    """A function called on arguments when the pickle is read (REDUCE), then given a state
+    (BUILD).
+    """
 
     function: Any
     args: tuple
@@ -41,7 +45,10 @@ class Call:
 
 @dataclass
 class Tensor:
-    """A view of a block of numbers (`data`, flat). Two tensors with the same `data` object share a storage."""
+    """A view of a block of numbers (`data`, flat).
+
+    Two tensors with the same `data` object share a storage.
+    """
 
     data: np.ndarray
     shape: tuple

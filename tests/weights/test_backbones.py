@@ -1,10 +1,12 @@
-"""Newer backbones of photographs against timm 1.0.31 and transformers 5.24 with torch 2.13, and what is not read.
+"""Newer backbones of photographs against timm 1.0.31 and transformers 5.24 with torch 2.13, and
+what is not read.
 
-data/backbones.npz has networks of width 16, depth 2, two heads and patches of 4 pixels: drawn weights (multiples of
-1/16, stored as float16), drawn pictures (2, H, W, 3) and the tokens after the last norm, in float32 on a CPU. They come
-from `VisionTransformer(reg_tokens=4, no_embed_class=True, init_values=1e-5)` and `Eva(rope_type="dinov3",
-num_reg_tokens=4)` of timm, and from `DINOv3ViTModel` and `SiglipVisionModel`. Meta's layout is timm's by other names,
-given to timm's own conversion, with a key bias that the mask takes out.
+data/backbones.npz has networks of width 16, depth 2, two heads and patches of 4 pixels: drawn
+weights (multiples of 1/16, stored as float16), drawn pictures (2, H, W, 3) and the tokens after the
+last norm, in float32 on a CPU. They come from `VisionTransformer(reg_tokens=4, no_embed_class=True,
+init_values=1e-5)` and `Eva(rope_type="dinov3", num_reg_tokens=4)` of timm, and from
+`DINOv3ViTModel` and `SiglipVisionModel`. Meta's layout is timm's by other names, given to timm's
+own conversion, with a key bias that the mask takes out.
 """
 
 import json

@@ -167,7 +167,9 @@ def test_a_failed_or_abandoned_save_does_not_block_a_load(tmp_path, monkeypatch)
 @pytest.mark.parametrize("times", [2, 3])
 @pytest.mark.parametrize("when", ["checked", "_load"])
 def test_a_checkpoint_that_its_run_removes_while_it_is_read(tmp_path, monkeypatch, when, times):
-    """The one after it is read; where that happens again and again the error says so, and not that it is damaged."""
+    """The one after it is read; where that happens again and again the error says so, and not that
+    it is damaged.
+    """
     filled(tmp_path, 1).close()
     real = getattr(checkpoint, when)
     read = []
@@ -428,7 +430,9 @@ def test_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, where, last):
 
 
 def test_a_checkpoint_of_the_first_format_loads_to_the_bit(tmp_path):
-    """It was written before the weights were reorganised: a stage-2 run of width 16 with both towers."""
+    """It was written before the weights were reorganised: a stage-2 run of width 16 with both
+    towers.
+    """
     with zipfile.ZipFile(DATA / "checkpoint_1.zip") as archive:
         archive.extractall(tmp_path / "run" / "checkpoints")
     loaded = load_model(tmp_path / "run")

@@ -31,7 +31,8 @@ MAE = "ViT-MAE (Hugging Face)"
 VIT = "ViT or DeiT (Hugging Face)"
 OUT = {"outputs": 7}
 PAIRS = OUT | {"tubelet": 2}
-# family, (width, depth, heads, mlp), patch, what else differs, size of the images, given to the loader
+# family, (width, depth, heads, mlp), patch, what else differs, size of the images, given to the
+# loader
 FORMS = [
     (SPARSH, (38, 3, 2, 50), 8, {"tubelet": 2, "frames": 2, "registers": 1}, (32, 24), True),
     (SPARSH, (24, 1, 4, 96), 16, {"tubelet": 3, "frames": 3}, (320, 240), False),
@@ -210,7 +211,9 @@ EVIL = Call(Global("os", "system"), ("touch hacked",))
 
 
 def write(folder: Path, kind: str, arrays, extra=None) -> tuple[Path, Path]:
-    """Write a file; return what is loaded and the file to damage, whose pickle may also hold `extra`."""
+    """Write a file; return what is loaded and the file to damage, whose pickle may also hold
+    `extra`.
+    """
     folder.mkdir()
     suffix = kind.split()[0]
     if kind.endswith("parts"):

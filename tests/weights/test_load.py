@@ -339,7 +339,8 @@ def test_a_web_page_and_a_pointer_are_called_so(tmp_path, name):
             load_model(tmp_path / name)
 
 
-# torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x 3 image
+# torch.nn.functional.interpolate(mode="bicubic", align_corners=False) of arange(9)**2 % 7 as a 3 x
+# 3 image
 UP = [
     [-0.220484018, 0.204530478, 2.152891397, 4.220484257],
     [1.355409384, 1.418546438, 2.801180124, 4.506895065],

@@ -1,8 +1,8 @@
 """AnyTouch in PyTorch, from the modules of `transformers`, by the authors' key names.
 
-Runs in a separate environment (torch, transformers, safetensors, numpy); the package never imports it. Attention
-is PyTorch's fused one, the optimiser its fused AdamW; images and texts are packed as in ours, so that what is compared
-is the framework and not a detour.
+Runs in a separate environment (torch, transformers, safetensors, numpy); the package never imports
+it. Attention is PyTorch's fused one, the optimiser its fused AdamW; images and texts are packed as
+in ours, so that what is compared is the framework and not a detour.
 """
 
 from __future__ import annotations

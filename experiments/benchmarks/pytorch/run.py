@@ -2,8 +2,9 @@
 
     make bench-torch PRESET=small BATCH=16
 
-First each rival must give the loss of ours to 1e-5 (float32). Then all take turns, round by round: ours in this
-process, PyTorch in a separate process that works only when asked. The first step of a turn is not counted.
+First each rival must give the loss of ours to 1e-5 (float32). Then all take turns, round by round:
+ours in this process, PyTorch in a separate process that works only when asked. The first step of a
+turn is not counted.
 """
 
 from __future__ import annotations
@@ -204,7 +205,8 @@ def check(work: Workload, rival: str, errors: dict[str, float]) -> None:
     for what, limit in limits.items():
         if errors.get(what, 0.0) > limit:
             raise SystemExit(
-                f"{work.name}, PyTorch {rival}: {what} differs by {errors[what]:.2g}, more than {limit:g}"
+                f"{work.name}, PyTorch {rival}: {what} differs by {errors[what]:.2g}, more than "
+                f"{limit:g}"
             )
 
 

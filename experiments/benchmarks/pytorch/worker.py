@@ -1,8 +1,9 @@
-"""Steps of the PyTorch rival on demand: one JSON line in, one out, so that another process can take turns with it.
+"""Steps of the PyTorch rival on demand: one JSON line in, one out, so that another process can take
+turns with it.
 
-{"do": "setup", "work": ..., "weights": file, "batch": file}      -> {"torch": version, ...}
-{"do": "values", "variant": name, "out": file}                    -> {"loss": x}; output and gradients go to the file
-{"do": "run", "variant": name, "count": k}                        -> {"seconds": [...]}
+{"do": "setup", "work": ..., "weights": file, "batch": file}      -> {"torch": version, ...} {"do":
+"values", "variant": name, "out": file}                    -> {"loss": x}; output and gradients go
+to the file {"do": "run", "variant": name, "count": k}                        -> {"seconds": [...]}
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ STD = {"touch": (0.229, 0.224, 0.225), "image": (0.26862954, 0.26130258, 0.27577
 
 
 def floats(pixels: torch.Tensor, kind: str) -> torch.Tensor:
-    """uint8 (..., H, W, 3) -> normalised float (..., 3, H, W), as torchvision leaves it: contiguous."""
+    """uint8 (..., H, W, 3) -> normalised float (..., 3, H, W), as torchvision leaves it:
+    contiguous.
+    """
     mean, std = (torch.tensor(table[kind]) for table in (MEAN, STD))
     return ((pixels.float() / 255.0 - mean) / std).movedim(-1, -3).contiguous()
 
@@ -151,7 +154,10 @@ def main() -> None:
                 answer = {"seconds": seconds}
         except Exception as error:
             answer = {
-                "error": f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
+                "error": (
+                    f"{type(error).__name__}: "
+                    f"{str(error).strip().splitlines()[0] if str(error) else ''}"
+                )
             }
         answers.write(json.dumps(answer) + "\n")
 

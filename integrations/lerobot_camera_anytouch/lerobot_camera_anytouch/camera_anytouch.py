@@ -1,4 +1,6 @@
-"""The tactile camera: LeRobot's OpenCV camera, whose pictures are oriented and background-subtracted, or depth."""
+"""The tactile camera: LeRobot's OpenCV camera, whose pictures are oriented and
+background-subtracted, or depth.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,10 @@ class AnyTouchCamera(Camera):
         return [camera | {"type": "anytouch"} for camera in OpenCVCamera.find_cameras()]
 
     def connect(self, warmup: bool = True) -> None:
-        """Open the camera and read the picture of the untouched gel. Without one it is estimated from the frames."""
+        """Open the camera and read the picture of the untouched gel.
+
+        Without one it is estimated from the frames.
+        """
         self._camera.connect(warmup=warmup)
         self.width = self._camera.width
         self.height = self._camera.height
@@ -82,7 +87,10 @@ class AnyTouchCamera(Camera):
         return self._prepared(self._camera.read_latest(max_age_ms=max_age_ms))
 
     def features(self, max_age_ms: int = 500) -> np.ndarray:
-        """Return the features f32 (E,) of the newest picture. The encoder is loaded at the first call."""
+        """Return the features f32 (E,) of the newest picture.
+
+        The encoder is loaded at the first call.
+        """
         frame = self._newest(max_age_ms)
         return np.asarray(self._encoder.encode_touch(self._ready(frame), self.config.sensor)[0])
 

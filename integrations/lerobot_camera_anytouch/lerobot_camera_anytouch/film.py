@@ -1,4 +1,6 @@
-"""A film in the place of LeRobot's OpenCV camera, which reads a film as fast as it can and ends with it."""
+"""A film in the place of LeRobot's OpenCV camera, which reads a film as fast as it can and ends
+with it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,10 @@ from anytouch_jax.view.live import LoopedFilm
 
 
 class FilmCamera:
-    """A film at its frame rate, again and again, with the methods of a camera of LeRobot. Pictures are RGB."""
+    """A film at its frame rate, again and again, with the methods of a camera of LeRobot.
+
+    Pictures are RGB.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -77,8 +77,8 @@ COMMANDS = {
 def console() -> int:
     """Run the `anytouch` command.
 
-    This silences XLA's C++ log: jaxlib 0.10.1 logs a spurious error for each program that it reads from the cache.
-    Set TF_CPP_MIN_LOG_LEVEL to see it.
+    This silences XLA's C++ log: jaxlib 0.10.1 logs a spurious error for each program that it reads
+    from the cache. Set TF_CPP_MIN_LOG_LEVEL to see it.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     return main()
@@ -112,7 +112,10 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def guarded(program: str, run: Callable[[], int]) -> int:
-    """Call `run` and return its exit status. `program` begins the sentence of an error; a bug keeps its traceback."""
+    """Call `run` and return its exit status.
+
+    `program` begins the sentence of an error; a bug keeps its traceback.
+    """
     status = 2
     try:
         with warnings.catch_warnings():
@@ -153,7 +156,9 @@ def guarded(program: str, run: Callable[[], int]) -> int:
 
 
 def _missing_devices() -> UserError | None:
-    """Return the error of a JAX_PLATFORMS that jax cannot use, which it raises as one of many types; None otherwise."""
+    """Return the error of a JAX_PLATFORMS that jax cannot use, which it raises as one of many
+    types; None otherwise.
+    """
     platforms = os.environ.get("JAX_PLATFORMS", "")
     jax = sys.modules.get("jax")
     if platforms in ("", "cpu") or jax is None:
@@ -162,7 +167,8 @@ def _missing_devices() -> UserError | None:
         jax.devices()
     except Exception:
         return UserError(
-            f"JAX_PLATFORMS is {platforms!r}, which jax cannot use here: unset it, or install jax for it"
+            f"JAX_PLATFORMS is {platforms!r}, which jax cannot use here: unset it, or install jax "
+            "for it"
         )
     return None
 
@@ -170,7 +176,9 @@ def _missing_devices() -> UserError | None:
 def _show_warning(
     default: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any
 ) -> None:
-    """Print a UserWarning of the library as a sentence, without the line of code that Python shows."""
+    """Print a UserWarning of the library as a sentence, without the line of code that Python
+    shows.
+    """
     if category is UserWarning:
         print(shorten(str(message)), file=sys.stderr)
     else:

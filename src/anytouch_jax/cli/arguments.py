@@ -1,4 +1,6 @@
-"""Command-line arguments: from argv to one frozen record of options, and one sentence for a mistake in them."""
+"""Command-line arguments: from argv to one frozen record of options, and one sentence for a mistake
+in them.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from anytouch_jax.errors import UserError
 # the encoder of commands without --model; `weights.registry` has its files
 DEFAULT = "anytouch-tiny"
 
-# Old names of commands, and of options: each applies to a command without an option of the old name.
+# Old names of commands, and of options: each applies to a command without an option of the old
+# name.
 RENAMED = {
     **{
         name: f"anytouch data {name}"
@@ -58,8 +61,8 @@ def parse_options(
 ) -> Any:
     """Return the record `kind` of the options in `args`.
 
-    `others` are options of the command that are parsed elsewhere. Raises UserError for words that are no options, for
-    values of another type or out of their range, and SystemExit after --help.
+    `others` are options of the command that are parsed elsewhere. Raises UserError for words that
+    are no options, for values of another type or out of their range, and SystemExit after --help.
     """
     import tyro
 
@@ -127,7 +130,9 @@ def _refuse_renamed(kind: Any, args: Sequence[str]) -> None:
 
 
 class Option(NamedTuple):
-    """An option `--name`, or a positional NAME, with values of the types `kinds`, again and again if it is a list."""
+    """An option `--name`, or a positional NAME, with values of the types `kinds`, again and again
+    if it is a list.
+    """
 
     name: str
     kinds: tuple[Any, ...]
@@ -154,7 +159,9 @@ def option_of(arg: str) -> str:
 
 
 def options_of(kind: Any, default: Any = None, prefix: str = "") -> Iterator[Option]:
-    """Yield the options of a record, of a section as section.name; a part that `default` lacks has none."""
+    """Yield the options of a record, of a section as section.name; a part that `default` lacks has
+    none.
+    """
     from tyro.conf import Positional
 
     hints = get_type_hints(kind, include_extras=True)
@@ -187,7 +194,9 @@ def check_words(
     args: Sequence[str],
     others: Mapping[str, str] = types.MappingProxyType({}),
 ) -> None:
-    """Raise UserError for words `args` that are no options (`others` are elsewhere), and for values that are unfit."""
+    """Raise UserError for words `args` that are no options (`others` are elsewhere), and for values
+    that are unfit.
+    """
     advice = f"see anytouch {command} --help"
     named = {option.name: option for option in options if not option.is_positional}
     for option in options:
@@ -292,7 +301,8 @@ def _check_values(option: Option, name: str, values: Sequence[str], advice: str)
                 near = get_close_matches(value, choices, 1)
                 hint = f": did you mean {near[0]}?" if near else ""
                 raise UserError(
-                    f"{name} takes {', '.join(choices[:-1])} or {choices[-1]}, not {value[:60]!r}{hint}"
+                    f"{name} takes {', '.join(choices[:-1])} or {choices[-1]}, not "
+                    f"{value[:60]!r}{hint}"
                 )
         elif kind in _TAKES:
             try:

@@ -1,4 +1,6 @@
-"""`anytouch data`: manifests made from data sets or simulated, marked, checked, captioned and packed."""
+"""`anytouch data`: manifests made from data sets or simulated, marked, checked, captioned and
+packed.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ if TYPE_CHECKING:
 class SimulateOptions:
     """Simulate touches felt by several sensors, with photographs, captions, forces and slip.
 
-    Example: anytouch data simulate --out data/scenes --touches 400 --sensors gelsight_mini digit --seed 0
+    Example: anytouch data simulate --out data/scenes --touches 400 --sensors gelsight_mini digit
+    --seed 0
 
     Run the same command again to continue after an interruption.
     """
@@ -47,7 +50,9 @@ class SimulateOptions:
     out: Path  # Folder for images and manifest.parquet.
     touches: Count[int] = 400  # Number of places to touch. Every sensor feels each place once.
     sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
-    """Sensors: gelsight, gelsight_mini, gelslim, digit, 9dtact, duragel, tac3d (a force field), or your NAME.sensor."""
+    """Sensors: gelsight, gelsight_mini, gelslim, digit, 9dtact, duragel, tac3d (a force field), or
+    your NAME.sensor.
+    """
     seed: Seed = 0  # Random seed.
     grade: Literal["fine", "coarse"] = "fine"
     """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""
@@ -67,7 +72,9 @@ class SimulateOptions:
     # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
     size: NotNegative[int] = 224
     units: Literal["each", "one"] = "each"
-    """each simulates a new device for every recording; one uses one device of each sensor, mounted straight."""
+    """each simulates a new device for every recording; one uses one device of each sensor, mounted
+    straight.
+    """
     threads: Threads = 2  # Threads that render photographs and write files.
 
 
@@ -83,7 +90,8 @@ def run_simulate(options: SimulateOptions) -> int:
     )
     if missing := _missing_splits(scenes):
         output.log(
-            f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or more."
+            f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or "
+            "more."
         )
     last = -1
     with bar(options.touches, "touches") as advance, _exit_on_interrupt():
@@ -92,7 +100,8 @@ def run_simulate(options: SimulateOptions) -> int:
             nonlocal last
             if last < 0 and done < of:
                 output.log(
-                    f"compiling the contact solver for {', '.join(scenes.sensors)}: about a minute at first"
+                    f"compiling the contact solver for {', '.join(scenes.sensors)}: about a minute "
+                    "at first"
                 )
             elif not sys.stderr.isatty() and 10 * done // of > 10 * last // of:
                 output.log(f"{done} of {of} touches")
@@ -108,7 +117,9 @@ def run_simulate(options: SimulateOptions) -> int:
 
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
-    """Exit at once on Ctrl-C: a thread that compiles would not react for a minute, and files are written atomically."""
+    """Exit at once on Ctrl-C: a thread that compiles would not react for a minute, and files are
+    written atomically.
+    """
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.default_int_handler:  # ignored, as in a script's background
         yield
@@ -164,10 +175,12 @@ class DatasetOptions:
 
     Example: anytouch data index ycb_slide ~/data/YCB-Slide --out ~/data/YCB-Slide/ycb_slide.parquet
 
-    Datasets: touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi, tacquad, feel,
-    objectfolder, real_touch, taxim_presses, gelsight_mini_pretrain, fota, tacbench_force, tacbench_pose, touchd_force,
-    freetacman, webdataset, lerobot, bags, recordings. Use recordings for your data: a folder of pictures for each
-    recording, as OBJECT/RECORDING/0.png. Put background.png, photo.jpg and caption.txt there or in a folder above.
+    Datasets: touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi,
+    tacquad, feel, objectfolder, real_touch, taxim_presses, gelsight_mini_pretrain, fota,
+    tacbench_force, tacbench_pose, touchd_force, freetacman, webdataset, lerobot, bags, recordings.
+    Use recordings for your data: a folder of pictures for each recording, as
+    OBJECT/RECORDING/0.png. Put background.png, photo.jpg and caption.txt there or in a folder
+    above.
     """
 
     name: Positional[str]  # Name of the dataset.
@@ -187,24 +200,33 @@ class DatasetOptions:
     # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
     export: bool = False
     sensor: str | None = None
-    """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new name."""
+    """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new
+    name.
+    """
     split_by: str | None = None
-    """recordings: what is held out: object, recording (a single picture is one), a column of the labels, or the part of
-    the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default: object. For single pictures: recording."""
+    """recordings: what is held out: object, recording (a single picture is one), a column of the
+    labels, or the part of the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default:
+    object. For single pictures: recording.
+    """
     # recordings: every picture is a touch alone. By default names decide, and a few pictures.
     singles: bool = False
     films: bool = False  # recordings: every folder of pictures is a film.
     # recordings: order frames by their names, or by the times of the files.
     order: Literal["names", "times"] = "names"
     labels: Path | None = None
-    """recordings: CSV table with a column object, sequence or both. Each other column becomes label.NAME, but unit,
-    touch and text keep their names."""
+    """recordings: CSV table with a column object, sequence or both. Each other column becomes
+    label.NAME, but unit, touch and text keep their names.
+    """
     # gelsight_mini_pretrain, fota, webdataset: address of the shards, as s3://BUCKET/FOLDER.
     url: str | None = None
     keys: tuple[str, ...] = ()
-    """lerobot, freetacman: tactile cameras. bags: topics of tactile images. webdataset: fields, as left.jpg."""
+    """lerobot, freetacman: tactile cameras. bags: topics of tactile images. webdataset: fields, as
+    left.jpg.
+    """
     values: tuple[str, ...] = ()
-    """lerobot: features that become labels. bags: labels from other topics, as force_z=/ft:wrench.force.z."""
+    """lerobot: features that become labels. bags: labels from other topics, as
+    force_z=/ft:wrench.force.z.
+    """
 
 
 def run_index(options: DatasetOptions) -> int:
@@ -228,10 +250,12 @@ def run_index(options: DatasetOptions) -> int:
 class ContactOptions:
     """Mark the frames in contact by their difference from the untouched gel, without markers.
 
-    Example: anytouch data contact ycb_slide.parquet --drop --out ycb_touched.parquet --picture contact.png
+    Example: anytouch data contact ycb_slide.parquet --drop --out ycb_touched.parquet --picture
+    contact.png
 
-    The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown. Pictures of the
-    untouched gel that had to be estimated are stored next to it, as the background_path of their rows.
+    The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown.
+    Pictures of the untouched gel that had to be estimated are stored next to it, as the
+    background_path of their rows.
     """
 
     manifest: Positional[Path]  # Manifest to mark (.csv, .parquet).
@@ -241,10 +265,13 @@ class ContactOptions:
     threshold: NotNegative[tuple[tuple[str, float], ...]] = ()
     """Contact threshold of the score by sensor, as in: digit 5 gelsight 7."""
     background: tuple[str, ...] = ()
-    """Picture of the untouched gel for recordings without one: FILE for all, or UNIT=FILE for each sensor unit."""
+    """Picture of the untouched gel for recordings without one: FILE for all, or UNIT=FILE for each
+    sensor unit.
+    """
     share: Share = 0.0
-    """Also require this share (0 to 1) of the highest score of the recording. This removes the start and end of a
-    contact. --picture and --check ignore it."""
+    """Also require this share (0 to 1) of the highest score of the recording. This removes the
+    start and end of a contact. --picture and --check ignore it.
+    """
     # PNG of kept and dropped frames by score. Look at it before you trust a threshold.
     picture: Path | None = None
     # Print precision and recall against a reference column. Writes a manifest only with --out.
@@ -257,7 +284,9 @@ class ContactOptions:
 
 
 def run_contact(options: ContactOptions) -> int:
-    """Score every frame, then write the marked manifest, the picture, or the comparison with a column."""
+    """Score every frame, then write the marked manifest, the picture, or the comparison with a
+    column.
+    """
     import numpy as np
 
     from anytouch_jax.data.manifest import manifest as manifests
@@ -298,7 +327,8 @@ def run_contact(options: ContactOptions) -> int:
         folder = target.with_name(f"{target.stem}_backgrounds")
         manifest = contact.store_backgrounds(manifest, scores, folder)
         output.log(
-            f"{folder}: {len(scores.gels)} pictures of the untouched gel, now the background_path of their rows"
+            f"{folder}: {len(scores.gels)} pictures of the untouched gel, now the background_path "
+            "of their rows"
         )
     share = options.share
     drop = options.drop
@@ -320,23 +350,28 @@ def run_contact(options: ContactOptions) -> int:
         output.log(f"{picture}: kept and dropped frames")
     if target is not None:
         print(
-            f"{output.write_new(marked, target)}: {len(marked):,} rows, with label.contact_score and label.contact"
+            f"{output.write_new(marked, target)}: {len(marked):,} rows, with label.contact_score "
+            "and label.contact"
         )
     return 0
 
 
 @dataclass(frozen=True)
 class VerifyOptions:
-    """Check manifests and their files: missing, broken, repeated, swapped, or leaking between splits.
+    """Check manifests and their files: missing, broken, repeated, swapped, or leaking between
+    splits.
 
     Example: anytouch data verify touch.parquet --repair touch_clean.parquet
 
-    Exits with 1 if there are errors, or errors that --repair could not remove. Ends with the licences of the data.
+    Exits with 1 if there are errors, or errors that --repair could not remove. Ends with the
+    licences of the data.
     """
 
     manifests: Positional[tuple[Path, ...]]  # Manifests to check together (.csv, .parquet).
     repair: Path | None = None
-    """Write a repaired copy: without unusable rows and files and repeated rows, with swapped folders exchanged."""
+    """Write a repaired copy: without unusable rows and files and repeated rows, with swapped
+    folders exchanged.
+    """
     # Write a copy with rows that certainly allow commercial use, after --repair.
     commercial_only: Path | None = None
     # With --repair: exchange touch image and photograph in these datasets. Look first.
@@ -389,7 +424,8 @@ def run_verify(options: VerifyOptions) -> int:
         commercial = verify.commercial_only(manifest)
         target = output.write_new(commercial.manifest, options.commercial_only)
         print(
-            f"{target}: {len(commercial.manifest):,} rows, without {commercial.non_commercial:,} non-commercial rows "
+            f"{target}: {len(commercial.manifest):,} rows, without {commercial.non_commercial:,} "
+            "non-commercial rows "
             f"and {commercial.unknown:,} rows of unknown licence"
         )
     if errors:
@@ -403,8 +439,9 @@ class AnnotateOptions:
 
     Example: anytouch data annotate tacquad.parquet --vlm gpt-4o --limit 20 --sheet look.html
 
-    Prints an estimate of the cost and asks before it starts. The key comes from the environment and is never stored.
-    Run the same command again to continue: answers are kept. Exits with 1 if a caption is missing.
+    Prints an estimate of the cost and asks before it starts. The key comes from the environment and
+    is never stored. Run the same command again to continue: answers are kept. Exits with 1 if a
+    caption is missing.
     """
 
     manifest: Positional[Path]  # Manifest with photographs or phrases (.csv, .parquet).
@@ -422,7 +459,9 @@ class AnnotateOptions:
     price_out: NotNegative[float | None] = None  # Price of a million output tokens.
     limit: Count[int | None] = None  # Number of captions to ask for, to look at a sample first.
     captions: Path | None = None
-    """Read captions from this table (.csv, .parquet) with a key column and `text`, and ask no model."""
+    """Read captions from this table (.csv, .parquet) with a key column and `text`, and ask no
+    model.
+    """
     # Column that joins --captions and the manifest: caption_id, sequence, object, path, ...
     key: str | None = None
     sheet: Path | None = None  # HTML page of captions with their pictures, to check by eye.
@@ -478,7 +517,8 @@ def run_annotate(options: AnnotateOptions) -> int:
             output.log(note)
         count = int(captioned.present("text").sum())
         print(
-            f"{output.write_new(captioned, target)}: {count:,} of {len(captioned):,} rows have a caption"
+            f"{output.write_new(captioned, target)}: {count:,} of {len(captioned):,} rows have a "
+            "caption"
         )
         return 0
     annotated = annotate(
@@ -526,7 +566,8 @@ def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:
         return True
     if not sys.stdin.isatty():
         raise UserError(
-            "There is no terminal to confirm on. Add --yes, or --estimate to print the estimate only."
+            "There is no terminal to confirm on. Add --yes, or --estimate to print the estimate "
+            "only."
         )
     try:
         return input("Ask now? [y/N] ").strip().lower() in ("y", "yes")
@@ -536,13 +577,15 @@ def _confirm(options: AnnotateOptions, estimate: CostEstimate) -> bool:
 
 def _print_summary(annotated: CaptionResult) -> None:
     print(
-        f"{annotated.requests:,} questions, {annotated.tokens_in:,} tokens in, {annotated.tokens_out:,} tokens out"
+        f"{annotated.requests:,} questions, {annotated.tokens_in:,} tokens in, "
+        f"{annotated.tokens_out:,} tokens out"
     )
     for reason, count in annotated.left_out.items():
         print(f"left out, {reason}: {count:,} rows")
     for failure in annotated.failures[:5]:
         output.log(
-            f"no caption for {failure.where} and the {failure.rows} rows of its touch: {failure.reason}"
+            f"no caption for {failure.where} and the {failure.rows} rows of its touch: "
+            f"{failure.reason}"
         )
     if len(annotated.failures) > 5:
         output.log(f"and {len(annotated.failures) - 5} more, listed in failures.jsonl")
@@ -550,7 +593,8 @@ def _print_summary(annotated: CaptionResult) -> None:
 
 @dataclass(frozen=True)
 class PackOptions:
-    """Store millions of small files in a few ZIP shards, from which training reads the same batches.
+    """Store millions of small files in a few ZIP shards, from which training reads the same
+    batches.
 
     Example: anytouch data pack touch.parquet --out packed
 
@@ -579,6 +623,7 @@ def run_pack(options: PackOptions) -> int:
         log=output.log,
     )
     print(
-        f"{target}: {len(manifest):,} rows. Train on it as on any manifest. Check a copy with sha256sum -c SHA256SUMS."
+        f"{target}: {len(manifest):,} rows. Train on it as on any manifest. Check a copy with "
+        "sha256sum -c SHA256SUMS."
     )
     return 0

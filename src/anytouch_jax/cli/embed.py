@@ -38,7 +38,9 @@ class SensorOptions:
     # Turn the frames clockwise by so many degrees, before anything else.
     rotate: Literal[0, 90, 180, 270] = 0
     flip: Literal["none", "across", "down"] = "none"
-    """Mirror the frames after that: across exchanges left and right, down exchanges top and bottom."""
+    """Mirror the frames after that: across exchanges left and right, down exchanges top and
+    bottom.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,16 +50,20 @@ class FrameOptions(SensorOptions):
     # Frames of a touch: 1 for stills, 3 or more for clips (in segments of three).
     frames: Count[int] = 1
     pooling: Literal["class", "mean", "both"] | None = None
-    """Features: the class token, the mean of the patch tokens, or both (default: that of --head, else class)."""
+    """Features: the class token, the mean of the patch tokens, or both (default: that of --head,
+    else class).
+    """
     join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a long clip are joined.
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """Arithmetic: that of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     engine: Literal["auto", "xla", "onnxruntime", "openvino"] = "auto"
-    """What computes the features: onnxruntime if it is installed (extra engines) and exact on this machine, else xla.
-    An export is made for it once."""
+    """What computes the features: onnxruntime if it is installed (extra engines) and exact on this
+    machine, else xla. An export is made for it once.
+    """
     head: Path | None = None
-    """Also predict the class with this head of `anytouch probe label --save`: its label, probability p, conformal set
-    and whether the touch is novel."""
+    """Also predict the class with this head of `anytouch probe label --save`: its label,
+    probability p, conformal set and whether the touch is novel.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,13 +115,17 @@ def run(options: EmbedOptions) -> int:
         log(line)
     skipped = f", {features.skipped} skipped" if features.skipped else ""
     print(
-        f"{options.out}: {len(features.values)} features of {features.values.shape[1]} values{skipped}"
+        f"{options.out}: {len(features.values)} features of {features.values.shape[1]} "
+        f"values{skipped}"
     )
     return 0
 
 
 def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequence[str]) -> bool:
-    """Return whether --data names manifests; else it is one folder, picture or video. Raises UserError."""
+    """Return whether --data names manifests; else it is one folder, picture or video.
+
+    Raises UserError.
+    """
     if all(path.suffix.lower() in (".csv", ".parquet") for path in data):
         per_row = ("sensor", "background", "rotate", "flip")
         refuse_unused(
@@ -137,7 +147,10 @@ def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequen
 def load_inputs(
     options: FrameOptions,
 ) -> tuple[Encoder, Literal["class", "mean", "both"], LinearHead | None]:
-    """Return the encoder, the pooling and the head that `options` name. Raises UserError if they do not fit."""
+    """Return the encoder, the pooling and the head that `options` name.
+
+    Raises UserError if they do not fit.
+    """
     from anytouch_jax.encoder.encoder import check_frames, load_encoder
     from anytouch_jax.encoder.linear_head import load_head
     from anytouch_jax.train.mesh import enable_compilation_cache
@@ -165,7 +178,9 @@ def save_features(
     options: FrameOptions,
     about: dict[str, str],
 ) -> None:
-    """Write features to `out`, with what a `head` predicts, and metadata; log a sensor that is not the one named."""
+    """Write features to `out`, with what a `head` predicts, and metadata; log a sensor that is not
+    the one named.
+    """
     from anytouch_jax.encoder.embed import save_npz
 
     if head is not None and len(features.values):
@@ -189,7 +204,9 @@ def save_features(
 
 
 def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the arrays that a head adds to features: label, p, and of a calibrated head set, classes and novelty."""
+    """Return the arrays that a head adds to features: label, p, and of a calibrated head set,
+    classes and novelty.
+    """
     if head.calibration is None:
         label, p = head(values)
         return {"label": label, "p": p.max(1)}
@@ -206,7 +223,10 @@ def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
 def frames_input(
     encoder: Encoder, options: SensorOptions, data: Path, known: Mapping[str, np.ndarray]
 ) -> tuple[int, Preprocess, ContactGate, dict[str, str]]:
-    """Return sensor row, preprocessing, gate and metadata of frames, with a head's `known` gels. It logs the gel."""
+    """Return sensor row, preprocessing, gate and metadata of frames, with a head's `known` gels.
+
+    It logs the gel.
+    """
     from anytouch_jax.data.gels import as_taken
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.linear_head import ContactGate
@@ -215,7 +235,8 @@ def frames_input(
     sensor = options.sensor or UNIVERSAL
     if options.background is not None and not encoder.subtracts:
         log(
-            "--background only decides contact: this encoder was trained on frames without background subtraction"
+            "--background only decides contact: this encoder was trained on frames without "
+            "background subtraction"
         )
     known = {name: as_taken(gel, options.rotate, options.flip) for name, gel in known.items()}
     picture, background = choose_gel(encoder, options.background, data, known)
@@ -234,10 +255,12 @@ def frames_input(
 def choose_gel(
     encoder: Encoder, named: Path | None, data: Path, known: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray | None, str]:
-    """Return the untouched gel of a folder, a video, a picture or a camera, and what it is, which is logged.
+    """Return the untouched gel of a folder, a video, a picture or a camera, and what it is, which
+    is logged.
 
-    It is the picture that the user named, that of the unit among the `known` ones, that of the folder, or the median of
-    the frames. It is None for a camera, and for an encoder that does without. Raises UserError for too few frames.
+    It is the picture that the user named, that of the unit among the `known` ones, that of the
+    folder, or the median of the frames. It is None for a camera, and for an encoder that does
+    without. Raises UserError for too few frames.
     """
     from anytouch_jax.data import gels
     from anytouch_jax.data.images import BACKGROUND, decode, list_images
@@ -266,8 +289,10 @@ def choose_gel(
             what = str(stored) if stored else f"estimated from {count} frames of {data}"
         elif encoder.needs_background:
             raise UserError(
-                f"{data} has too few frames to estimate the untouched gel, which is subtracted. Give {gels.FEWEST} or "
-                "more, or a picture of the gel with nothing on it: --background, or background.png next to the frames."
+                f"{data} has too few frames to estimate the untouched gel, which is subtracted. "
+                f"Give {gels.FEWEST} or "
+                "more, or a picture of the gel with nothing on it: --background, or background.png "
+                "next to the frames."
             )
     if encoder.subtracts:
         log(f"untouched gel: {what}")
@@ -275,7 +300,10 @@ def choose_gel(
 
 
 def _some_frames(data: Path) -> Iterator[np.ndarray]:
-    """Yield evenly spread frames of a folder, all frames of a video, or a picture. Broken ones are left out."""
+    """Yield evenly spread frames of a folder, all frames of a video, or a picture.
+
+    Broken ones are left out.
+    """
     from contextlib import suppress
 
     from anytouch_jax.data import images
@@ -313,7 +341,8 @@ def log_if_cut(video: Path, count: int) -> None:
     reported = count_frames(video)
     if 0.98 * reported > count + 2:  # some containers only estimate it
         log(
-            f"{video} reports {reported} frames and {count} could be read. The file may be incomplete."
+            f"{video} reports {reported} frames and {count} could be read. The file may be "
+            "incomplete."
         )
 
 
@@ -359,7 +388,9 @@ def _embed_manifest(
 
 
 def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray:
-    """Return those of `rows` that have images and end a clip of `frames` frames; log how many others there are."""
+    """Return those of `rows` that have images and end a clip of `frames` frames; log how many
+    others there are.
+    """
     import numpy as np
 
     fields = np.isin(manifest.text_column("sensor")[rows], FIELD_SENSORS)
@@ -369,7 +400,8 @@ def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray
     usable = rows if frames == 1 else np.intersect1d(rows, manifest.clips(frames)[:, -1])
     if len(usable) < len(rows):
         log(
-            f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {frames} frames and are left out"
+            f"{len(rows) - len(usable)} of {len(rows)} rows end no clip of {frames} frames and are "
+            "left out"
         )
     return usable
 
@@ -391,14 +423,18 @@ def contact_of_rows(
 
 
 def _write_columns(root: Path, column: str, features: Features) -> None:
-    """Write features into a LeRobot data set, a column for each camera. Raises UserError for another manifest."""
+    """Write features into a LeRobot data set, a column for each camera.
+
+    Raises UserError for another manifest.
+    """
     import numpy as np
 
     from anytouch_jax.data.readers.lerobot import camera_names, write_features
 
     if "index" not in features.keys or not (root / "meta" / "info.json").is_file():
         raise UserError(
-            f"--column is for a manifest that `data index lerobot` wrote into the data set, not in {root}"
+            "--column is for a manifest that `data index lerobot` wrote into the data set, not in "
+            f"{root}"
         )
     unit = features.keys["unit"]
     numbers = features.keys["index"]
@@ -460,8 +496,9 @@ def numbered_frames(
 ) -> Iterator[tuple[int, str, np.ndarray | None]]:
     """Yield number, name and RGB u8 pixels of each frame; the frames of a video have no names.
 
-    A folder's pictures come in natural order. A picture that cannot be read is None if bad samples are skipped, and the
-    first are logged. The time stamps of a video's frames are appended to `times`.
+    A folder's pictures come in natural order. A picture that cannot be read is None if bad samples
+    are skipped, and the first are logged. The time stamps of a video's frames are appended to
+    `times`.
     """
     from anytouch_jax.data import images
     from anytouch_jax.data.loading.samples import NAMED

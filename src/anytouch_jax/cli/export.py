@@ -38,21 +38,25 @@ class ExportOptions:
 
     Example: anytouch export --model runs/stage2 --out encoder.bin --frames 3
 
-    The first two take uint8 frames and sensor rows, and return features. OUT.json describes how to call them. They are
-    compared with the live model before they are written.
-    Example: anytouch export --to onnx --out encoder.onnx --int8 --data manifest.parquet
-    Example: anytouch export --to safetensors --model runs/stage2 --out weights.safetensors
+    The first two take uint8 frames and sensor rows, and return features. OUT.json describes how to
+    call them. They are compared with the live model before they are written. Example: anytouch
+    export --to onnx --out encoder.onnx --int8 --data manifest.parquet Example: anytouch export --to
+    safetensors --model runs/stage2 --out weights.safetensors
     """
 
     model: Path  # Run folder or weights file (.pth, .safetensors).
     out: Path | None = None  # The file to write. Weights must end in .safetensors, ONNX in .onnx.
     card: Path | None = None
-    """Write a folder to upload instead: config.json, model.safetensors as float16, and README.md, the model card."""
+    """Write a folder to upload instead: config.json, model.safetensors as float16, and README.md,
+    the model card.
+    """
     # Markdown for the card: the data with their licences, results, limits.
     notes: Path | None = None
     to: Literal["jax", "onnx", "safetensors", "release"] = "jax"
-    """jax: the touch encoder as a program. onnx: the same for onnxruntime and OpenVINO. safetensors: all weights
-    by this package's names. release: weights by the names of the authors' files."""
+    """jax: the touch encoder as a program. onnx: the same for onnxruntime and OpenVINO.
+    safetensors: all weights by this package's names. release: weights by the names of the authors'
+    files.
+    """
     int8: bool = False  # onnx: integer products of 8 bits, calibrated on 200 touches of --data.
     # onnx: also the outputs of depth, shear, contact and force, see OUT.json.
     fields: bool = False
@@ -92,7 +96,8 @@ def run(options: ExportOptions) -> int:
     refuse_unused(options, ("between", "share", *foreign), f"with --to {options.to}")
     if options.int8 != bool(options.data):
         raise UserError(
-            "--int8 is calibrated on the touches of manifests: give both --int8 and --data, or neither."
+            "--int8 is calibrated on the touches of manifests: give both --int8 and --data, or "
+            "neither."
         )
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.export import describes, export
@@ -112,10 +117,12 @@ def run(options: ExportOptions) -> int:
         **{name: getattr(options, name) for name in names},
     )
     print(
-        f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; {about['input']}"
+        f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; "
+        f"{about['input']}"
     )
     print(
-        f"largest difference from the live model: {about['worst_difference']:.1e} of the largest feature"
+        f"largest difference from the live model: {about['worst_difference']:.1e} of the largest "
+        "feature"
     )
     if options.int8:
         print(
@@ -128,7 +135,9 @@ def run(options: ExportOptions) -> int:
 
 
 def _calibration(encoder: Encoder, options: ExportOptions) -> dict[str, Any]:
-    """Return `export`'s touches u8 (200, T, H, W, 3) with sensor rows i32 (200,), evenly spaced, and untouched gels."""
+    """Return `export`'s touches u8 (200, T, H, W, 3) with sensor rows i32 (200,), evenly spaced,
+    and untouched gels.
+    """
     import numpy as np
 
     from anytouch_jax.cli.embed import usable_rows
@@ -216,7 +225,8 @@ def _export_weights(options: ExportOptions) -> int:
         ]
         if differ := differ + ["background"] * (grounds[0] != grounds[1]):
             raise UserError(
-                f"{before} and {source} have different networks ({', '.join(differ)}). --between takes the run that "
+                f"{before} and {source} have different networks ({', '.join(differ)}). --between "
+                "takes the run that "
                 "MODEL was trained from."
             )
         params = tree.interpolate(other.params, params, options.share)
@@ -228,16 +238,19 @@ def _export_weights(options: ExportOptions) -> int:
     else:
         if not {"touch", "decoder"} <= params.keys():
             raise UserError(
-                f"{source} lacks the touch encoder or decoder of the authors' files. Use --to safetensors."
+                f"{source} lacks the touch encoder or decoder of the authors' files. Use --to "
+                "safetensors."
             )
         params, model = _universal_last(params, model)
         if "matcher" in params and model.match_head == "mlp":
             log(
-                "the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the authors' code ignores"
+                "the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the "
+                "authors' code ignores"
             )
         if params.pop("force", None) is not None:
             log(
-                "the force heads are left out: the authors' files have none. Use --to safetensors to keep them."
+                "the force heads are left out: the authors' files have none. Use --to safetensors "
+                "to keep them."
             )
         about |= {safetensors.MODEL_KEY: to_json(model), "format": "pt"}
         arrays = convert.to_release(params, model, allow_extra=True)
@@ -249,7 +262,9 @@ def _export_weights(options: ExportOptions) -> int:
 def _universal_last(
     params: dict[str, Any], model: ModelConfig
 ) -> tuple[dict[str, Any], ModelConfig]:
-    """Return the same model with its universal tokens in the last row, where the authors' code reads them (id -1)."""
+    """Return the same model with its universal tokens in the last row, where the authors' code
+    reads them (id -1).
+    """
     import numpy as np
 
     from anytouch_jax.weights.convert import match_sensors

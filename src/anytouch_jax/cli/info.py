@@ -25,12 +25,13 @@ _WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Describe an encoder by name, a run, weights, a manifest, features, a head, pictures, a film, or the cameras.
+    """Describe an encoder by name, a run, weights, a manifest, features, a head, pictures, a film,
+    or the cameras.
 
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
 
-    `anytouch info encoders` lists the encoders in the package, and `anytouch info cameras` the connected cameras.
-    `--health` checks every sensor unit of a manifest.
+    `anytouch info encoders` lists the encoders in the package, and `anytouch info cameras` the
+    connected cameras. `--health` checks every sensor unit of a manifest.
     """
 
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
@@ -53,7 +54,10 @@ def run(options: InfoOptions) -> int:
 
 
 def _health(options: InfoOptions) -> int:
-    """Print a table with the checks of every sensor unit, and what to do. Exit status 1 reports a fault."""
+    """Print a table with the checks of every sensor unit, and what to do.
+
+    Exit status 1 reports a fault.
+    """
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import health
     from anytouch_jax.evaluate.statistics import markdown_table
@@ -159,7 +163,10 @@ def _lines(path: Path) -> list[str]:
         return _weights(path, weights)
     if lines := _pictures(path):
         return lines
-    known = f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), features, a head"
+    known = (
+        f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), "
+        "features, a head"
+    )
     raise UserError(f"{path} has no known format. Known are {known}, pictures and films.")
 
 
@@ -205,7 +212,9 @@ def _named(name: str) -> str:
 
 
 def _folder(path: Path) -> list[str]:
-    """Return lines about a run, or about the manifest in the folder: that called manifest, or the first."""
+    """Return lines about a run, or about the manifest in the folder: that called manifest, or the
+    first.
+    """
     from anytouch_jax.data.images import SUFFIXES
     from anytouch_jax.data.manifest.schema import is_manifest
     from anytouch_jax.weights.checkpoint import steps
@@ -258,8 +267,10 @@ def _run(path: Path) -> list[str]:
         ]
         content = f" (content {metadata['data'][:12]})" if metadata.get("data") else ""
         lines = [
-            f"{path}: a run of stage {config.stage}, step {metadata['step']} of {config.run.steps}{checkpoints}",
-            f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch {config.data.batch_size}",
+            f"{path}: a run of stage {config.stage}, step {metadata['step']} of "
+            f"{config.run.steps}{checkpoints}",
+            f"preset {config.preset}, recipe {config.recipe}, towers {config.towers}, batch "
+            f"{config.data.batch_size}",
             *model,
             f"background: {config.data.background}",
             f"started from {', '.join(starts) or 'random weights'}",
@@ -278,7 +289,8 @@ def _run(path: Path) -> list[str]:
 def _model(model: ModelConfig, *, heads_known: bool = True) -> str:
     heads = f"{model.touch.heads} heads" if heads_known else "heads unknown"
     return (
-        f"touch encoder: width {model.touch.width}, depth {model.touch.depth}, {heads}, images of {model.image_size} "
+        f"touch encoder: width {model.touch.width}, depth {model.touch.depth}, {heads}, images of "
+        f"{model.image_size} "
         f"pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} features"
     )
 
@@ -342,7 +354,8 @@ def _manifest(path: Path) -> list[str]:
     filled = [f"{name} {summary.filled[name]:,}" for name in optional if name in summary.filled]
     labels = [name.removeprefix("label.") for name in summary.filled if name.startswith("label.")]
     return [
-        f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, {summary.clips:,} clips of "
+        f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, "
+        f"{summary.clips:,} clips of "
         "three frames",
         f"splits: {counts('split')}",
         f"sensors: {counts('sensor')}",
@@ -353,7 +366,10 @@ def _manifest(path: Path) -> list[str]:
 
 
 def _arrays(path: Path) -> list[str]:
-    """Return lines about features or a head; [] for another .npz. Raises UserError for a damaged file."""
+    """Return lines about features or a head; [] for another .npz.
+
+    Raises UserError for a damaged file.
+    """
     from anytouch_jax.encoder.arrays import spread_lines
     from anytouch_jax.files import read_arrays
 
@@ -370,7 +386,8 @@ def _arrays(path: Path) -> list[str]:
         head = load_head(path)
         return [
             f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
-            f"for features of {len(head.mean)} with --pooling {head.pooling} --frames {head.frames}, "
+            f"for features of {len(head.mean)} with --pooling {head.pooling} --frames "
+            f"{head.frames}, "
             f"encoder {head.fingerprint}",
             *(head.promises() or ["without calibration: save it again"]),
         ]
@@ -380,7 +397,8 @@ def _arrays(path: Path) -> list[str]:
     rows = arrays["rows"]
     if values.ndim != 2 or values.dtype.kind not in "fiu" or rows.shape != values.shape[:1]:
         raise UserError(
-            f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and {rows.shape}."
+            f"{path} needs numeric features (n, d) and rows (n,), not {values.shape} and "
+            f"{rows.shape}."
         )
     keys = ", ".join(name.removeprefix("key/") for name in arrays if name.startswith("key/"))
     about = {

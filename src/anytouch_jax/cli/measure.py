@@ -1,4 +1,6 @@
-"""`anytouch measure`: depth, shear, contact and force of a manifest, a folder of frames, a picture or a video."""
+"""`anytouch measure`: depth, shear, contact and force of a manifest, a folder of frames, a picture
+or a video.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ class MeasureOptions(embed.SensorOptions):
     # The .npz to write, with maps of every frame. Its numbers go to a .csv of the same name.
     out: Path
     width_mm: Above0[float | None] = None
-    """What the width of the picture shows, in mm. Known sensors need none. For others lengths are else shares of it."""
+    """What the width of the picture shows, in mm. Known sensors need none. For others lengths are
+    else shares of it.
+    """
     split: str | None = None  # Only this split of a manifest.
     film: Path | None = None  # Film of the frames with depth, shear and force (.mp4, .avi).
     ply: Path | None = None  # Surface of the deepest frame, a mesh in mm (.ply).
@@ -135,7 +139,10 @@ def run(options: MeasureOptions) -> int:
 def _measured(
     encoder: Encoder, touches: Iterator[_Touch], width_mm: float | None
 ) -> Iterator[tuple[tuple[_Touch, ...], Fields]]:
-    """Yield touches of one sensor, background and size in batches, and their fields. Each warning is logged once."""
+    """Yield touches of one sensor, background and size in batches, and their fields.
+
+    Each warning is logged once.
+    """
     import numpy as np
 
     logged = set[str]()
@@ -191,7 +198,10 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
 
 
 def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
-    """Yield the rows of manifests that have images. Before the first frame of a sequence nothing moved."""
+    """Yield the rows of manifests that have images.
+
+    Before the first frame of a sequence nothing moved.
+    """
     import numpy as np
 
     from anytouch_jax.data.gels import UnitGels

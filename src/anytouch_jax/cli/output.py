@@ -41,17 +41,22 @@ def log_default(models: Sequence[Path]) -> None:
 
 
 def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:
-    """Raise UserError for those of the options `names` that were changed; `reason` ends "has no effect"."""
+    """Raise UserError for those of the options `names` that were changed; `reason` ends "has no
+    effect".
+    """
     defaults = {field.name: field.default for field in fields(options)}
     changed = [spelled(name) for name in names if getattr(options, name) != defaults[name]]
     if changed:
         raise UserError(
-            f"{', '.join(changed)} {'has' if len(changed) == 1 else 'have'} no effect {reason}. Remove it."
+            f"{', '.join(changed)} {'has' if len(changed) == 1 else 'have'} no effect {reason}. "
+            "Remove it."
         )
 
 
 def refuse_join(options: Any, segment: int) -> None:
-    """Raise UserError for --join where a touch of `options.frames` frames is one segment, of `segment` at most."""
+    """Raise UserError for --join where a touch of `options.frames` frames is one segment, of
+    `segment` at most.
+    """
     if (options.frames or 1) <= segment:
         refuse_unused(
             options, ("join",), f"on touches of up to {segment} frames, which have one segment"
@@ -66,7 +71,10 @@ def default_target(manifest: Path, word: str, suffix: str | None = None) -> Path
 
 
 def check_new(manifest: Manifest, path: Path) -> Path:
-    """Return the absolute path of a manifest that `write_new` can write. Raises UserError before long work."""
+    """Return the absolute path of a manifest that `write_new` can write.
+
+    Raises UserError before long work.
+    """
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.manifest.schema import is_manifest
 
@@ -81,7 +89,10 @@ def check_new(manifest: Manifest, path: Path) -> Path:
 
 
 def write_new(manifest: Manifest, path: Path) -> Path:
-    """Write `manifest` atomically to `path`. Raises UserError for one of the files that it was read from."""
+    """Write `manifest` atomically to `path`.
+
+    Raises UserError for one of the files that it was read from.
+    """
     from anytouch_jax.data.manifest import manifest as manifests
 
     target = check_new(manifest, path)
@@ -92,10 +103,11 @@ def write_new(manifest: Manifest, path: Path) -> Path:
 def check_folder(
     path: Path | None, option: str = "--out", *, read: Iterable[str | Path] = (), suffix: str = ""
 ) -> None:
-    """Make the folder of a file that will be written after long work, if there is one; `option` named it.
+    """Make the folder of a file that will be written after long work, if there is one; `option`
+    named it.
 
-    Raises UserError for a folder that cannot be made, and for a name that does not end in `suffix`. So it does for a
-    `path` that is a folder, a device or one of the files that are `read`.
+    Raises UserError for a folder that cannot be made, and for a name that does not end in `suffix`.
+    So it does for a `path` that is a folder, a device or one of the files that are `read`.
     """
     if path is None:
         return
@@ -119,7 +131,9 @@ def check_folder(
 
 
 def check_home(folder: Path, option: str = "--out") -> None:
-    """Check a folder that will be filled after long work: its parents are made, the folder itself is not."""
+    """Check a folder that will be filled after long work: its parents are made, the folder itself
+    is not.
+    """
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder. Choose another {option}.")
     check_folder(folder / "file" if folder.is_dir() else folder, option)
@@ -133,5 +147,6 @@ def check_apart(**outputs: Path | None) -> None:
             other = options.setdefault(path.expanduser().resolve(), name)
             if other != name:
                 raise UserError(
-                    f"{spelled(other)} and {spelled(name)} name the same file. Give each another name."
+                    f"{spelled(other)} and {spelled(name)} name the same file. Give each another "
+                    "name."
                 )

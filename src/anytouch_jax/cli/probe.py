@@ -1,4 +1,6 @@
-"""`anytouch probe`: simple heads on frozen features, for a label column, for tasks, or as a public benchmark."""
+"""`anytouch probe`: simple heads on frozen features, for a label column, for tasks, or as a public
+benchmark.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,13 @@ class ProbeOptions:
 
     data: tuple[Path, ...]  # Manifests to probe on.
     model: tuple[Path, ...] = ()
-    """Encoders to compare: names, run folders or weights files (default: anytouch-tiny, without --features)."""
+    """Encoders to compare: names, run folders or weights files (default: anytouch-tiny, without
+    --features).
+    """
     features: tuple[Path, ...] = ()
-    """Features of other encoders to compare: .npz with features (n, d) and rows (n,), as embed writes it."""
+    """Features of other encoders to compare: .npz with features (n, d) and rows (n,), as embed
+    writes it.
+    """
     controls: bool = True  # Also probe raw pixels and a random encoder.
     out: Path | None = None  # Write the results as JSON.
 
@@ -41,16 +47,20 @@ class LabelOptions(ProbeOptions):
 
     Example: anytouch probe label --model runs/stage1 --data manifest.csv --label object
 
-    Use --where label.contact_score 7 for firm touches only, after `anytouch data contact`. The penalty is chosen on
-    split val, or by grouped cross-validation inside train. The report is on split test.
+    Use --where label.contact_score 7 for firm touches only, after `anytouch data contact`. The
+    penalty is chosen on split val, or by grouped cross-validation inside train. The report is on
+    split test.
     """
 
     label: str = "object"  # Label column. The prefix "label." may be left out.
     group: str = ""
-    """Column whose values never appear in two splits (default: the first of grasp_group, object, touch, sequence that
-    the manifest has and that is not the label)."""
+    """Column whose values never appear in two splits (default: the first of grasp_group, object,
+    touch, sequence that the manifest has and that is not the label).
+    """
     leave_out: str | None = None
-    """Leave out each value of this column in turn instead of using the splits, such as object for slip."""
+    """Leave out each value of this column in turn instead of using the splits, such as object for
+    slip.
+    """
     where: Finite[tuple[str, float] | None] = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
     # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
@@ -59,7 +69,9 @@ class LabelOptions(ProbeOptions):
     pooling: Literal["class", "mean", "both"] = "class"
     seeds: NotNegative[int] = 5  # Bootstrap resamples of the training groups.
     protocol: Literal["honest", "published"] = "honest"
-    """published chooses the penalty on the test split, as the authors' code does. The report says so."""
+    """published chooses the penalty on the test split, as the authors' code does. The report says
+    so.
+    """
     # Also print parts of the test rows: classes that alignment may have named, and others.
     details: bool = False
     # Write the linear head of one --model as .npz, for embed --head and stream --head.
@@ -87,13 +99,17 @@ class BatteryOptions(ProbeOptions):
 
 @dataclass(frozen=True)
 class TasksOptions(BatteryOptions):
-    """Probe named tasks: every seed splits the groups again, so that no object or recording is in two splits.
+    """Probe named tasks: every seed splits the groups again, so that no object or recording is in
+    two splits.
 
-    Example: anytouch probe tasks --model runs/stage2 --data manifest.parquet --tasks material slip force twist
+    Example: anytouch probe tasks --model runs/stage2 --data manifest.parquet --tasks material slip
+    force twist
     """
 
     tasks: tuple[str, ...] = ("all",)
-    """Tasks: material, roughness, hardness, grasp, grasp_after, object, slip, force, twist, slide, indenter, or all."""
+    """Tasks: material, roughness, hardness, grasp, grasp_after, object, slip, force, twist, slide,
+    indenter, or all.
+    """
     heads: tuple[Literal["linear", "knn", "gradient"], ...] = ("linear",)
     """Heads. gradient is the authors': one layer trained by AdamW."""
     protocol: Literal["honest", "published"] = "honest"
@@ -106,7 +122,9 @@ class TasksOptions(BatteryOptions):
     order: Literal["right", "shuffled", "repeated"] = "right"
     """Order of the frames of a clip: as recorded, shuffled, or the last frame repeated."""
     counterfactual: bool = False
-    """Does touch matter? Compare the touch of one --model with shuffled, shifted, background-only and mean touch."""
+    """Does touch matter? Compare the touch of one --model with shuffled, shifted, background-only
+    and mean touch.
+    """
 
 
 @dataclass(frozen=True)
@@ -173,7 +191,9 @@ def run_tasks(options: TasksOptions) -> int:
 
 
 def _run_counterfactual(options: TasksOptions, settings: dict[str, Any]) -> int:
-    """Print the scores of real touch and of the controls, their paired differences, and a verdict for each task."""
+    """Print the scores of real touch and of the controls, their paired differences, and a verdict
+    for each task.
+    """
     import json
 
     from anytouch_jax.evaluate.counterfactual import gains_table, probe_counterfactual, verdicts
@@ -208,7 +228,10 @@ def run_benchmark(options: BenchmarkOptions) -> int:
 
 
 def _settings(options: ProbeOptions) -> dict[str, Any]:
-    """Return all options by the names that probes take them. Check where results go, before the work."""
+    """Return all options by the names that probes take them.
+
+    Check where results go, before the work.
+    """
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_folder(options.out, read=_files_read(options))
@@ -221,7 +244,9 @@ def _settings(options: ProbeOptions) -> dict[str, Any]:
 
 
 def _models(options: ProbeOptions) -> tuple[Path, ...]:
-    """Return the encoders to probe: those named, or that of the package if there are no features either."""
+    """Return the encoders to probe: those named, or that of the package if there are no features
+    either.
+    """
     return options.model or (() if options.features else (Path(DEFAULT),))
 
 

@@ -1,4 +1,6 @@
-"""`anytouch retrieve`, cross-sensor retrieval of the same touch, and `anytouch report`, the evaluation of two runs."""
+"""`anytouch retrieve`, cross-sensor retrieval of the same touch, and `anytouch report`, the
+evaluation of two runs.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +34,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RetrieveOptions:
-    """Retrieve the same touch felt by another sensor: recall@1 and recall@5 with controls and intervals.
+    """Retrieve the same touch felt by another sensor: recall@1 and recall@5 with controls and
+    intervals.
 
     Example: anytouch retrieve --model runs/stage2 --data data/scenes/manifest.parquet
 
-    A gallery holds the true touch once, and the touches most similar to it in position, depth and force. With --index,
-    list the stored touches nearest to --query instead.
+    A gallery holds the true touch once, and the touches most similar to it in position, depth and
+    force. With --index, list the stored touches nearest to --query instead.
     """
 
     # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
@@ -62,12 +65,16 @@ class RetrieveOptions:
     by_chance: bool = False  # Draw the galleries at random, not by similarity.
     seeds: Count[int] = 5  # Galleries drawn for each query, with --by-chance.
     controls: bool = True
-    """Also score a random encoder, background-subtracted pixels, and the contact's area, centroid and force."""
+    """Also score a random encoder, background-subtracted pixels, and the contact's area, centroid
+    and force.
+    """
     out: Path | None = None  # Write the results as JSON.
 
 
 def run_retrieve(options: RetrieveOptions) -> int:
-    """Score cross-sensor retrieval, or search an index, print a table, and write JSON with --out."""
+    """Score cross-sensor retrieval, or search an index, print a table, and write JSON with
+    --out.
+    """
     if options.index is not None:
         return _search(options)
     refuse_unused(
@@ -119,7 +126,8 @@ def run_retrieve(options: RetrieveOptions) -> int:
         kept, values[name] = embedding.embed_rows(encoder, table, rows, *how, gels=gels, log=log)
         if len(kept) < len(rows):
             raise UserError(
-                f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest first."
+                f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest "
+                "first."
             )
     if options.controls:
         pixels = partial(background_difference, gels=gels)
@@ -194,7 +202,9 @@ def _query(
     about: dict[str, str],
     known: Mapping[str, np.ndarray],
 ) -> np.ndarray:
-    """Return features (1, d) of a picture, of the last clip of a folder or video, or of a sentence."""
+    """Return features (1, d) of a picture, of the last clip of a folder or video, or of a
+    sentence.
+    """
     import numpy as np
 
     from anytouch_jax.cli.embed import choose_gel
@@ -212,7 +222,8 @@ def _query(
         )
         if pooling != "class":
             raise UserError(
-                f"A sentence is compared with features of pooling class, not {pooling}. Embed again."
+                f"A sentence is compared with features of pooling class, not {pooling}. Embed "
+                "again."
             )
         return encoder.encode_text(str(options.query))
     if (files := images.picture_files(path)) is None:
@@ -223,7 +234,8 @@ def _query(
         ]
     if len(frames) < length:
         raise UserError(
-            f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more frames."
+            f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more "
+            "frames."
         )
     preprocess = Preprocess(encoder, choose_gel(encoder, options.background, path, known)[0])
     clip = np.stack([preprocess(frame) for frame in frames])[None]
@@ -246,9 +258,11 @@ def _cells(score: Any) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Report on a stage-1 and a stage-2 run: samples, losses, reconstructions, t-SNE, retrieval and probes.
+    """Report on a stage-1 and a stage-2 run: samples, losses, reconstructions, t-SNE, retrieval and
+    probes.
 
-    Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2 runs/stage2 --out report
+    Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2
+    runs/stage2 --out report
     """
 
     data: Path  # Manifest of simulated scenes, or one with the same columns.

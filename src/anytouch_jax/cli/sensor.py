@@ -21,9 +21,10 @@ class FitOptions:
 
     Example: anytouch sensor fit pictures/ --name mine --width-mm 18.6 --out mine.sensor
 
-    Press all kinds of objects into the gel, at changing places, and add a few pictures of the untouched gel. The folder
-    has readable numbers (sensor.json), which say how sure each is, and real next to simulated pictures (look.png).
-    `data simulate --sensors`, `train --simulated.sensors` and `adapt --sensor` take it like the name of a sensor.
+    Press all kinds of objects into the gel, at changing places, and add a few pictures of the
+    untouched gel. The folder has readable numbers (sensor.json), which say how sure each is, and
+    real next to simulated pictures (look.png). `data simulate --sensors`, `train
+    --simulated.sensors` and `adapt --sensor` take it like the name of a sensor.
     """
 
     # Folder of pictures of one unit, upright and not cropped.
@@ -68,7 +69,8 @@ def run_fit(options: FitOptions) -> int:
     )
     print(f"{options.out}: {options.name}, {fitted.colour.source}")
     print(
-        f"{picture}: real pictures above simulated ones. A linear classifier knows one from the other in {share:.0%} "
+        f"{picture}: real pictures above simulated ones. A linear classifier knows one from the "
+        f"other in {share:.0%} "
         "of the cases, where 50 % is chance."
     )
     return 0
@@ -76,12 +78,14 @@ def run_fit(options: FitOptions) -> int:
 
 @dataclass(frozen=True)
 class AdaptOptions:
-    """Make tokens for a new sensor: trained on simulated touches of it, or fitted to a few labelled frames.
+    """Make tokens for a new sensor: trained on simulated touches of it, or fitted to a few labelled
+    frames.
 
     Example: anytouch adapt --sensor mine.sensor --minutes 6 --out runs/mine
 
-    A sensor of `anytouch sensor fit` needs no data. Ctrl-C keeps the state, and the same command continues. Tokens
-    that find fewer simulated touches than the universal ones are not saved. With --data, tokens are fitted to --labels.
+    A sensor of `anytouch sensor fit` needs no data. Ctrl-C keeps the state, and the same command
+    continues. Tokens that find fewer simulated touches than the universal ones are not saved. With
+    --data, tokens are fitted to --labels.
     """
 
     # Folder NAME.sensor of `anytouch sensor fit`, or a name in the column sensor of the manifest.
@@ -93,7 +97,9 @@ class AdaptOptions:
     deep: bool = False  # Train the first blocks too, and hold the features of known sensors.
     data: tuple[Path, ...] = ()  # Manifests with labelled frames of the sensor in split train.
     frames: NotNegative[int] = 100
-    """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens unchanged."""
+    """Number of frames to fit on, spread over the recordings. 0 copies the universal tokens
+    unchanged.
+    """
     # Label column whose classes the frames are fitted to. Known sensors need examples.
     labels: str | None = None
     steps: Count[int] = 200  # Steps of the fit.
@@ -112,7 +118,8 @@ def run_adapt(options: AdaptOptions) -> int:
         refuse_unused(options, unused, f"with a sensor of {OWN_SENSOR}, which is simulated")
     elif not options.data:
         raise UserError(
-            f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as --sensor"
+            f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as "
+            "--sensor"
         )
     else:
         refuse_unused(
@@ -171,8 +178,10 @@ def _simulated(options: AdaptOptions) -> int:
     state.unlink(missing_ok=True)
     name = adapted.metadata["source"]["sensor"]
     print(
-        f"{options.out}: tokens of {name}, {len(adapted.losses)} steps. Of held-out simulated touches by {name}, the "
-        f"nearest one by a known sensor is the same touch in {adapted.after:.1%}. With universal tokens it is in "
+        f"{options.out}: tokens of {name}, {len(adapted.losses)} steps. Of held-out simulated "
+        f"touches by {name}, the "
+        f"nearest one by a known sensor is the same touch in {adapted.after:.1%}. With universal "
+        "tokens it is in "
         f"{adapted.before:.1%}."
     )
     return 0

@@ -52,22 +52,26 @@ class StreamOptions(CameraOptions, embed.FrameOptions):
 
     Example: anytouch stream --data 0 --sensor digit --out -
 
-    A camera's frames are dropped while the encoder is busy. Press Ctrl-C to stop and save. A camera that delivers no
-    frame for 2 seconds ends the stream with an error, after the features are saved.
+    A camera's frames are dropped while the encoder is busy. Press Ctrl-C to stop and save. A camera
+    that delivers no frame for 2 seconds ends the stream with an error, after the features are
+    saved.
     """
 
     data: str
-    """Camera or video file. A camera is a number such as 0, a part of its name, its serial, /dev/video0, or an address
-    http:// or rtsp://. `anytouch info cameras` lists them."""
+    """Camera or video file. A camera is a number such as 0, a part of its name, its serial,
+    /dev/video0, or an address http:// or rtsp://. `anytouch info cameras` lists them.
+    """
     out: Path  # The .npz to write, or - for one JSON line per frame on standard output.
     # Frames from one frame of a clip to the next, as in the training data.
     stride: Count[int] = 1
     reuse: NotNegative[float] = 0.0
-    """Reuse features while no place changes by more than so many times the camera's noise (0: while frames are
-    equal)."""
+    """Reuse features while no place changes by more than so many times the camera's noise (0: while
+    frames are equal).
+    """
     fields: bool = False
-    """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with deviations. Shear and
-    slip need --frames 3."""
+    """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with
+    deviations. Shear and slip need --frames 3.
+    """
     # --fields: mm that the picture's width shows. Known sensors need none.
     width_mm: Above0[float | None] = None
 
@@ -124,7 +128,8 @@ def run_stream(options: StreamOptions) -> int:
     if not live and not result.interrupted:
         if not len(result.numbers):
             raise UserError(
-                f"{data} has too few frames for a clip of {options.frames} at stride {options.stride}. "
+                f"{data} has too few frames for a clip of {options.frames} at stride "
+                f"{options.stride}. "
                 "Lower one of them."
             )
         embed.log_if_cut(data, int(result.numbers[-1]) + 1)
@@ -176,10 +181,10 @@ class ViewOptions(CameraOptions):
 
     Example: anytouch view manifest.parquet features.npz runs/stage1
 
-    Name a manifest, a folder of pictures, a film, a features file of `anytouch embed`, a run folder, the word examples,
-    or a camera: 0, a part of its name, its serial, or an address http:// or rtsp://. Without any, the page shows the
-    cameras that are connected, and the examples. Features show their pictures if their manifest is named, too. Press
-    Ctrl-C to stop.
+    Name a manifest, a folder of pictures, a film, a features file of `anytouch embed`, a run
+    folder, the word examples, or a camera: 0, a part of its name, its serial, or an address http://
+    or rtsp://. Without any, the page shows the cameras that are connected, and the examples.
+    Features show their pictures if their manifest is named, too. Press Ctrl-C to stop.
     """
 
     paths: Positional[tuple[str, ...]] = ()  # What to show, several at once.
@@ -190,7 +195,9 @@ class ViewOptions(CameraOptions):
     # Show the class of a camera's touch by this head of `anytouch probe label --save`.
     head: Path | None = None
     out: Path = Path("recordings")
-    """Folder for recordings of a camera, with their manifest.parquet, and for the head that they teach."""
+    """Folder for recordings of a camera, with their manifest.parquet, and for the head that they
+    teach.
+    """
     # Address to listen on. For any but this machine's own, the page asks for a token.
     host: str = "127.0.0.1"
     port: Annotated[int, Range(1, 65535, "1 to 65535")] = 8765  # Port to listen on.
@@ -224,7 +231,8 @@ def run_view(options: ViewOptions) -> int:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "without a camera")
     if len(cameras) > 1:
         raise UserError(
-            f"One camera can be shown at a time, not {len(cameras)}. Start another page for the next."
+            f"One camera can be shown at a time, not {len(cameras)}. Start another page for the "
+            "next."
         )
     begin = time.perf_counter()
     sources = server.open_sources(

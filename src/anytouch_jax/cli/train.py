@@ -50,10 +50,12 @@ _RECONSTRUCTION_FIELDS = ("objective.mask_ratio", "objective.norm_pix_loss", "ob
 class TrainOptions:
     """Pre-train stage 1 (masked autoencoding, next frame) or stage 2 (alignment, matching).
 
-    Example: anytouch train --stage 1 --data manifest.csv --run runs/stage1 --preset tiny --steps 800
+    Example: anytouch train --stage 1 --data manifest.csv --run runs/stage1 --preset tiny --steps
+    800
 
-    Run the same command again to continue from the last checkpoint. Sections of the configuration are options too,
-    such as --model.patch 16 or --optim.learning-rate 1e-3. `--help-all` lists them.
+    Run the same command again to continue from the last checkpoint. Sections of the configuration
+    are options too, such as --model.patch 16 or --optim.learning-rate 1e-3. `--help-all` lists
+    them.
     """
 
     data: tuple[Path, ...]  # Manifests (.csv or .parquet) to train on.
@@ -85,7 +87,9 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class Sections:
-    """Every field of the configuration, with the defaults of the preset, the recipe and the options of --help."""
+    """Every field of the configuration, with the defaults of the preset, the recipe and the options
+    of --help.
+    """
 
     model: ModelConfig  # Network: its sizes, its parts, the table of sensors.
     objective: LossConfig  # Weights and choices of the losses.
@@ -103,7 +107,10 @@ class TrainRequest(NamedTuple):
 
 
 def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequest:
-    """Return the options of `train` and its configuration. Sections are second: the preset has their defaults."""
+    """Return the options of `train` and its configuration.
+
+    Sections are second: the preset has their defaults.
+    """
     list_all = "--help-all" in args
     plain, sections = _split_sections([arg for arg in args if arg != "--help-all"])
     defaults = TrainOptions((), Path("runs/stage1")) if list_all else None
@@ -126,7 +133,9 @@ def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequ
 
 
 def run(request: TrainRequest) -> int:
-    """Train or continue, alone or as one of several processes; 0 after SIGTERM and 130 after Ctrl-C, both saved."""
+    """Train or continue, alone or as one of several processes; 0 after SIGTERM and 130 after
+    Ctrl-C, both saved.
+    """
     from anytouch_jax.pretrain import pretrain
     from anytouch_jax.train.mesh import enable_compilation_cache, joined
     from anytouch_jax.train.progress import terminating
@@ -149,7 +158,8 @@ def run(request: TrainRequest) -> int:
                 )
     except Terminated:
         log(
-            f"stopped by SIGTERM before the first step of {options.run}. Run the same command again to continue."
+            f"stopped by SIGTERM before the first step of {options.run}. Run the same command "
+            "again to continue."
         )
         return 0
     if result.interrupted == signal.SIGINT:
@@ -160,7 +170,9 @@ def run(request: TrainRequest) -> int:
 
 
 def _with_own_sensors(config: Config) -> Config:
-    """Return the configuration with tokens for the sensors of `anytouch sensor fit` among the simulated ones."""
+    """Return the configuration with tokens for the sensors of `anytouch sensor fit` among the
+    simulated ones.
+    """
     folders = [word for word in config.simulated.sensors if word.endswith(OWN_SENSOR)]
     if not folders:
         return config
@@ -173,7 +185,9 @@ def _with_own_sensors(config: Config) -> Config:
 
 
 def _configure(options: TrainOptions, *, usual: bool = False) -> Config:
-    """Return the configuration of the preset and recipe, changed by the short options (unless `usual`) and baseline."""
+    """Return the configuration of the preset and recipe, changed by the short options (unless
+    `usual`) and baseline.
+    """
     short = {
         "data.manifests": tuple(map(str, options.data)),
         "data.on_bad_sample": options.on_bad_sample,
@@ -195,7 +209,9 @@ def _configure(options: TrainOptions, *, usual: bool = False) -> Config:
 
 
 def _refuse_unread(options: TrainOptions, config: Config) -> None:
-    """Raise UserError for options that do not go together, and for settings that this stage does not read."""
+    """Raise UserError for options that do not go together, and for settings that this stage does
+    not read.
+    """
     for name in config.model.sensors:
         check_spelling(name)
     baseline = presets.find_baseline(options.baseline)
@@ -223,7 +239,9 @@ def _refuse_unread(options: TrainOptions, config: Config) -> None:
 
 
 def _split_sections(args: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split argv into plain options and those of a section (--model.patch 16), each with the values that follow it."""
+    """Split argv into plain options and those of a section (--model.patch 16), each with the values
+    that follow it.
+    """
     plain: list[str] = []
     section: list[str] = []
     target = plain

@@ -38,10 +38,11 @@ class SpellingError(ConfigError):
 
 
 def check_spelling(name: str, known: Iterable[str] = ()) -> None:
-    """Raise SpellingError for a name within two letters of a known one; case, - and blanks do not count as letters.
+    """Raise SpellingError for a name within two letters of a known one; case, - and blanks do not
+    count as letters.
 
-    Known are SENSORS, FIELD_SENSORS and `known`. A name with more digits, such as digit_2, is a new one. So are
-    OTHER_SENSORS.
+    Known are SENSORS, FIELD_SENSORS and `known`. A name with more digits, such as digit_2, is a new
+    one. So are OTHER_SENSORS.
     """
 
     def plain(sensor: str) -> str:
@@ -60,7 +61,8 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
     )
     if apart <= _LETTERS and digits(word) <= digits(nearest):
         raise SpellingError(
-            f"sensor {name!r} is not known: did you mean {nearest}? The name of a new sensor differs from it by more "
+            f"sensor {name!r} is not known: did you mean {nearest}? The name of a new sensor "
+            "differs from it by more "
             f"than {_LETTERS} letters"
         )
 
@@ -99,7 +101,9 @@ class TextTower:
 @shown_short
 @dataclass(frozen=True)
 class ModelConfig:
-    """All shapes and arithmetic of the network; `sensors` names the rows of tokens, or of patch encoders too (T3)."""
+    """All shapes and arithmetic of the network; `sensors` names the rows of tokens, or of patch
+    encoders too (T3).
+    """
 
     image_size: Size  # Side of an image, pixels.
     patch: Size  # Side of a patch, pixels.
@@ -163,13 +167,15 @@ class ModelConfig:
         """Return the row of a sensor. Raises ConfigError if the table does not have it."""
         if name in FIELD_SENSORS:
             raise ConfigError(
-                f"sensor {name!r} measures a force field and has no images. Leave it out of training."
+                f"sensor {name!r} measures a force field and has no images. Leave it out of "
+                "training."
             )
         check_spelling(name, self.sensors)
         if name not in self.sensors:
             known = ", ".join(self.sensors)
             table = " ".join(self.sensors)
             raise ConfigError(
-                f"unknown sensor {name!r}. Choose one of {known}, or add it by --model.sensors {name} {table}"
+                f"unknown sensor {name!r}. Choose one of {known}, or add it by --model.sensors "
+                f"{name} {table}"
             )
         return self.sensors.index(name)

@@ -42,8 +42,9 @@ _JSON_DIGITS = 40
 def parse_json(text: str | bytes) -> Any:
     """Return the value of JSON of at most 64 MiB, 64 levels and 40 digits a number.
 
-    Raises ConfigError with a clause such as "is not JSON" for other text, and for values that no file of ours has: NaN,
-    infinite numbers, halves of a Unicode pair, and a name twice in one object. All readers of JSON use it.
+    Raises ConfigError with a clause such as "is not JSON" for other text, and for values that no
+    file of ours has: NaN, infinite numbers, halves of a Unicode pair, and a name twice in one
+    object. All readers of JSON use it.
     """
     if len(text) > _JSON_BYTES:
         raise ConfigError(f"has {len(text):,} bytes of JSON, more than {_JSON_BYTES:,}")
@@ -94,10 +95,11 @@ def _depth(value: Any) -> int:
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """Raise ConfigError for a field of a dataclass outside its range, or that is not one of its choices (Literal).
+    """Raise ConfigError for a field of a dataclass outside its range, or that is not one of its
+    choices (Literal).
 
-    `prefix` is its section on the command line. None is always in a range. NaN and numbers that are infinite in float32
-    never are. Every entry of a tuple is checked.
+    `prefix` is its section on the command line. None is always in a range. NaN and numbers that are
+    infinite in float32 never are. Every entry of a tuple is checked.
     """
     kind: Any = type(settings)
     for name, (hint, has_choices, bounds) in _rules(kind).items():
@@ -124,7 +126,9 @@ def _numbers(value: Any) -> Iterator[float]:
 
 @functools.cache
 def _rules(kind: type) -> dict[str, tuple[Any, bool, list[Range]]]:
-    """Return the annotation of each field of a dataclass, whether it has choices, and its ranges."""
+    """Return the annotation of each field of a dataclass, whether it has choices, and its
+    ranges.
+    """
 
     def has_choices(hint: Any) -> bool:
         return typing.get_origin(hint) is Literal or any(map(has_choices, typing.get_args(hint)))
@@ -141,7 +145,10 @@ def _rules(kind: type) -> dict[str, tuple[Any, bool, list[Range]]]:
 
 
 def read_value(kind: Any, value: Any, where: str) -> Any:
-    """Return `value` (from JSON) as an instance of the annotation `kind`. `where` is its name in errors."""
+    """Return `value` (from JSON) as an instance of the annotation `kind`.
+
+    `where` is its name in errors.
+    """
     origin = typing.get_origin(kind)
     args = typing.get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
@@ -150,7 +157,8 @@ def read_value(kind: Any, value: Any, where: str) -> Any:
         hints = typing.get_type_hints(kind)
         if unknown := sorted(set(value) - set(hints)):
             raise ConfigError(
-                f"{where} has no setting called {', '.join(unknown)}. Choose from {', '.join(hints)}."
+                f"{where} has no setting called {', '.join(unknown)}. Choose from "
+                f"{', '.join(hints)}."
             )
         no_default = (
             f.default is f.default_factory is dataclasses.MISSING for f in dataclasses.fields(kind)

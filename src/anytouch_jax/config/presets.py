@@ -1,4 +1,6 @@
-"""Named configurations: presets (sizes of the network, for each stage and recipe), baselines and ablations."""
+"""Named configurations: presets (sizes of the network, for each stage and recipe), baselines and
+ablations.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ from anytouch_jax.config.parsing import read_value
 from anytouch_jax.config.train import Config, DataConfig, PresetName, Recipe, Towers
 from anytouch_jax.errors import ConfigError, UserError
 
-# name -> pixels, patch, embedding; (width, blocks, heads) of touch encoder and image tower, of decoder, of text tower;
-# batch
+# name -> pixels, patch, embedding; (width, blocks, heads) of touch encoder and image tower, of
+# decoder, of text tower; batch
 _PRESETS = {
     "tiny": (112, 14, 128, (192, 6, 6), (128, 2, 4), (128, 4, 4), 64),
     "small": (224, 14, 512, (384, 6, 6), (512, 8, 16), (384, 6, 6), 64),
@@ -29,10 +31,11 @@ def preset(
 ) -> Config:
     """Return the configuration called `name` (tiny, small, base, large) for a stage and a recipe.
 
-    `large` is the paper's. `towers` matters in stage 2 only: "scratch" trains small image and text towers whole,
-    "pretrained" expects CLIP weights, freezes the text tower and adapts the image tower by LoRA. One point of the
-    release depends on the machine and is set by hand: negatives stay within a device's 64 rows, so
-    `objective.groups` is 4 for a batch of 256. Raises ConfigError for an unknown name or choice.
+    `large` is the paper's. `towers` matters in stage 2 only: "scratch" trains small image and text
+    towers whole, "pretrained" expects CLIP weights, freezes the text tower and adapts the image
+    tower by LoRA. One point of the release depends on the machine and is set by hand: negatives
+    stay within a device's 64 rows, so `objective.groups` is 4 for a batch of 256. Raises
+    ConfigError for an unknown name or choice.
     """
     if name not in _PRESETS:
         raise ConfigError(f"unknown preset {name!r}. Choose one of {', '.join(_PRESETS)}")
@@ -62,10 +65,12 @@ def preset(
 
 @dataclass(frozen=True)
 class Baseline:
-    """A baseline or ablation: the `stages` that it trains, and its `changes` of their configuration by section.field.
+    """A baseline or ablation: the `stages` that it trains, and its `changes` of their configuration
+    by section.field.
 
-    Without `changes_stage1` they are made in stage 2 only. It keeps what distinguishes the method (Sec. 4.1, appendix
-    "Baselines"), on this network and the same data. The ablations are the rows of Table 6.
+    Without `changes_stage1` they are made in stage 2 only. It keeps what distinguishes the method
+    (Sec. 4.1, appendix "Baselines"), on this network and the same data. The ablations are the rows
+    of Table 6.
     """
 
     name: str
@@ -81,11 +86,15 @@ class Baseline:
 
 
 def apply_baseline(name: str, config: Config) -> Config:
-    """Return `config` changed to a baseline. Raises UserError if it is unknown, or does not train the stage."""
+    """Return `config` changed to a baseline.
+
+    Raises UserError if it is unknown, or does not train the stage.
+    """
     baseline = find_baseline(name)
     if not baseline.stages:
         raise UserError(
-            f"baseline {name} is not trained. Evaluate the image tower of a stage-2 run, or that of CLIP."
+            f"baseline {name} is not trained. Evaluate the image tower of a stage-2 run, or that "
+            "of CLIP."
         )
     if config.stage not in baseline.stages:
         only = f"only stage {baseline.stages[0]} ({baseline.about})"
@@ -123,7 +132,8 @@ _ALL = (
     ),
     Baseline(
         "tlv_link",
-        "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor tokens, no "
+        "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor "
+        "tokens, no "
         "matching",
         (2,),
         {
@@ -140,8 +150,8 @@ _ALL = (
         (1,),
         {"model.patch_encoder": "sensor", "model.sensor_tokens": 0} | _SENSOR_TOKENS | _NO_CLIPS,
     ),
-    # The paper has one model for both names: "trained solely on tactile images" in Table 4, "w/o Dynamic Perception" in
-    # Table 6.
+    # The paper has one model for both names: "trained solely on tactile images" in Table 4, "w/o
+    # Dynamic Perception" in Table 6.
     Baseline("static_only", "AnyTouch without clips in both stages (Table 4)", changes=_NO_CLIPS),
     Baseline(
         "no_dynamic",

@@ -31,7 +31,8 @@ Towers = Literal["none", "scratch", "pretrained"]
 PresetName = Literal["tiny", "small", "base", "large"]
 # how often the release draws these in an epoch
 RELEASE_WEIGHTS = (("touch_and_go", 2.0), ("octopi", 3.0))
-# Mean and standard deviation of RGB in 0..1: touch images (ImageNet) and photographs (CLIP), as in the release.
+# Mean and standard deviation of RGB in 0..1: touch images (ImageNet) and photographs (CLIP), as in
+# the release.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
@@ -113,14 +114,16 @@ class DataConfig:
     # Sensors of the negatives of matching: any, or the positive's.
     negatives: Literal["any", "same_sensor"] = "any"
     parts: NotNegative[int] = 0
-    """Cut large data into this many parts of whole shards. A slot of a batch draws from its own part, so that a host
-    reads its parts alone. 0: any row with any other. Stage 1 only."""
+    """Cut large data into this many parts of whole shards. A slot of a batch draws from its own
+    part, so that a host reads its parts alone. 0: any row with any other. Stage 1 only.
+    """
     # Draw only rows that have these modalities.
     require: tuple[Literal["image", "text"], ...] = ()
     # Leave out rows that label.contact marks as free. Unmarked rows stay.
     contact_only: bool = False
     aligned_text: bool = True  # Use the text of touches that other sensors or units recorded too.
-    # Subtract the untouched gel (docs/sensor.md), or for half of the samples, at random. Not in the paper.
+    # Subtract the untouched gel (docs/sensor.md), or for half of the samples, at random. Not in the
+    # paper.
     background: Literal["keep", "subtract", "either"] = "keep"
     flip: Share = 0.5  # Probability of a mirror image, for each direction.
     affine: NotNegative[tuple[float, float, float]] = (0.0, 0.0, 0.0)
@@ -227,7 +230,9 @@ class Config:
 
     @property
     def reconstructs(self) -> bool:
-        """Whether batches need the next frame: stage 1, and stage 2 of the release, which keeps stage 1's loss."""
+        """Whether batches need the next frame: stage 1, and stage 2 of the release, which keeps
+        stage 1's loss.
+        """
         return self.stage == 1 or self.recipe == "release"
 
     @property
@@ -237,7 +242,9 @@ class Config:
 
     @property
     def pair_weights(self) -> tuple[float, float, float]:
-        """Factors of (TV, TL, VL) on both directions of InfoNCE (Eq. 4). The release weighs touch and text by alpha."""
+        """Factors of (TV, TL, VL) on both directions of InfoNCE (Eq. 4). The release weighs touch
+        and text by alpha.
+        """
         objective = self.objective
         text = objective.alpha_tl if self.recipe == "release" else objective.alpha_tl / 2
         return objective.alpha_tv / 2, text, objective.alpha_vl / 2
@@ -284,8 +291,9 @@ def to_json(config: Any) -> str:
 def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> Any:
     """Read a config written by `to_json`, of this version or an older one.
 
-    Settings that no longer exist are dropped. With `allow_retired` False, one that changed the training is an error:
-    the run cannot be continued. Raises ConfigError, which names an unknown, missing, mistyped or retired setting.
+    Settings that no longer exist are dropped. With `allow_retired` False, one that changed the
+    training is an error: the run cannot be continued. Raises ConfigError, which names an unknown,
+    missing, mistyped or retired setting.
     """
     try:
         data = parsing.parse_json(text)
@@ -310,7 +318,8 @@ def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> A
                 )
             if not allow_retired and value != inert:
                 raise ConfigError(
-                    f"the run sets {section}.{name} to {value!r}, which this version no longer has. "
+                    f"the run sets {section}.{name} to {value!r}, which this version no longer "
+                    "has. "
                     "Continue it with version 0.1, or start a new run from it with --init."
                 )
     return parsing.read_value(cls, data, "config" if cls is Config else cls.__name__.lower())

@@ -1,6 +1,8 @@
-"""Cameras: those that are connected, with their names, sizes and rates, and opening of one by what a user calls it.
+"""Cameras: those that are connected, with their names, sizes and rates, and opening of one by what
+a user calls it.
 
-Linux lists them in a folder, and their drivers answer questions of V4L2 (linux/videodev2.h) without starting them.
+Linux lists them in a folder, and their drivers answer questions of V4L2 (linux/videodev2.h) without
+starting them.
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ _PATIENCE = 10_000  # milliseconds to wait for an address
 
 
 class CameraSettings(NamedTuple):
-    """What a camera is asked for: width and height in pixels, frames a second, and four letters such as MJPG."""
+    """What a camera is asked for: width and height in pixels, frames a second, and four letters
+    such as MJPG.
+    """
 
     size: tuple[int, int] | None = None
     fps: float | None = None
@@ -93,8 +97,9 @@ def list_cameras() -> list[Camera]:
 def camera_of(source: str | Path) -> int | str | None:
     """Return the number or the address of a camera, None for a film.
 
-    `source` is a file, a number, /dev/videoN or a link to it, an address (ADDRESSES), the serial number of a camera, or
-    a part of its name. A file comes first. Raises UserError for a name that several cameras have.
+    `source` is a file, a number, /dev/videoN or a link to it, an address (ADDRESSES), the serial
+    number of a camera, or a part of its name. A file comes first. Raises UserError for a name that
+    several cameras have.
     """
     text = str(source)
     path = Path(source)
@@ -125,7 +130,9 @@ def camera_of(source: str | Path) -> int | str | None:
 def open_source(
     name: str | Path, asked: CameraSettings | None = None, log: Callable[[str], None] | None = None
 ) -> tuple[Any, bool]:
-    """Return a cv2.VideoCapture of a camera or film, and whether it is a camera (`asked` for settings)."""
+    """Return a cv2.VideoCapture of a camera or film, and whether it is a camera (`asked` for
+    settings).
+    """
     camera = camera_of(name)
     if camera is None and Path(name).is_dir():
         raise UserError(
@@ -191,7 +198,9 @@ def _ask(source: Any, asked: CameraSettings) -> None:
 
 
 def _given(source: Any, camera: int | str, asked: CameraSettings) -> str:
-    """Return what a camera gives, where that is not what it was asked for, and a format that is faster."""
+    """Return what a camera gives, where that is not what it was asked for, and a format that is
+    faster.
+    """
     size = int(source.get(cv2.CAP_PROP_FRAME_WIDTH)), int(source.get(cv2.CAP_PROP_FRAME_HEIGHT))
     rate = source.get(cv2.CAP_PROP_FPS)
     form = format_of(source)
@@ -258,7 +267,9 @@ def _modes(device: Path) -> Iterator[Mode]:
 
 
 def _answers(handle: int, code: int, *question: int) -> Iterator[tuple[int, ...]]:
-    """Yield the answers of a driver as words of 32 bits, number 0 first, until there are no more."""
+    """Yield the answers of a driver as words of 32 bits, number 0 first, until there are no
+    more.
+    """
     import fcntl
 
     count = (code >> 16 & 0x3FFF) // 4

@@ -19,13 +19,16 @@ FEWEST = 12
 # spread of the steps from dot to dot, and grey levels of a dot, that are no lattice
 IRREGULAR = 0.08
 FAINT = 12
-# Deviation of a motion in pixels of FLOW: of dots that move alike, and for each pixel by which dots nearby differ.
+# Deviation of a motion in pixels of FLOW: of dots that move alike, and for each pixel by which dots
+# nearby differ.
 STEADY = 0.2
 UNSTEADY = 0.5
 
 
 class Dots(NamedTuple):
-    """Dots of the gel: the step and the bend of their lattice as in `Markers`, radius of a height, ink (3,) in 0..1."""
+    """Dots of the gel: the step and the bend of their lattice as in `Markers`, radius of a height,
+    ink (3,) in 0..1.
+    """
 
     pitch: float
     bend: float
@@ -39,13 +42,17 @@ class Dots(NamedTuple):
 
 
 def find_dots(gel: Array) -> Dots | None:
-    """Return the dots of an untouched gel u8 (h, w, 3), dark or light ones; None without a lattice of them."""
+    """Return the dots of an untouched gel u8 (h, w, 3), dark or light ones; None without a lattice
+    of them.
+    """
     found = [_dots_of(gel, sign) for sign in (1, -1)]
     return next((one for one in found if one is not None), None)
 
 
 def _spots(picture: Array, sign: int, shape: int = cv2.MORPH_ELLIPSE) -> Array:
-    """Return by how many grey levels (h, w, 3) small spots are darker (`sign` 1) or lighter than what is around."""
+    """Return by how many grey levels (h, w, 3) small spots are darker (`sign` 1) or lighter than
+    what is around.
+    """
     shown = picture if sign > 0 else 255 - picture
     side = 2 * round(0.045 * max(picture.shape[:2])) + 1
     kernel = cv2.getStructuringElement(shape, (side, side))
@@ -53,7 +60,9 @@ def _spots(picture: Array, sign: int, shape: int = cv2.MORPH_ELLIPSE) -> Array:
 
 
 def hidden(frame: Array, dots: Dots) -> Array:
-    """Return where (h, w) dots hide the gel of a pressed frame u8 (h, w, 3), or hid it before they moved."""
+    """Return where (h, w) dots hide the gel of a pressed frame u8 (h, w, 3), or hid it before they
+    moved.
+    """
     # a dot changes these colours all at once, and a slope does not
     strong = dots.change >= 0.5 * dots.change.max()
     share = (_spots(frame, dots.sign)[..., strong] / dots.change[strong]).min(-1)
@@ -126,9 +135,11 @@ def _dots_of(gel: Array, sign: int) -> Dots | None:
 def _lattice(
     at: Array, apart: Array, rough: float, shape: tuple[int, ...]
 ) -> tuple[float, float, float]:
-    """Return step and bend of the lattice of dots at places (N, 2), and the spread of its steps, infinite for few.
+    """Return step and bend of the lattice of dots at places (N, 2), and the spread of its steps,
+    infinite for few.
 
-    Along x and y the lattice counts `plain` x + `more` x r^2 (see `Markers`), which is one more at the next dot.
+    Along x and y the lattice counts `plain` x + `more` x r^2 (see `Markers`), which is one more at
+    the next dot.
     """
     place = at - np.array([shape[1], shape[0]]) / 2
     half = float(np.hypot(shape[0], shape[1])) / 2
@@ -150,7 +161,8 @@ def _lattice(
 
 
 class DotFlow:
-    """How the dots of an untouched gel have moved: dense optical flow of their ink (DIS, Kroeger et al. 2016).
+    """How the dots of an untouched gel have moved: dense optical flow of their ink (DIS, Kroeger et
+    al. 2016).
 
     It is false if the picture `gel` u8 (h, w, 3) shows no dots.
     """
@@ -178,9 +190,11 @@ class DotFlow:
         return np.asarray(np.minimum.reduce(parts))
 
     def __call__(self, frame: Array, rows: int, columns: int) -> tuple[Array, Array]:
-        """Return shifts (rows, columns, 2) along x and y and their deviations (rows, columns), in shares of the width.
+        """Return shifts (rows, columns, 2) along x and y and their deviations (rows, columns), in
+        shares of the width.
 
-        `frame` u8 (h, w, 3) has the proportions of the gel's picture. Between dots a shift is the mean of those around.
+        `frame` u8 (h, w, 3) has the proportions of the gel's picture. Between dots a shift is the
+        mean of those around.
         """
         assert self._dots is not None
         height, width = self._gel.shape

@@ -1,4 +1,5 @@
-"""The picture of the untouched gel: one rule for manifests, folders, films, pictures and live sources.
+"""The picture of the untouched gel: one rule for manifests, folders, films, pictures and live
+sources.
 
 The first of these counts:
 
@@ -8,9 +9,9 @@ The first of these counts:
 * the median of the unit's frames
 * for a live source, a running estimate
 
-A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one unit. The median is
-over frames of split train, if these are enough, pressed or not. A unit of few sequences may have one press only: its
-median is that of its sensor, if these look alike.
+A unit is the column `unit` of one dataset and sensor, or else the sensor. A folder or a film is one
+unit. The median is over frames of split train, if these are enough, pressed or not. A unit of few
+sequences may have one press only: its median is that of its sensor, if these look alike.
 """
 
 from __future__ import annotations
@@ -43,7 +44,10 @@ SETTLED = 512  # frames, a power of two, after which a running estimate stays
 # grey levels: frames of one unit differ by less in most places, units of one product by more
 TINT = 8.0
 STORED = 32  # units whose pictures a file stores
-ADVICE = f"Record {FEWEST} frames or more of the sensor, or name a picture of its gel in the column background_path."
+ADVICE = (
+    f"Record {FEWEST} frames or more of the sensor, or name a picture of its gel in the column "
+    "background_path."
+)
 
 
 class Spread:
@@ -66,17 +70,19 @@ class Spread:
 
 
 def untouched_gel(frames: Iterable[npt.ArrayLike]) -> Array:
-    """Return the picture u8 (h, w, 3) of the untouched gel: the median of frames (h, w, 3) of one camera.
+    """Return the picture u8 (h, w, 3) of the untouched gel: the median of frames (h, w, 3) of one
+    camera.
 
-    The frames may be pressed, at changing places. At most FRAMES of them are used, evenly spread. Raises UserError for
-    fewer than FEWEST frames, and for frames of several sizes.
+    The frames may be pressed, at changing places. At most FRAMES of them are used, evenly spread.
+    Raises UserError for fewer than FEWEST frames, and for frames of several sizes.
     """
     spread = Spread(lambda frame: to_rgb(np.asarray(frame), "a frame"))
     for frame in frames:
         spread.add(frame)
     if spread.count < FEWEST:
         raise UserError(
-            f"{spread.count} frames are too few for a picture of the untouched gel. Give {FEWEST} or more."
+            f"{spread.count} frames are too few for a picture of the untouched gel. Give {FEWEST} "
+            "or more."
         )
     if len(shapes := {frame.shape for frame in spread.items}) > 1:
         raise UserError(f"the frames have {len(shapes)} sizes. Give frames of one camera.")
@@ -90,7 +96,9 @@ def median(frames: Sequence[Array]) -> Array:
 
 
 def estimate(frames: Sequence[Array]) -> Array:
-    """Return the untouched gel of one recording: the median of its free frames if these stand out, else of all."""
+    """Return the untouched gel of one recording: the median of its free frames if these stand out,
+    else of all.
+    """
     some = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 24).astype(int))]
     small = [scale_picture(frame) for frame in some]
     decides = len(some) >= FEWEST and min(small[0].shape[:2]) > 2 * EDGE + 2
@@ -106,7 +114,9 @@ def reduced(frame: Array) -> Array:
 
 
 def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
-    """Return the untouched gel of frames of a folder or a film, and how many count; below FEWEST it shows the press."""
+    """Return the untouched gel of frames of a folder or a film, and how many count; below FEWEST it
+    shows the press.
+    """
     spread = Spread(reduced)
     for frame in frames:
         spread.add(frame)
@@ -125,10 +135,12 @@ def alike(frames: Sequence[Array]) -> list[Array]:
 
 
 class RunningGel:
-    """The untouched gel of a live source: `picture`, None before its first frame, from the frames so far.
+    """The untouched gel of a live source: `picture`, None before its first frame, from the frames
+    so far.
 
-    A thread estimates it whenever their number has doubled. The result counts when it has doubled again, so that no
-    frame waits for it, and equal frames have equal pictures. It is `settled` after SETTLED frames.
+    A thread estimates it whenever their number has doubled. The result counts when it has doubled
+    again, so that no frame waits for it, and equal frames have equal pictures. It is `settled`
+    after SETTLED frames.
     """
 
     def __init__(self) -> None:
@@ -167,12 +179,16 @@ class RunningGel:
 
 
 def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
-    """Return an upright picture as the camera takes it, before `orient_frame` turns and mirrors it."""
+    """Return an upright picture as the camera takes it, before `orient_frame` turns and mirrors
+    it.
+    """
     return np.ascontiguousarray(orient_frame(orient_frame(picture, 0, flip), -rotate % 360))
 
 
 def same_unit(known: Mapping[str, Array], picture: Array) -> tuple[Array | None, str]:
-    """Return the known picture that looks most like `picture`, None without any, and how another unit differs ("")."""
+    """Return the known picture that looks most like `picture`, None without any, and how another
+    unit differs ("").
+    """
     sizes = {
         name: gel.shape[1] / gel.shape[0] / (picture.shape[1] / picture.shape[0])
         for name, gel in known.items()
@@ -196,15 +212,20 @@ def same_unit(known: Mapping[str, Array], picture: Array) -> tuple[Array | None,
 
 
 def other_unit(why: str) -> str:
-    """Return the warning about a camera whose picture differs from all that a head or an index was fitted with."""
+    """Return the warning about a camera whose picture differs from all that a head or an index was
+    fitted with.
+    """
     return (
-        f"The picture differs {why} from every unit that the head or index was fitted with. Its own untouched gel is "
+        f"The picture differs {why} from every unit that the head or index was fitted with. Its "
+        "own untouched gel is "
         "subtracted. Do not trust the result before you have checked it."
     )
 
 
 class _Unit(NamedTuple):
-    """The picture of a unit, None if there is none, what it is, from how many frames, and whether a head has it."""
+    """The picture of a unit, None if there is none, what it is, from how many frames, and whether a
+    head has it.
+    """
 
     picture: Array | None = None
     source: str = "none"
@@ -213,10 +234,12 @@ class _Unit(NamedTuple):
 
 
 class UnitGels:
-    """The untouched gel of every row of a manifest. A unit is looked at when one of its rows is asked for.
+    """The untouched gel of every row of a manifest.
 
-    `known` are the pictures of a head or an index by unit, of which the same unit gets its own. `log` gets one warning
-    about units that are none of these.
+    A unit is looked at when one of its rows is asked for.
+
+    `known` are the pictures of a head or an index by unit, of which the same unit gets its own.
+    `log` gets one warning about units that are none of these.
     """
 
     def __init__(
@@ -240,11 +263,16 @@ class UnitGels:
         self._lock = threading.Lock()
 
     def __call__(self, row: int) -> Array | None:
-        """Return the picture RGB u8 (h, w, 3) of a row's unit; None if that of the row counts, or there is none."""
+        """Return the picture RGB u8 (h, w, 3) of a row's unit; None if that of the row counts, or
+        there is none.
+        """
         return self._of(row).picture
 
     def read(self, row: int) -> Array | None:
-        """Return the untouched gel of a row, its own picture where that counts. Raises UserError if it is broken."""
+        """Return the untouched gel of a row, its own picture where that counts.
+
+        Raises UserError if it is broken.
+        """
         picture = self(row)
         if picture is not None or not self._stored[row]:
             return picture
@@ -256,7 +284,9 @@ class UnitGels:
             ) from None
 
     def shared(self, make: Callable[[Array], T], most: int = 256) -> Callable[[int], T | None]:
-        """Return a function from a row to `make` of its untouched gel (or None), made once for all rows of it."""
+        """Return a function from a row to `make` of its untouched gel (or None), made once for all
+        rows of it.
+        """
         made = dict[Any, T]()
 
         def of_row(row: int) -> T | None:
@@ -293,7 +323,9 @@ class UnitGels:
         return f"untouched gel: {'; '.join(parts)}"
 
     def pictures(self, rows: Array) -> dict[str, Array]:
-        """Return the pictures of the units of rows by name, those of the STORED units with most rows."""
+        """Return the pictures of the units of rows by name, those of the STORED units with most
+        rows.
+        """
         rows = rows[self.has(rows)]
         found = {}
         units, first, counts = np.unique(self._unit[rows], return_index=True, return_counts=True)
@@ -335,7 +367,9 @@ class UnitGels:
             return self._units[unit]
 
     def _find(self, unit: int) -> _Unit:
-        """Return the median of a unit's frames, or the picture of the same unit among the known ones."""
+        """Return the median of a unit's frames, or the picture of the same unit among the known
+        ones.
+        """
         rows = np.flatnonzero((self._unit == unit) & self._has_image)
         found = self._median(rows[self._split[rows] == "background"], 1, "rows of split background")
         if found.picture is None:
@@ -354,7 +388,9 @@ class UnitGels:
         return _Unit(gel, "the picture that the head was fitted with", 0, True)
 
     def _median_of(self, unit: int, rows: Array) -> _Unit:
-        """Return the median of rows of a unit, or that of its sensor if they are few and do not show another unit."""
+        """Return the median of rows of a unit, or that of its sensor if they are few and do not
+        show another unit.
+        """
         own = self._median(rows, FEWEST, "the median")
         sensors = self._manifest.codes("sensor")
         sensor = int(sensors[self._first[unit]])
@@ -377,7 +413,9 @@ class UnitGels:
         return shared
 
     def _fitted(self, rows: Array) -> Array:
-        """Return the rows of split train, or all but those of split background if these are too few."""
+        """Return the rows of split train, or all but those of split background if these are too
+        few.
+        """
         train = rows[self._split[rows] == "train"]
         if len(train) >= FEWEST:
             return train
@@ -408,7 +446,10 @@ def gel_arrays(pictures: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def gels_of_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the pictures among the arrays of an .npz file. Raises KeyError or ValueError for others."""
+    """Return the pictures among the arrays of an .npz file.
+
+    Raises KeyError or ValueError for others.
+    """
     names = arrays.get("gels", np.zeros(0, str))
     found = {}
     check_array("gels", names, (len(names.reshape(-1)),), "U")

@@ -41,14 +41,16 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy")
 BACKGROUND = "background"
 PHOTO = "photo"
 
-# Since OpenCV 4.11. Orientation tags are obeyed by `_upright`, as versions of OpenCV do it for other formats.
+# Since OpenCV 4.11. Orientation tags are obeyed by `_upright`, as versions of OpenCV do it for
+# other formats.
 _JPEG_RGB: int = cv2.IMREAD_UNCHANGED
 if hasattr(cv2, "IMREAD_COLOR_RGB"):
     _JPEG_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\0", b"MM\0*")
-# Pillow's classes for the headers. Image.open adds a search over all formats, 40 of the 390 us that a JPEG takes.
+# Pillow's classes for the headers. Image.open adds a search over all formats, 40 of the 390 us that
+# a JPEG takes.
 _HEADERS: dict[bytes, type[ImageFile.ImageFile]] = {
     _PNG: PngImagePlugin.PngImageFile,
     _JPEG: JpegImagePlugin.JpegImageFile,
@@ -83,8 +85,8 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 class _Quiet:
     """A context in which the C library's `stderr`, where libjpeg and libpng print, is /dev/null.
 
-    Python writes to descriptor 2, which does not change: no thread loses a sentence. Threads may be inside together. A
-    C library in which `stderr` is no variable is left alone.
+    Python writes to descriptor 2, which does not change: no thread loses a sentence. Threads may be
+    inside together. A C library in which `stderr` is no variable is left alone.
     """
 
     def __init__(self) -> None:
@@ -122,11 +124,13 @@ class ImageError(UserError):
 
 
 def decode(path: str | Path) -> np.ndarray:
-    """Return the image in `path`, a file or a row of a shard (`manifest.files`), as RGB u8 (h, w, 3).
+    """Return the image in `path`, a file or a row of a shard (`manifest.files`), as RGB u8 (h, w,
+    3).
 
-    Grey becomes RGB, an alpha channel is dropped, 16 bits are scaled to 8, and floats are taken as 0..1. Reads PNG,
-    JPEG, TIFF, BMP, WebP and .npy, and obeys orientation tags, as for a video. Raises ImageError for a missing, broken
-    or too large file, and for pixels that are NaN or outside 0..1.
+    Grey becomes RGB, an alpha channel is dropped, 16 bits are scaled to 8, and floats are taken as
+    0..1. Reads PNG, JPEG, TIFF, BMP, WebP and .npy, and obeys orientation tags, as for a video.
+    Raises ImageError for a missing, broken or too large file, and for pixels that are NaN or
+    outside 0..1.
     """
     # copying a Path takes as long as reading the file
     path = path if isinstance(path, Path) else Path(path)
@@ -140,7 +144,9 @@ def decode(path: str | Path) -> np.ndarray:
 
 
 def decode_bytes(data: bytes, name: str | Path, *, as_stored: bool = False) -> np.ndarray:
-    """Return the image in `data` as `decode` does, or its pixels before any scaling; `name` is for errors."""
+    """Return the image in `data` as `decode` does, or its pixels before any scaling; `name` is for
+    errors.
+    """
     try:
         pixels = _unpack(data)
     except (ValueError, EOFError, MemoryError) as error:
@@ -156,7 +162,10 @@ def encode(picture: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:
 
 
 def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
-    """Return pixels as RGB u8 (h, w, 3) by the rules of `decode`; `path` is for errors. Raises ImageError."""
+    """Return pixels as RGB u8 (h, w, 3) by the rules of `decode`; `path` is for errors.
+
+    Raises ImageError.
+    """
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or 0 in pixels.shape:
@@ -186,7 +195,8 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
         pixels = np.rint(pixels.astype(np.float32) * 255).astype(np.uint8)
     elif pixels.dtype != np.uint8:
         raise ImageError(
-            f"{path} has pixels of type {pixels.dtype}; use uint8, uint16 or floats in 0..1, for a list "
+            f"{path} has pixels of type {pixels.dtype}; use uint8, uint16 or floats in 0..1, for a "
+            "list "
             "np.asarray(frame, np.uint8)"
         )
     if pixels.shape[2] == 1:
@@ -235,7 +245,10 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _check_header(data: bytes) -> int:
-    """Return the EXIF orientation (1 for a TIFF). Raises ValueError unless OpenCV unpacks `data` whole and safely."""
+    """Return the EXIF orientation (1 for a TIFF).
+
+    Raises ValueError unless OpenCV unpacks `data` whole and safely.
+    """
     header = next((header for start, header in _HEADERS.items() if data.startswith(start)), None)
     if header is None and not data.startswith(_TIFF):
         if kind := placeholder(data):
@@ -264,7 +277,8 @@ def _check_header(data: bytes) -> int:
             f"it declares {width} x {height} pixels, more than the limit of {MAX_PIXELS}"
         )
     if data.startswith(_JPEG):
-        # OpenCV fills the lost part of some cut JPEG files with grey. The stream is now behind the last header.
+        # OpenCV fills the lost part of some cut JPEG files with grey. The stream is now behind the
+        # last header.
         if data.find(b"\xff\xd9", stream.tell()) < 0:
             raise ValueError("the file is cut short")
         _check_scans(data, max(width * height, 1 << 16))
@@ -284,7 +298,9 @@ def _orientation(image: ImageFile.ImageFile) -> int:
 
 
 def _decoded_chunks(data: bytes) -> bytes:
-    """Return a PNG without needless chunks, walked first: OpenCV allocates what a chunk declares, up to 4 GB."""
+    """Return a PNG without needless chunks, walked first: OpenCV allocates what a chunk declares,
+    up to 4 GB.
+    """
     at = 8
     kind = b""
     headers = 0
@@ -309,7 +325,9 @@ def _decoded_chunks(data: bytes) -> bytes:
 
 
 def _segments(data: bytes) -> Iterator[tuple[bytes, int]]:
-    """Yield (kind, bytes skipped before it) of the segments of a JPEG up to its end, as decoders walk them."""
+    """Yield (kind, bytes skipped before it) of the segments of a JPEG up to its end, as decoders
+    walk them.
+    """
     at = 2
     while (marker := _MARKER.search(data, at)) and marker[1] != _END:
         yield marker[1], marker.start() - at
@@ -330,7 +348,9 @@ def _check_segments(data: bytes) -> None:
 
 
 def _check_scans(data: bytes, pixels: int) -> None:
-    """Bound the time to decode a JPEG; a count of bytes, which may stand elsewhere too, is enough for most."""
+    """Bound the time to decode a JPEG; a count of bytes, which may stand elsewhere too, is enough
+    for most.
+    """
     most = MAX_CODED // pixels
     if data.count(b"\xff" + _SCAN) > most:
         scans = 0
@@ -338,15 +358,18 @@ def _check_scans(data: bytes, pixels: int) -> None:
             scans += kind == _SCAN
             if scans > most or count > 16 * MAX_PARTS:
                 raise ValueError(
-                    f"it has more than {most} scans, which would take minutes; save it as a plain JPEG"
+                    f"it has more than {most} scans, which would take minutes; save it as a plain "
+                    "JPEG"
                 )
 
 
 def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:
-    """Return (width, height). Pillow's image class knows no float colours, so only its directory reader is used.
+    """Return (width, height).
 
-    Raises ValueError for a stack of pictures, of which OpenCV reads the first only, and for 8-bit colours with
-    unassociated alpha, by which OpenCV multiplies them.
+    Pillow's image class knows no float colours, so only its directory reader is used.
+
+    Raises ValueError for a stack of pictures, of which OpenCV reads the first only, and for 8-bit
+    colours with unassociated alpha, by which OpenCV multiplies them.
     """
     data = stream.getvalue()
     order: Literal["little", "big"] = "little" if data[:2] == b"II" else "big"
@@ -362,18 +385,25 @@ def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:
         raise ValueError("it holds several pictures; write a file for each")
     if tags.get(_ALPHA) in (2, (2,)) and tags.get(_BITS, (0,))[0] == 8:
         raise ValueError(
-            "it has an alpha channel by which its colours would be multiplied; write it without alpha"
+            "it has an alpha channel by which its colours would be multiplied; write it without "
+            "alpha"
         )
     return tags[_WIDTH], tags[_HEIGHT]
 
 
 def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
-    """Yield the frames of a video as RGB u8 (h, w, 3). Raises ImageError if it cannot be read or has no frame."""
+    """Yield the frames of a video as RGB u8 (h, w, 3).
+
+    Raises ImageError if it cannot be read or has no frame.
+    """
     return (frame for _, frame in timed_frames(path))
 
 
 def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
-    """Yield (time stamp in seconds, RGB u8 (h, w, 3)) of the frames of a video. Raises ImageError as above."""
+    """Yield (time stamp in seconds, RGB u8 (h, w, 3)) of the frames of a video.
+
+    Raises ImageError as above.
+    """
     path = Path(path)
     if not path.is_file():
         raise ImageError(f"there is no video {path}; give another path")
@@ -400,7 +430,9 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def frame_time(video: Any, number: int, last: float) -> float:
-    """Return the seconds of frame `number` of a cv2.VideoCapture, later than `last`, by its stamp or the frame rate."""
+    """Return the seconds of frame `number` of a cv2.VideoCapture, later than `last`, by its stamp
+    or the frame rate.
+    """
     seconds = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
     if math.isfinite(seconds) and seconds > last:
         return seconds
@@ -420,7 +452,10 @@ def count_frames(path: str | Path) -> int:
 
 
 def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
-    """Open a video, by PyAV if OpenCV cannot decode it. Raises ImageError for no film, and for an unknown codec."""
+    """Open a video, by PyAV if OpenCV cannot decode it.
+
+    Raises ImageError for no film, and for an unknown codec.
+    """
     if Path(path).is_file() and (kind := placeholder(path)):
         raise ImageError(f"{path} is {kind}")
     # FFmpeg takes the part of a relative name before a colon for a protocol
@@ -443,7 +478,8 @@ def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
             return film
     except ImportError:
         raise ImageError(
-            f"OpenCV cannot decode {path}, a video of the codec {codec}: pip install 'anytouch_jax[lerobot]' to read "
+            f"OpenCV cannot decode {path}, a video of the codec {codec}: pip install "
+            "'anytouch_jax[lerobot]' to read "
             "it, or convert it with ffmpeg -i IN -c:v libx264 OUT.mp4"
         ) from None
     except OSError:
@@ -452,7 +488,10 @@ def open_video(path: str | Path) -> cv2.VideoCapture | PyAvFilm:
 
 
 class PyAvFilm:
-    """A film such as AV1, BGR u8 (h, w, 3), with the methods of cv2.VideoCapture. Raises ImportError and OSError."""
+    """A film such as AV1, BGR u8 (h, w, 3), with the methods of cv2.VideoCapture.
+
+    Raises ImportError and OSError.
+    """
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -537,10 +576,11 @@ class PyAvFilm:
 
 
 def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
-    """Return the frames of a folder in order (`frame_order`), and its BACKGROUND and PHOTO images by name.
+    """Return the frames of a folder in order (`frame_order`), and its BACKGROUND and PHOTO images
+    by name.
 
-    Arrays (.npy) count as frames only if there are no pictures. Warns if the names show no order. Raises ImageError if
-    there are no frames.
+    Arrays (.npy) count as frames only if there are no pictures. Warns if the names show no order.
+    Raises ImageError if there are no frames.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -564,7 +604,10 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
 
 
 def picture_files(path: Path) -> list[Path] | None:
-    """Return the picture at `path`, or the frames of a folder in order; None for a film. Raises ImageError."""
+    """Return the picture at `path`, or the frames of a folder in order; None for a film.
+
+    Raises ImageError.
+    """
     if path.is_dir():
         return list_images(path)[0]
     if path.suffix.lower() in SUFFIXES:
@@ -573,7 +616,9 @@ def picture_files(path: Path) -> list[Path] | None:
 
 
 def _suggestion(folder: Path) -> str:
-    """Suggest what to use instead of a folder without pictures: its manifest, or `anytouch data index`."""
+    """Suggest what to use instead of a folder without pictures: its manifest, or `anytouch data
+    index`.
+    """
     entries = sorted(folder.iterdir())
     for file in entries:
         if file.suffix.lower() in (".csv", ".parquet") and is_manifest(file):

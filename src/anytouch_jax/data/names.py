@@ -1,4 +1,6 @@
-"""Names of frames: the order that their numbers show, several recorders in one folder, films and single pictures."""
+"""Names of frames: the order that their numbers show, several recorders in one folder, films and
+single pictures.
+"""
 
 from __future__ import annotations
 
@@ -41,10 +43,11 @@ _SIDE = re.compile(
 
 
 def frame_order(names: Sequence[str]) -> tuple[list[str], bool]:
-    """Return the names of a folder's frames in order, series by series (`split_series`), and whether they show it.
+    """Return the names of a folder's frames in order, series by series (`split_series`), and
+    whether they show it.
 
-    Numbers are compared by value from left to right. One that counts goes first if what stands before it is in no
-    order.
+    Numbers are compared by value from left to right. One that counts goes first if what stands
+    before it is in no order.
     """
     ordered = list[str]()
     is_clear = True
@@ -104,7 +107,9 @@ def _is_rising(column: Sequence[Any]) -> bool:
 
 
 def looks_like_film(names: Sequence[str]) -> bool:
-    """Return whether names of frames, in order, may be those of a film: they count, or give times at a steady rate."""
+    """Return whether names of frames, in order, may be those of a film: they count, or give times
+    at a steady rate.
+    """
     if len(names) < 2:
         return False
     values = [numbers for _, numbers in _series_of(names)]
@@ -127,12 +132,16 @@ def looks_like_film(names: Sequence[str]) -> bool:
 
 
 def frame_numbers(names: Sequence[str]) -> list[int]:
-    """Return the frames' last numbers that differ, if a third of the steps or more are 1; else (times) 0, 1, 2, ..."""
+    """Return the frames' last numbers that differ, if a third of the steps or more are 1; else
+    (times) 0, 1, 2, ...
+    """
     return _counted([numbers for _, numbers in _series_of(names)]) or list(range(len(names)))
 
 
 def _counted(counters: Sequence[tuple[Number, ...]]) -> list[int] | None:
-    """Return the last numbers that differ, if a third of their steps or more are 1 and none is below."""
+    """Return the last numbers that differ, if a third of their steps or more are 1 and none is
+    below.
+    """
     if len(set(map(len, counters))) == 1:
         columns = [column for column in zip(*counters, strict=True) if len(set(column)) > 1]
         numbers = list(columns[-1] if columns else [numbers[-1] for numbers in counters if numbers])
@@ -151,10 +160,11 @@ def _counted(counters: Sequence[tuple[Number, ...]]) -> list[int] | None:
 
 
 def split_series(names: Sequence[str]) -> dict[str, list[str]]:
-    """Return the names of a folder by series, if they are of several recorders; else all of them under "".
+    """Return the names of a folder by series, if they are of several recorders; else all of them
+    under "".
 
-    left_0 and right_0 (0_A and 0_B, 0_D20012 and 0_D20345) are two fingers: they share a number. So are sides or serial
-    numbers that alternate. 12-00-05 is one time.
+    left_0 and right_0 (0_A and 0_B, 0_D20012 and 0_D20345) are two fingers: they share a number. So
+    are sides or serial numbers that alternate. 12-00-05 is one time.
     """
     parts = _series_of(names)
     series: dict[str, list[str]] = {}
@@ -174,7 +184,9 @@ def split_series(names: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _series_of(names: Sequence[str]) -> list[tuple[str, tuple[Number, ...]]]:
-    """Return each name's series (its words, with serials as cam0), and its numbers that count frames."""
+    """Return each name's series (its words, with serials as cam0), and its numbers that count
+    frames.
+    """
     forms: dict[str, list[list[str]]] = {}
     pieces = _number_parts(names)
     for one in pieces:
@@ -206,7 +218,10 @@ def _counters(alike: list[list[str]]) -> list[int]:
 
 
 def _number_parts(names: Sequence[str]) -> list[list[str]]:
-    """Return words and numbers of each name in turn. 1,5 is 1.5; in names with 1.1 and 1.10 the point separates two."""
+    """Return words and numbers of each name in turn.
+
+    1,5 is 1.5; in names with 1.1 and 1.10 the point separates two.
+    """
     stems = [re.sub(r"(?<=\d),(?=\d)", ".", Path(name).stem) for name in names]
     fractions = [number.partition(".")[2] for stem in stems for number in _DECIMAL.findall(stem)]
     is_dotted = len(set(map(len, fractions))) > 1 and any(

@@ -1,4 +1,6 @@
-"""Tokenizers of captions: CLIP's, read from its file, or a small one trained on the captions of a data set."""
+"""Tokenizers of captions: CLIP's, read from its file, or a small one trained on the captions of a
+data set.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,11 @@ END = "<|endoftext|>"
 
 
 class Tokenizer:
-    """A tokenizer with CLIP's conventions: a start token first, an end token last, padding with the end token.
+    """A tokenizer with CLIP's conventions: a start token first, an end token last, padding with the
+    end token.
 
-    There are `vocab_size` ids. The end token `end_id` has the largest one, so that pooling at the largest id (golden
-    Q10) reads its position.
+    There are `vocab_size` ids. The end token `end_id` has the largest one, so that pooling at the
+    largest id (golden Q10) reads its position.
     """
 
     def __init__(self, inner: tokenizers.Tokenizer, name: str = "the tokenizer") -> None:
@@ -30,7 +33,8 @@ class Tokenizer:
         self.vocab_size: int = inner.get_vocab_size()
         if len(empty) != 2 or empty[1] != self.vocab_size - 1:
             raise UserError(
-                f"{name} is not of CLIP's kind: it must put a start and an end token around a text, and the end token "
+                f"{name} is not of CLIP's kind: it must put a start and an end token around a "
+                "text, and the end token "
                 "must have the largest id"
             )
         self.start_id, self.end_id = empty
@@ -39,8 +43,9 @@ class Tokenizer:
     def encode(self, texts: Sequence[str], length: int) -> tuple[np.ndarray, np.ndarray]:
         """Return (ids i32 (L, length), mask bool (L, length)) of L texts.
 
-        A long text keeps its first tokens and the end token. A short text is padded with the end token. The mask is
-        true on real tokens including the first end token. Raises UserError for a length below 2.
+        A long text keeps its first tokens and the end token. A short text is padded with the end
+        token. The mask is true on real tokens including the first end token. Raises UserError for a
+        length below 2.
         """
         if length < 2:
             raise UserError(
@@ -57,7 +62,9 @@ class Tokenizer:
         return ids, mask
 
     def longest(self, texts: Sequence[str]) -> int:
-        """Return the number of tokens of the longest text, start and end included; 2 without texts."""
+        """Return the number of tokens of the longest text, start and end included; 2 without
+        texts.
+        """
         starts = range(0, len(texts), 10_000)
         parts = (
             self._inner.encode_batch_fast(list(texts[start : start + 10_000])) for start in starts
@@ -72,7 +79,10 @@ class Tokenizer:
 
 
 def load_tokenizer(path: str | Path) -> Tokenizer:
-    """Load a `tokenizer.json`; `path` is the file or its folder. Raises UserError if it is missing or unfit."""
+    """Load a `tokenizer.json`; `path` is the file or its folder.
+
+    Raises UserError if it is missing or unfit.
+    """
     path = Path(path).expanduser()
     if not path.exists() and path.name != "tokenizer.json":
         raise UserError(f"there is no tokenizer at {path}; give a tokenizer.json or its folder")
@@ -89,10 +99,12 @@ def load_tokenizer(path: str | Path) -> Tokenizer:
 
 
 def train_tokenizer(captions: Iterable[str], vocab_size: int) -> Tokenizer:
-    """Train a byte-level BPE tokenizer of at most `vocab_size` ids; the same captions give the same ids.
+    """Train a byte-level BPE tokenizer of at most `vocab_size` ids; the same captions give the same
+    ids.
 
-    It encodes any text, in lower case and with single spaces. The start and end token take the last two ids. Raises
-    UserError if there is no caption, or if `vocab_size` is below 258 (the 256 bytes and these two).
+    It encodes any text, in lower case and with single spaces. The start and end token take the last
+    two ids. Raises UserError if there is no caption, or if `vocab_size` is below 258 (the 256 bytes
+    and these two).
     """
     texts = sorted(set(captions))
     if not texts:

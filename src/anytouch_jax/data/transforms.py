@@ -1,7 +1,7 @@
 """Image transforms: pure functions from images (and a generator) to images, uint8 RGB in and out.
 
-Normalisation happens on the device, with the constants in `anytouch_jax.config`. All randomness comes from the
-generator argument, which `augmentation_rng` makes from (seed, epoch, row).
+Normalisation happens on the device, with the constants in `anytouch_jax.config`. All randomness
+comes from the generator argument, which `augmentation_rng` makes from (seed, epoch, row).
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ UNTOUCHED = 128  # grey level of an untouched gel after background subtraction
 
 
 def augmentation_rng(seed: int, epoch: int, row: int, stream: int = TOUCH) -> np.random.Generator:
-    """Return the generator of a row's augmentation, a function of (seed, epoch, row) and of the stream."""
+    """Return the generator of a row's augmentation, a function of (seed, epoch, row) and of the
+    stream.
+    """
     return np.random.default_rng([seed % 2**63, epoch, row, stream])
 
 
@@ -37,11 +39,13 @@ def touch_transform(
     config: DataConfig,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), with one draw for all frames.
+    """Augment a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), with one draw for
+    all frames.
 
-    The whole image is resized (no crop), and flipped in each direction with probability `config.flip`. It is then
-    rotated, shifted and scaled by up to `config.affine` (edges are mirrored; not in the release), and its colours are
-    jittered by `config.jitter`. The result is written into `out` or a new array.
+    The whole image is resized (no crop), and flipped in each direction with probability
+    `config.flip`. It is then rotated, shifted and scaled by up to `config.affine` (edges are
+    mirrored; not in the release), and its colours are jittered by `config.jitter`. The result is
+    written into `out` or a new array.
     """
     across, down = rng.random(2) < config.flip
     out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
@@ -62,7 +66,9 @@ def touch_transform(
 
 
 def _affine(size: int, rng: np.random.Generator, spread: tuple[float, float, float]) -> np.ndarray:
-    """Return a random affine map of pixels, f64 (2, 3): rotation and scaling about the centre, then a shift."""
+    """Return a random affine map of pixels, f64 (2, 3): rotation and scaling about the centre, then
+    a shift.
+    """
     angle, scale, across, down = rng.uniform(-1, 1, 4)
     degrees, share, growth = spread
     centre = (size - 1) / 2
@@ -74,7 +80,9 @@ def _affine(size: int, rng: np.random.Generator, spread: tuple[float, float, flo
 def touch_evaluation(
     frames: Sequence[np.ndarray] | np.ndarray, size: int, out: np.ndarray | None = None
 ) -> np.ndarray:
-    """Resize a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), written into `out` or a new array."""
+    """Resize a still or a clip: T frames u8 (h, w, 3) -> u8 (T, size, size, 3), written into `out`
+    or a new array.
+    """
     out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
     for target, frame in zip(out, frames, strict=True):
         _resize(frame, target)
@@ -82,7 +90,9 @@ def touch_evaluation(
 
 
 def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarray:
-    """Return a frame (h, w, c) turned clockwise by multiples of 90 degrees, then mirrored across or down."""
+    """Return a frame (h, w, c) turned clockwise by multiples of 90 degrees, then mirrored across or
+    down.
+    """
     frame = np.rot90(frame, -rotate // 90) if rotate else frame
     return {"none": frame, "across": frame[:, ::-1], "down": frame[::-1]}[flip]
 
@@ -90,10 +100,11 @@ def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.
 def subtract_background(
     frames: Sequence[np.ndarray] | np.ndarray, background: np.ndarray
 ) -> list[np.ndarray]:
-    """Return background-subtracted frames: frame - background + 128, clipped to u8, for each of T frames u8 (h, w, 3).
+    """Return background-subtracted frames: frame - background + 128, clipped to u8, for each of T
+    frames u8 (h, w, 3).
 
-    The background is an image of the untouched gel. It is resized to the frame's size if they differ. Raises ImageError
-    for one of other proportions.
+    The background is an image of the untouched gel. It is resized to the frame's size if they
+    differ. Raises ImageError for one of other proportions.
     """
 
     def subtract(frame: np.ndarray) -> np.ndarray:
@@ -108,13 +119,16 @@ def subtract_background(
 
 
 def check_proportions(frame: Sequence[int], background: Sequence[int]) -> None:
-    """Raise ImageError if a background (h, w, ...) has other proportions than a frame: it is turned or cropped."""
+    """Raise ImageError if a background (h, w, ...) has other proportions than a frame: it is turned
+    or cropped.
+    """
     (height, width) = frame[:2]
     (high, wide) = background[:2]
     scale = max(high, wide) / max(height, width)
     if max(abs(height * scale - high), abs(width * scale - wide)) > max(high, wide) / FORM:
         raise ImageError(
-            f"the background has {wide} x {high} pixels and the frame {width} x {height}: one of them was turned or "
+            f"the background has {wide} x {high} pixels and the frame {width} x {height}: one of "
+            "them was turned or "
             "cropped; give a picture taken as the frames are"
         )
 
@@ -136,11 +150,12 @@ def colour_jitter(
     jitter: tuple[float, float, float, float],
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Jitter brightness, contrast, saturation and hue in a random order, the same for all frames u8 (T, h, w, 3).
+    """Jitter brightness, contrast, saturation and hue in a random order, the same for all frames u8
+    (T, h, w, 3).
 
-    This is torchvision's ColorJitter in float32, each step clipped, with one rounding at the end. Factors are in 1 +-
-    jitter (at least 0), the hue turns by up to +-jitter of a circle. The result is written into `out` (`frames` is
-    allowed) or a new array.
+    This is torchvision's ColorJitter in float32, each step clipped, with one rounding at the end.
+    Factors are in 1 +- jitter (at least 0), the hue turns by up to +-jitter of a circle. The result
+    is written into `out` (`frames` is allowed) or a new array.
     """
     spread = np.asarray(jitter)
     low = np.maximum(0.0, 1.0 - spread)
@@ -165,10 +180,11 @@ _IDENTITY = np.eye(3, 4)
 
 
 class _Jitter:
-    """One frame under jitter, f32 in 0..255; brightness, contrast and saturation are affine maps of a pixel's colour.
+    """One frame under jitter, f32 in 0..255; brightness, contrast and saturation are affine maps of
+    a pixel's colour.
 
-    `pending` (3, 4) is not yet applied to `image`: maps are composed until a value could leave the range, bounded by
-    `low` and `high`, or until the hue changes.
+    `pending` (3, 4) is not yet applied to `image`: maps are composed until a value could leave the
+    range, bounded by `low` and `high`, or until the hue changes.
     """
 
     def __init__(self, frame: np.ndarray, image: np.ndarray, spare: np.ndarray) -> None:
@@ -190,7 +206,9 @@ class _Jitter:
         cv2.convertScaleAbs(self.image, dst=target)
 
     def _blend(self, operation: int, factor: float) -> None:
-        """Blend with black (0), with the mean grey of the image (1), or with the grey of each pixel (2)."""
+        """Blend with black (0), with the mean grey of the image (1), or with the grey of each pixel
+        (2).
+        """
         step = _IDENTITY * factor
         low = 0.0
         high = 0.0
@@ -224,7 +242,9 @@ class _Jitter:
         self.high = min(self.high, 255.0)
 
     def _rotate_hue(self, factor: float) -> None:
-        """Rotate the hue; the largest and the smallest value of a pixel stay, and so do the bounds."""
+        """Rotate the hue; the largest and the smallest value of a pixel stay, and so do the
+        bounds.
+        """
         self._apply_pending()
         cv2.cvtColor(self.image, cv2.COLOR_RGB2HSV, dst=self.spare)
         hue = self.spare[..., 0]
@@ -240,7 +260,9 @@ def vision_transform(
     rotation: float = 20.0,
     flip: float = 0.5,
 ) -> np.ndarray:
-    """Augment a photograph u8 (h, w, 3) -> u8 (size, size, 3): turn by +-`rotation` degrees, flip, CLIP's resize."""
+    """Augment a photograph u8 (h, w, 3) -> u8 (size, size, 3): turn by +-`rotation` degrees, flip,
+    CLIP's resize.
+    """
     angle = rng.uniform(-rotation, rotation)
     across = rng.random() < flip
     image = _shrink(image, size)
@@ -254,10 +276,11 @@ def vision_transform(
 
 
 def vision_evaluation(image: np.ndarray, size: int) -> np.ndarray:
-    """Resize the short side (bicubic) and crop the centre, as CLIP does: u8 (h, w, 3) -> u8 (size, size, 3).
+    """Resize the short side (bicubic) and crop the centre, as CLIP does: u8 (h, w, 3) -> u8 (size,
+    size, 3).
 
-    The kernel widens as in Pillow, which rounds between the passes: 13 % of the pixels would change by one level. An
-    image more than 6 times too large is first averaged down to about 3 times.
+    The kernel widens as in Pillow, which rounds between the passes: 13 % of the pixels would change
+    by one level. An image more than 6 times too large is first averaged down to about 3 times.
     """
     image = _shrink(image, size)
     height, width = image.shape[:2]
@@ -276,7 +299,10 @@ def vision_evaluation(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _weigh(image: np.ndarray, first: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return rows (size, c) of weighted taps. A matrix product is fifty times slower next to threads."""
+    """Return rows (size, c) of weighted taps.
+
+    A matrix product is fifty times slower next to threads.
+    """
     out = np.zeros((len(first), image.shape[1]), np.float32)
     part = np.empty_like(out)
     for k, weight in enumerate(weights):
@@ -300,7 +326,9 @@ def _shrink(image: np.ndarray, size: int) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _bicubic(before: int, after: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a bicubic resize of the centre: first source pixels i64 (size,), weights from them on f32 (taps, size)."""
+    """Return a bicubic resize of the centre: first source pixels i64 (size,), weights from them on
+    f32 (taps, size).
+    """
     scale = before / after
     start = round((after - size) / 2)
     centre = (np.arange(start, start + size) + 0.5) * scale

@@ -1,4 +1,6 @@
-"""Adaptation to a new sensor: its own tokens, fitted to a few labelled frames with all else frozen (Sec. 3.5)."""
+"""Adaptation to a new sensor: its own tokens, fitted to a few labelled frames with all else frozen
+(Sec. 3.5).
+"""
 
 import contextlib
 import json
@@ -46,7 +48,8 @@ PROTOTYPE_ROWS = 1000  # frames of the known sensors for the prototypes of the c
 class Adapted(NamedTuple):
     """A model with a fitted row of tokens, and how well it fits.
 
-    `params` and `metadata` are of the new run. `before` and `after` are mean losses on frames of `measured`.
+    `params` and `metadata` are of the new run. `before` and `after` are mean losses on frames of
+    `measured`.
     """
 
     config: Config
@@ -70,10 +73,12 @@ def adapt(
     seed: int = 0,
     log: Log = print,
 ) -> Adapted:
-    """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split train.
+    """Return the model of `run` with tokens for `sensor`, fitted to `frames` of its stills in split
+    train.
 
-    `run` is what `load_encoder` takes. The tokens start as the universal ones. The embedding of each frame is drawn to
-    the mean embedding of the known sensors' frames of its class in column `labels`. Raises UserError.
+    `run` is what `load_encoder` takes. The tokens start as the universal ones. The embedding of
+    each frame is drawn to the mean embedding of the known sensors' frames of its class in column
+    `labels`. Raises UserError.
     """
     if frames < 0 or steps < 1:
         raise UserError(f"frames are 0 or more and steps 1 or more, not {frames} and {steps}")
@@ -145,7 +150,10 @@ def check_empty(out: Path) -> None:
 
 
 def save(adapted: Adapted, run: str | Path, out: str | Path) -> None:
-    """Write a run folder for embed, probe and retrieve, whole or not at all. Raises UserError if `out` is not empty."""
+    """Write a run folder for embed, probe and retrieve, whole or not at all.
+
+    Raises UserError if `out` is not empty.
+    """
     check_empty(Path(out))
     text = to_json(adapted.config)
     tokenizer = find_tokenizer(registry.locate(run))
@@ -178,14 +186,16 @@ def choose_frames(
 ) -> np.ndarray:
     """Return `count` rows i64 of a sensor in a split, from as many sequences as possible, in order.
 
-    With `classes` i32 (rows of the manifest,) only rows that have a class (not -1). Raises UserError for too few rows.
+    With `classes` i32 (rows of the manifest,) only rows that have a class (not -1). Raises
+    UserError for too few rows.
     """
     sensors = manifest.text_column("sensor")
     usable_rows = (sensors == sensor) & (manifest.text_column("split") == split)
     rows = np.flatnonzero(usable_rows if classes is None else usable_rows & (classes >= 0))
     if len(rows) < count:
         raise UserError(
-            f"split {split!r} has {len(rows)} usable frames of {sensor}, not {count}; ask for fewer, or name another "
+            f"split {split!r} has {len(rows)} usable frames of {sensor}, not {count}; ask for "
+            "fewer, or name another "
             f"sensor ({', '.join(sorted(set(sensors)))})"
         )
     rows = np.random.default_rng([seed % 2**63, 77]).permutation(rows)
@@ -198,12 +208,16 @@ def choose_frames(
 
 
 def read_model(run: str | Path) -> tuple[Loaded, Params]:
-    """Return the model, and its stored parameters. Raises UserError for an encoder of another family."""
+    """Return the model, and its stored parameters.
+
+    Raises UserError for an encoder of another family.
+    """
     path = registry.locate(run)
     family, weights = load_family(path)
     if family is not None:
         raise UserError(
-            f"{run} is {family.family.title}, which has no tokens to fit; name an encoder of AnyTouch"
+            f"{run} is {family.family.title}, which has no tokens to fit; name an encoder of "
+            "AnyTouch"
         )
     loaded = load_model(path, stored_rows=True, weights=weights)
     return loaded, checkpoint.load_params(path)[0] if loaded.from_run else loaded.params
@@ -228,7 +242,8 @@ def with_row(
         raise UserError(f"{run} was trained on {sensor}; name a new sensor")
     if sensor in model.sensors and trained is None:
         log(
-            f"{run} does not store its trained sensors: the tokens of {sensor} start from the universal ones"
+            f"{run} does not store its trained sensors: the tokens of {sensor} start from the "
+            "universal ones"
         )
     served = convert.serve_unseen(
         params["touch"], model, trained or (), universal_drawn=loaded.universal_drawn
@@ -306,7 +321,9 @@ def _fit(
     rate: float,
     seed: int,
 ) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Return the tokens (S, D) of the row after `steps` of Adam with a cosine schedule, and the loss of each step."""
+    """Return the tokens (S, D) of the row after `steps` of Adam with a cosine schedule, and the
+    loss of each step.
+    """
     tx = optax.adam(optax.cosine_decay_schedule(rate, steps))
     arrays = jax.device_put((params, clip, target))
 

@@ -1,4 +1,7 @@
-"""Equal batches, unit rows, rows of sensors, spread of features. All in numpy, for `info` and exported encoders."""
+"""Equal batches, unit rows, rows of sensors, spread of features.
+
+All in numpy, for `info` and exported encoders.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +35,14 @@ def warn(sentence: str) -> None:
 
 
 def check_features(values: np.ndarray) -> np.ndarray:
-    """Return what an encoder computed. Raises UserError if it is not finite, since finite weights may overflow."""
+    """Return what an encoder computed.
+
+    Raises UserError if it is not finite, since finite weights may overflow.
+    """
     if not np.isfinite(values).all():
         raise UserError(
-            "the features are not finite (NaN or infinite): the weights are damaged or much too large. Load them again "
+            "the features are not finite (NaN or infinite): the weights are damaged or much too "
+            "large. Load them again "
             "from their source, or take an earlier checkpoint."
         )
     return values
@@ -46,8 +53,9 @@ def run_in_batches(
 ) -> np.ndarray:
     """Return the results (n, ...) of `function` over n items, in batches of `size`.
 
-    Arrays are stacked, and tuples of arrays one by one. The last batch is filled up with its last item, so that one
-    shape is compiled. Without items the result is of shape (0,). Raises UserError for results that are not finite.
+    Arrays are stacked, and tuples of arrays one by one. The last batch is filled up with its last
+    item, so that one shape is compiled. Without items the result is of shape (0,). Raises UserError
+    for results that are not finite.
     """
     values = list[np.ndarray]()
     left = iter(items)
@@ -65,7 +73,9 @@ def run_in_batches(
 
 
 def binary_scale(values: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Return the exponent e of two that brings the largest |value| * 2**-e below 1, so that squares do not overflow."""
+    """Return the exponent e of two that brings the largest |value| * 2**-e below 1, so that squares
+    do not overflow.
+    """
     return np.frexp(np.abs(values).max(axis=axis, keepdims=True, initial=0.0))[1]
 
 
@@ -80,13 +90,17 @@ def as_array(values: Any, name: str) -> np.ndarray:
 
 
 def check_frames(model: ModelConfig, frames: int) -> None:
-    """Raise UserError unless a touch may have `frames` frames: 1 (a still), or at least those of the model's clips."""
+    """Raise UserError unless a touch may have `frames` frames: 1 (a still), or at least those of
+    the model's clips.
+    """
     if frames != 1 and frames < model.frames:
         raise UserError(f"a clip needs {model.frames} frames or more (or 1, a still), not {frames}")
 
 
 def filled(batch: np.ndarray) -> np.ndarray:
-    """Return a batch (n, ...) with zeros up to 1, 2, 4, ... 64, 128, 192, ... rows: each number of rows is compiled."""
+    """Return a batch (n, ...) with zeros up to 1, 2, 4, ... 64, 128, 192, ... rows: each number of
+    rows is compiled.
+    """
     count = len(batch)
     size = 1 << max(count - 1, 0).bit_length() if count <= 64 else -(-count // 64) * 64
     if count == size:
@@ -95,13 +109,17 @@ def filled(batch: np.ndarray) -> np.ndarray:
 
 
 def unit_rows(values: np.ndarray) -> np.ndarray:
-    """Return rows (n, d) divided by their Euclidean norms, of any magnitude; a row of zeros stays zero."""
+    """Return rows (n, d) divided by their Euclidean norms, of any magnitude; a row of zeros stays
+    zero.
+    """
     values = np.ldexp(values, -binary_scale(values, 1))
     return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
 
 
 def spread_lines(values: np.ndarray) -> list[str]:
-    """Return a line with the mean cosine of pairs of features (n, d), and a warning if they are nearly constant."""
+    """Return a line with the mean cosine of pairs of features (n, d), and a warning if they are
+    nearly constant.
+    """
     rows = np.asarray(
         values[np.linspace(0, len(values) - 1, min(len(values), SPREAD_ROWS)).astype(int)],
         np.float64,
@@ -114,20 +132,25 @@ def spread_lines(values: np.ndarray) -> list[str]:
     lines = [f"spread: the mean cosine of two features is {cosine:.4f}"]
     if cosine > SPREAD_LEAST:
         lines.append(
-            f"The features are nearly constant: a mean cosine above {SPREAD_LEAST} cannot distinguish touches. "
+            f"The features are nearly constant: a mean cosine above {SPREAD_LEAST} cannot "
+            "distinguish touches. "
             "Train longer, and check background subtraction and that the frames differ."
         )
     return lines
 
 
 def rows_of_sensors(sensor: Any, count: int, row: Callable[[str], int], rows: int) -> np.ndarray:
-    """Return rows i32 (count,) of a sensor name (by `row`), of names (count,), or of numbers. Raises UserError."""
+    """Return rows i32 (count,) of a sensor name (by `row`), of names (count,), or of numbers.
+
+    Raises UserError.
+    """
     ids = np.full(count, row(sensor)) if isinstance(sensor, str) else np.asarray(sensor)
     if ids.dtype.kind in "UO":
         ids = np.array([row(name) for name in ids.reshape(-1)], np.int32).reshape(ids.shape)
     if ids.shape != (count,) or ids.dtype.kind not in "iu":
         raise UserError(
-            f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} {ids.shape}"
+            f"sensor rows must be one integer for each of the {count} touches, not {ids.dtype} "
+            f"{ids.shape}"
         )
     if ids.min(initial=0) < 0 or ids.max(initial=0) >= rows:
         raise UserError(f"sensor rows must be 0 to {rows - 1}")

@@ -1,4 +1,6 @@
-"""The touch encoder with its image and text towers: features, similarity, matching, preprocessing."""
+"""The touch encoder with its image and text towers: features, similarity, matching,
+preprocessing.
+"""
 
 from __future__ import annotations
 
@@ -53,10 +55,11 @@ _PART_NAMES = {
 class Encoder:
     """A touch encoder with its parameters, and the image and text towers if the weights have them.
 
-    `config` and `params` are those of the touch encoder alone, `source` is the path of the weights. If training never
-    drew the universal tokens (`universal_drawn`), the mean of the trained sensors' tokens is used instead. `others` are
-    the parameters of towers, decoder and heads of the `whole` model: they stay on the host until they are used.
-    `engine` computes touch by what `exporter` returns (`cached_export`); XLA computes all else.
+    `config` and `params` are those of the touch encoder alone, `source` is the path of the weights.
+    If training never drew the universal tokens (`universal_drawn`), the mean of the trained
+    sensors' tokens is used instead. `others` are the parameters of towers, decoder and heads of the
+    `whole` model: they stay on the host until they are used. `engine` computes touch by what
+    `exporter` returns (`cached_export`); XLA computes all else.
     """
 
     config: Config = field(repr=False)
@@ -75,19 +78,27 @@ class Encoder:
         return described(f"{type(self).__name__} {self.source}", **self.about())
 
     def about(self) -> dict[str, str]:
-        """Return what a user wants to know: family, parameters, input, background, features and sensors."""
+        """Return what a user wants to know: family, parameters, input, background, features and
+        sensors.
+        """
         model = self.config.model
         count = sum(math.prod(leaf.shape) for leaf in leaves(self.params))
         towers = [_PART_NAMES[name] for name in ("image", "text") if name in self.others]
         trained = self.trained_sensors
         background = "subtracted if it is given" if self.subtracts else "not used"
         return {
-            "family": f"AnyTouch, width {model.touch.width}, depth {model.touch.depth}, {model.touch.heads} heads"
+            "family": (
+                f"AnyTouch, width {model.touch.width}, depth {model.touch.depth}, "
+                f"{model.touch.heads} heads"
+            )
             + (f", with {' and '.join(towers)}" if towers else ""),
             "parameters": count_of(count) + (" of the touch encoder" if towers else "")
             if count
             else "",
-            "input": f"uint8 RGB {model.image_size} x {model.image_size}, 1 frame or clips of {model.frames} or more",
+            "input": (
+                f"uint8 RGB {model.image_size} x {model.image_size}, 1 frame or clips of "
+                f"{model.frames} or more"
+            ),
             "background": "needed, the picture of the untouched gel"
             if self.needs_background
             else background,
@@ -104,7 +115,9 @@ class Encoder:
         return build(self.config.model)
 
     def sensor_row(self, name: str, log: Log = warn) -> int:
-        """Return the row of a sensor, or, logged, of the universal tokens (Sec. 3.5). SpellingError for a near name."""
+        """Return the row of a sensor, or, logged, of the universal tokens (Sec. 3.5). SpellingError
+        for a near name.
+        """
         model = self.config.model
         name = str(name)
         drawn = self.universal_drawn or not self.trained_sensors
@@ -130,7 +143,9 @@ class Encoder:
         return model.universal_row
 
     def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
-        """Return the same encoder with float32 or bfloat16 arithmetic; "trained" is that of its training."""
+        """Return the same encoder with float32 or bfloat16 arithmetic; "trained" is that of its
+        training.
+        """
         if dtype == "trained":
             return self
         whole = self.whole and replace(self.whole, dtype=dtype)
@@ -162,12 +177,17 @@ class Encoder:
         return np.zeros((self.config.model.image_size, self.config.model.image_size, 3), np.uint8)
 
     def input_form(self, frames: int) -> dict[str, Any]:
-        """Return what an exported encoder says about its input, and how a picture becomes a frame of it."""
+        """Return what an exported encoder says about its input, and how a picture becomes a frame
+        of it.
+        """
         side = self.config.model.image_size
         subtracts = self.subtracts
         difference = ", background-subtracted: clip(frame - gel + 128, 0, 255)" if subtracts else ""
         return {
-            "input": f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){difference}; sensor: int32 (B,)",
+            "input": (
+                f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){difference}; sensor: int32 "
+                "(B,)"
+            ),
             "resize": f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where the "
             f"shorter side is above {side} pixels, else INTER_LINEAR"
             + ("; the background is subtracted before" if subtracts else ""),
@@ -189,24 +209,31 @@ class Encoder:
     def traceable(
         self, pooling: Pooling = "class", join: Join = "mean"
     ) -> Callable[..., jax.Array]:
-        """Return the function from params, touches u8 (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
+        """Return the function from params, touches u8 (B, T, H, W, 3) and sensor rows (B,) to
+        features (B, E).
+        """
         return partial(touch_features, net=self.net, pooling=pooling, join=join)
 
     def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
-        """Return a frame u8 (h, w, 3) as the network reads it, its `background` subtracted if there is one."""
+        """Return a frame u8 (h, w, 3) as the network reads it, its `background` subtracted if there
+        is one.
+        """
         frames = [frame] if background is None else subtract_background([frame], background)
         return touch_evaluation(frames, self.config.model.image_size)[0]
 
     def preprocess(
         self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None
     ) -> np.ndarray:
-        """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder does so.
+        """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder
+        does so.
 
-        Raises UserError if the encoder needs a `background`, and there is none. `untouched_gel(frames)` makes one.
+        Raises UserError if the encoder needs a `background`, and there is none.
+        `untouched_gel(frames)` makes one.
         """
         if self.needs_background and background is None:
             raise UserError(
-                f"{self.source} subtracts the untouched gel. Give its picture, or that of some frames: "
+                f"{self.source} subtracts the untouched gel. Give its picture, or that of some "
+                "frames: "
                 "encoder.preprocess(frame, at.untouched_gel(frames)). Or prepare all frames with "
                 "at.Preprocess(encoder, frames=frames)."
             )
@@ -220,11 +247,13 @@ class Encoder:
         pooling: Pooling = "class",
         join: Join = "mean",
     ) -> np.ndarray:
-        """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3); not unit-norm.
+        """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3);
+        not unit-norm.
 
-        H and W are the model's size, see `preprocess`. T is 1 (a still), 3 (a clip) or more: then features of segments
-        of three are joined by `join`. `sensor` is one name, names (B,), or rows i32 (B,). `pooling`: the class token
-        (which alignment trains), the mean of the patch tokens, or both (B, 2E). Raises UserError.
+        H and W are the model's size, see `preprocess`. T is 1 (a still), 3 (a clip) or more: then
+        features of segments of three are joined by `join`. `sensor` is one name, names (B,), or
+        rows i32 (B,). `pooling`: the class token (which alignment trains), the mean of the patch
+        tokens, or both (B, 2E). Raises UserError.
         """
         frames = as_clips(frames)
         side = self.config.model.image_size
@@ -233,7 +262,8 @@ class Encoder:
                 frames.dtype != np.uint8
             )
             raise UserError(
-                f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), not {frames.dtype} "
+                f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), "
+                f"not {frames.dtype} "
                 f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
             )
         arrays.check_frames(self.config.model, frames.shape[1])
@@ -246,7 +276,9 @@ class Encoder:
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
 
     def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Any:
-        """Return the export on its engine for touches of `frames` frames, None if XLA computes them."""
+        """Return the export on its engine for touches of `frames` frames, None if XLA computes
+        them.
+        """
         if self.engine == "xla" or self.exporter is None:
             return None
         refuse_forked()
@@ -258,7 +290,9 @@ class Encoder:
     def _encode(
         self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any
     ) -> np.ndarray:
-        """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled for a few B and `key`s."""
+        """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled for a
+        few B and `key`s.
+        """
         rows = arrays.rows_of_sensors(
             sensor, len(clips), self.sensor_row, len(self.config.model.sensors)
         )
@@ -286,7 +320,10 @@ class Encoder:
         return load_tokenizer(self.tokenizer_file)
 
     def encode_image(self, images: Any, *, batch: int = 64) -> np.ndarray:
-        """Return embeddings f32 (B, E) of photographs RGB (h, w, 3), not unit-norm. UserError without a tower."""
+        """Return embeddings f32 (B, E) of photographs RGB (h, w, 3), not unit-norm.
+
+        UserError without a tower.
+        """
 
         def run(net: Net, params: Params, pixels: jax.Array) -> jax.Array:
             return net.encode_image(params, normalise_image(pixels)).astype(jnp.float32)
@@ -300,7 +337,10 @@ class Encoder:
         return self._embeddings(tower, pixels, batch)
 
     def encode_text(self, texts: str | Sequence[str], *, batch: int = 64) -> np.ndarray:
-        """Return embeddings f32 (L, E) of texts, not unit-norm. Raises UserError without a text tower or tokenizer."""
+        """Return embeddings f32 (L, E) of texts, not unit-norm.
+
+        Raises UserError without a text tower or tokenizer.
+        """
 
         def run(net: Net, params: Params, batch: tuple[jax.Array, jax.Array]) -> jax.Array:
             return net.encode_text(params, *batch).astype(jnp.float32)
@@ -311,11 +351,13 @@ class Encoder:
         text = self.whole.text
         if tokenizer is None:
             raise UserError(
-                f"there is no tokenizer.json in the folder of {self.source}; copy the one of its training"
+                f"there is no tokenizer.json in the folder of {self.source}; copy the one of its "
+                "training"
             )
         if tokenizer.vocab_size > text.vocab:
             raise UserError(
-                f"{self.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of {self.source} has "
+                f"{self.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of "
+                f"{self.source} has "
                 f"{text.vocab}; copy the tokenizer of its training"
             )
         texts = [texts] if isinstance(texts, str) else list(texts)
@@ -335,17 +377,19 @@ class Encoder:
     ) -> Fields:
         """Return depth, shear, contact and force of B frames in mm and N, with their deviations.
 
-        `frames` are those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), whose
-        last frame is measured. A still shows little of slip. `background` is the untouched gel. A sensor that
-        is not in `fields.GELS` needs `width_mm`, the mm that the picture's width shows. Without it lengths are shares
-        of that width, and there is no force. Raises UserError if the weights do not measure.
+        `frames` are those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B,
+        T, h, w, 3), whose last frame is measured. A still shows little of slip. `background` is the
+        untouched gel. A sensor that is not in `fields.GELS` needs `width_mm`, the mm that the
+        picture's width shows. Without it lengths are shares of that width, and there is no force.
+        Raises UserError if the weights do not measure.
         """
         measure = self.measure_of(sensor, background, width_mm, log)
         frames = arrays.as_array(frames, "frames")
         clips = as_clips(frames[..., None] if frames.ndim == 2 else frames)
         if clips.ndim != 5 or not len(clips):
             raise UserError(
-                f"frames must be (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), not {frames.shape}"
+                "frames must be (h, w, 3), (B, h, w, 3) or clips (B, T, h, w, 3), not "
+                f"{frames.shape}"
             )
         arrays.check_frames(self.config.model, clips.shape[1])
         clips = clips[:, -self.config.model.frames :]
@@ -374,7 +418,10 @@ class Encoder:
         rotate: int = 0,
         flip: Flip = "none",
     ) -> Measure:
-        """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it. Raises UserError."""
+        """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it.
+
+        Raises UserError.
+        """
         gel = (
             None
             if background is None
@@ -392,9 +439,11 @@ class Encoder:
     def encode_and_measure(
         self, clips: np.ndarray, rows: np.ndarray, aspect: np.ndarray, pooling: Pooling = "class"
     ) -> tuple[np.ndarray, FieldOutput]:
-        """Return features and raw fields, see `nn.fields`, of prepared clips u8 (B, T, H, W, 3) in one pass.
+        """Return features and raw fields, see `nn.fields`, of prepared clips u8 (B, T, H, W, 3) in
+        one pass.
 
-        `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over width.
+        `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over
+        width.
         """
         if (
             self.measures
@@ -433,10 +482,11 @@ class Encoder:
         *,
         probabilities: bool = False,
     ) -> np.ndarray:
-        """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text embeddings (L, E).
+        """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text
+        embeddings (L, E).
 
-        `probabilities` are their softmax with the learned temperature: a zero-shot classifier. UserError without a
-        tower.
+        `probabilities` are their softmax with the learned temperature: a zero-shot classifier.
+        UserError without a tower.
         """
         embeddings = (
             texts
@@ -457,9 +507,11 @@ class Encoder:
         return np.asarray(jax.nn.softmax(scale() * cosine, axis=1))
 
     def match(self, first: npt.ArrayLike, second: npt.ArrayLike) -> np.ndarray:
-        """Return matching logits f32 (B,) of two sets of touch features (B, E), pooling class (Eq. 5).
+        """Return matching logits f32 (B,) of two sets of touch features (B, E), pooling class (Eq.
+        5).
 
-        A positive logit predicts the same place. Raises UserError without a matching head, and for other shapes.
+        A positive logit predicts the same place. Raises UserError without a matching head, and for
+        other shapes.
         """
 
         def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
@@ -471,14 +523,17 @@ class Encoder:
         )
         if one.shape != other.shape or one.ndim != 2:
             raise UserError(
-                f"match takes two sets of features of one shape (B, E), not {one.shape}, {other.shape}"
+                f"match takes two sets of features of one shape (B, E), not {one.shape}, "
+                f"{other.shape}"
             )
         return np.asarray(head(arrays.filled(one), arrays.filled(other)))[: len(one)]
 
     def _part(
         self, method: str, run: Callable[..., jax.Array], name: str, *more: str
     ) -> Callable[..., jax.Array]:
-        """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
+        """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go
+        to the device.
+        """
         params = {name: self.part_params(name)}
         if method not in self._compiled:
             params |= {key: self.others[key] for key in more if key in self.others}
@@ -494,10 +549,14 @@ class Encoder:
         return call
 
     def part_params(self, name: str) -> Params:
-        """Return the parameters of a part: image, text, decoder, matcher or logit_scale. Raises UserError."""
+        """Return the parameters of a part: image, text, decoder, matcher or logit_scale.
+
+        Raises UserError.
+        """
         if name not in self.others:
             raise UserError(
-                f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has one"
+                f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has "
+                "one"
             )
         return dict(self.others)[name]
 
@@ -505,10 +564,11 @@ class Encoder:
 class Preprocess:
     """Frames of one sensor in the form that an encoder was trained on.
 
-    They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and resized. For an encoder
-    that `subtracts`, the `background` (a picture of the untouched gel) is subtracted first, or the `untouched_gel` of
-    `frames`. Without either, the first frame chooses among the `known` pictures of a head. If none is of its unit,
-    `log` gets a warning, and the frames so far give a running estimate, as for an encoder that needs a background.
+    They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and
+    resized. For an encoder that `subtracts`, the `background` (a picture of the untouched gel) is
+    subtracted first, or the `untouched_gel` of `frames`. Without either, the first frame chooses
+    among the `known` pictures of a head. If none is of its unit, `log` gets a warning, and the
+    frames so far give a running estimate, as for an encoder that needs a background.
 
     >>> features = encoder.encode_touch(Preprocess(encoder, frames=frames)(camera.read()), "digit")
     """
@@ -541,7 +601,9 @@ class Preprocess:
 
     @property
     def background(self) -> np.ndarray | None:
-        """The picture of the untouched gel, RGB u8 (h, w, 3), as the camera takes it; None if there is none (yet)."""
+        """The picture of the untouched gel, RGB u8 (h, w, 3), as the camera takes it; None if there
+        is none (yet).
+        """
         if self._background is None and self._running:
             return self._running.picture
         return self._background
@@ -562,7 +624,9 @@ class Preprocess:
         return f"Preprocess(frames of {getattr(encoder, 'source', 'an encoder')}, {used}, {turned})"
 
     def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
-        """Return a camera's frame (h, w, 3), or grey, RGBA, u16 or floats in 0..1, as the encoder reads it."""
+        """Return a camera's frame (h, w, 3), or grey, RGBA, u16 or floats in 0..1, as the encoder
+        reads it.
+        """
         frame = to_rgb(arrays.as_array(frame, "the frame"), "the frame")
         if self._background is None and self._known:
             known = self._known
@@ -591,13 +655,19 @@ def _unit(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
 
 
 def precision(config: Config) -> AbstractContextManager[Any]:
-    """Return a context with 64 bits for a float64 model, else 32. Raises UserError if this process cannot use jax."""
+    """Return a context with 64 bits for a float64 model, else 32.
+
+    Raises UserError if this process cannot use jax.
+    """
     refuse_forked()
     return jax.enable_x64(config.model.dtype == "float64")
 
 
 def as_clips(frames: Any) -> np.ndarray:
-    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips. Raises UserError for frames of two sizes."""
+    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips.
+
+    Raises UserError for frames of two sizes.
+    """
     frames = arrays.as_array(frames, "frames")
     if frames.ndim == 3:
         return frames[None, None]
@@ -616,7 +686,9 @@ def check_choices(pooling: Pooling, join: Join) -> None:
 def touch_features(
     params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
 ) -> jax.Array:
-    """Return features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,): a traceable `encode_touch`."""
+    """Return features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,): a traceable
+    `encode_touch`.
+    """
     check_choices(pooling, join)
     clips = normalise_touch(clips)
     if pooling == "class":
@@ -635,7 +707,9 @@ def features_and_fields(
     net: Net,
     pooling: Pooling,
 ) -> tuple[jax.Array, FieldOutput]:
-    """Return features f32 (B, E) and fields of touches u8 (B, T, H, W, 3), sensor rows and aspects (B,)."""
+    """Return features f32 (B, E) and fields of touches u8 (B, T, H, W, 3), sensor rows and aspects
+    (B,).
+    """
     check_choices(pooling, "mean")
     token, mean, out = net.encode_and_measure(params, normalise_touch(clips), sensor, aspect)
     values = {"class": (token,), "mean": (mean,), "both": (token, mean)}[pooling]

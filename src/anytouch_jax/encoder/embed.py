@@ -1,4 +1,5 @@
-"""Embedding of many touches: arrays, manifest rows, frames of a folder or a video; features files, and search in them.
+"""Embedding of many touches: arrays, manifest rows, frames of a folder or a video; features files,
+and search in them.
 
 Search is exact, by numpy, or `approximate`, by FAISS (an extra).
 """
@@ -46,8 +47,9 @@ SHOWN = ("path", "frame_index", "sensor", "unit", "sequence", "object")
 class Features:
     """Features f32 (n, d), their `rows` i64 (n,) and further `keys` (n,).
 
-    Rows are those of a manifest, or frame numbers of a video or folder. `predictions`: arrays (n, ...) of a head.
-    `skipped` counts rows without features. `gels`: pictures of the untouched gel by unit.
+    Rows are those of a manifest, or frame numbers of a video or folder. `predictions`: arrays (n,
+    ...) of a head. `skipped` counts rows without features. `gels`: pictures of the untouched gel by
+    unit.
     """
 
     values: np.ndarray
@@ -75,10 +77,11 @@ def embed_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (row numbers i64 (n,), features f32 (n, d)) of manifest rows, each frame encoded once.
 
-    A row's clip is the `frames` frames that end at it. An unknown sensor gets the universal tokens, which is logged;
-    `sensor_row` serves all rows. `edit` changes clips u8 (B, T, H, W, 3) of rows (B,) before they are encoded. With
-    `on_bad_sample` "skip", rows that cannot be read are left out, and the first are logged. So are rows without a
-    picture of the untouched gel (`gels`), if the encoder needs one. Raises UserError.
+    A row's clip is the `frames` frames that end at it. An unknown sensor gets the universal tokens,
+    which is logged; `sensor_row` serves all rows. `edit` changes clips u8 (B, T, H, W, 3) of rows
+    (B,) before they are encoded. With `on_bad_sample` "skip", rows that cannot be read are left
+    out, and the first are logged. So are rows without a picture of the untouched gel (`gels`), if
+    the encoder needs one. Raises UserError.
     """
     if not len(rows):
         raise UserError("there are no rows to embed; check the split and the filters")
@@ -140,10 +143,12 @@ def embed_frames(
     join: Join = "mean",
     batch: int = BATCH,
 ) -> Features:
-    """Return features of every clip of `length` consecutive frames, keyed by the place of its last frame.
+    """Return features of every clip of `length` consecutive frames, keyed by the place of its last
+    frame.
 
-    `frames` yields number, name ("" for a video) and pixels of each frame, None for an unreadable one, which no clip
-    spans. `preprocess` is `encoder.preprocess` by default. Raises UserError if there is no clip.
+    `frames` yields number, name ("" for a video) and pixels of each frame, None for an unreadable
+    one, which no clip spans. `preprocess` is `encoder.preprocess` by default. Raises UserError if
+    there is no clip.
     """
     prepare = encoder.preprocess if preprocess is None else preprocess
     names = list[str]()
@@ -179,24 +184,31 @@ def embed_frames(
 def rows_with_gel(
     encoder: Encoder, gels: UnitGels | None, rows: np.ndarray, log: Log = warn
 ) -> np.ndarray:
-    """Return those of `rows` that have an untouched gel, if the encoder needs one. Raises UserError if none has one."""
+    """Return those of `rows` that have an untouched gel, if the encoder needs one.
+
+    Raises UserError if none has one.
+    """
     if not encoder.needs_background or gels is None:
         return rows
     has = gels.has(rows)
     if not has.any():
         raise UserError(
-            f"{encoder.source} subtracts the untouched gel. {len(rows)} rows have no picture of it, and too few frames "
+            f"{encoder.source} subtracts the untouched gel. {len(rows)} rows have no picture of "
+            "it, and too few frames "
             f"to estimate it. {ADVICE}"
         )
     if not has.all():
         log(
-            f"{(~has).sum()} of {len(rows)} rows have no picture of the untouched gel, and are left out"
+            f"{(~has).sum()} of {len(rows)} rows have no picture of the untouched gel, and are "
+            "left out"
         )
     return rows[has]
 
 
 def plain_column(manifest: Manifest, name: str) -> np.ndarray:
-    """Return a column of a manifest as an array without objects: numbers with NaN for null, all others as text."""
+    """Return a column of a manifest as an array without objects: numbers with NaN for null, all
+    others as text.
+    """
     kind = manifest.column(name).type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
         return manifest.text_column(name)
@@ -206,7 +218,10 @@ def plain_column(manifest: Manifest, name: str) -> np.ndarray:
 
 
 def save_npz(path: str | Path, features: Features, metadata: dict[str, str]) -> None:
-    """Write features, rows, keys and metadata as one `.npz`, whole or not at all. Raises OSError."""
+    """Write features, rows, keys and metadata as one `.npz`, whole or not at all.
+
+    Raises OSError.
+    """
     described = {f"about/{name}": np.asarray(value) for name, value in metadata.items()}
     keys = {f"key/{name}": values for name, values in features.keys.items()}
     arrays: dict[str, Any] = {"features": features.values, "rows": features.rows}
@@ -216,7 +231,10 @@ def save_npz(path: str | Path, features: Features, metadata: dict[str, str]) -> 
 
 
 def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
-    """Return the features and the metadata of a file of `save_npz`. Raises UserError for any other file."""
+    """Return the features and the metadata of a file of `save_npz`.
+
+    Raises UserError for any other file.
+    """
     try:
         arrays = read_arrays(path)
         gels = gels_of_arrays(arrays)
@@ -226,11 +244,13 @@ def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
     numeric = values.dtype.kind in "fiu" and rows.dtype.kind in "iu"
     if values.ndim != 2 or not numeric or rows.shape != values.shape[:1] or not len(rows):
         raise UserError(
-            f"{path} needs numeric arrays features (n, d) and rows (n,), not {values.shape}, {rows.shape}."
+            f"{path} needs numeric arrays features (n, d) and rows (n,), not {values.shape}, "
+            f"{rows.shape}."
         )
     if not values.shape[1] or not np.isfinite(values).all():
         raise UserError(
-            f"{path}: the array features has no columns, or values that are not finite (NaN or infinite)."
+            f"{path}: the array features has no columns, or values that are not finite (NaN or "
+            "infinite)."
         )
     keys = {
         name.removeprefix("key/"): array
@@ -250,8 +270,11 @@ def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
 
 
 def nearest(z_train: Array, z_rows: Array, k: int) -> tuple[Array, Array]:
-    """Return row numbers in `z_train` and cosines of the k nearest of each unit row of `z_rows`, nearest first."""
-    # scikit-learn's NearestNeighbors, brute force, takes 1.5 (euclidean) to 6 times longer (cosine) on 100,000 rows.
+    """Return row numbers in `z_train` and cosines of the k nearest of each unit row of `z_rows`,
+    nearest first.
+    """
+    # scikit-learn's NearestNeighbors, brute force, takes 1.5 (euclidean) to 6 times longer (cosine)
+    # on 100,000 rows.
     k = min(k, len(z_train))
     ids = np.empty((len(z_rows), k), np.int64)
     cosines = np.empty((len(z_rows), k), np.float32)
@@ -263,7 +286,8 @@ def nearest(z_train: Array, z_rows: Array, k: int) -> tuple[Array, Array]:
 
 def _largest(values: Array, k: int, block: int = 64) -> tuple[Array, Array]:
     """Return columns and values of the k largest of each row, largest first."""
-    # They lie in the k blocks of columns with the largest maxima. Partitioning whole rows takes ten times longer.
+    # They lie in the k blocks of columns with the largest maxima. Partitioning whole rows takes ten
+    # times longer.
     blocks = values.shape[1] // block
     columns = np.broadcast_to(np.arange(values.shape[1]), values.shape)
     if blocks > 2 * k:
@@ -281,7 +305,9 @@ def _largest(values: Array, k: int, block: int = 64) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class TouchIndex:
-    """Unit features f32 (n, d), their `rows` and `keys` (n,), metadata `about` them, and untouched `gels` by unit."""
+    """Unit features f32 (n, d), their `rows` and `keys` (n,), metadata `about` them, and untouched
+    `gels` by unit.
+    """
 
     values: Array
     rows: Array
@@ -304,7 +330,10 @@ class TouchIndex:
         )
 
     def search(self, features: Array, count: int = 10) -> tuple[Array, Array]:
-        """Return row numbers and cosines (m, count), nearest first, of features (m, d). Raises UserError."""
+        """Return row numbers and cosines (m, count), nearest first, of features (m, d).
+
+        Raises UserError.
+        """
         features = np.atleast_2d(np.asarray(features, np.float32))
         if (
             features.ndim != 2
@@ -328,7 +357,8 @@ class TouchIndex:
         """Raise UserError unless the index was made by the encoder with that fingerprint."""
         if self.about.get("weights") != fingerprint:
             raise UserError(
-                f"{self.source} was made by another encoder ({self.about.get('weights', 'unknown')}) than {source} "
+                f"{self.source} was made by another encoder "
+                f"({self.about.get('weights', 'unknown')}) than {source} "
                 f"({fingerprint}). Embed again, or name its encoder with --model."
             )
 
@@ -339,7 +369,10 @@ class TouchIndex:
 
 
 def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
-    """Return the index of a features file. Raises UserError for another file, and without FAISS if `approximate`."""
+    """Return the index of a features file.
+
+    Raises UserError for another file, and without FAISS if `approximate`.
+    """
     features, about = read_npz(path)
     unit = unit_rows(features.values).astype(np.float32)
     cells = _cells(unit) if approximate else None
@@ -347,7 +380,9 @@ def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
 
 
 def _cells(values: Array) -> Any:
-    """Return an inverted file: cells around middles of k-means, of which a search looks into the nearest."""
+    """Return an inverted file: cells around middles of k-means, of which a search looks into the
+    nearest.
+    """
     try:
         import faiss
     except ImportError:

@@ -56,15 +56,17 @@ def load_encoder(
 ) -> Encoder:
     """Load an encoder: by name, or of a run folder, a checkpoint folder or a weights file.
 
-    Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face hub. Weights files
-    are .pth, .bin, .safetensors, .npz or an .onnx of `anytouch export`. `step` chooses a checkpoint of a run, the
-    latest by default. Image and text towers are loaded too. `engine` computes the features of touch, see
-    `cached_export`: "auto" is onnxruntime on a CPU where it is exact, else XLA.
+    Names are those of `list_encoders`, and addresses hf://user/repo[@revision] on the Hugging Face
+    hub. Weights files are .pth, .bin, .safetensors, .npz or an .onnx of `anytouch export`. `step`
+    chooses a checkpoint of a run, the latest by default. Image and text towers are loaded too.
+    `engine` computes the features of touch, see `cached_export`: "auto" is onnxruntime on a CPU
+    where it is exact, else XLA.
 
-    Files of other families (Sparsh, T3, AnyTouch 2, SITR, DINOv2, DINOv3, SigLIP, ViT-MAE, ViT, DeiT) give a
-    `FamilyEncoder`. `heads` is their number of attention heads, where neither the file nor a config.json next to it has
-    it. `image_size` (a side, or height and width) changes the size of their images. Raises UserError for weights
-    without a touch encoder or with values that are not finite, and in a process that cannot use jax.
+    Files of other families (Sparsh, T3, AnyTouch 2, SITR, DINOv2, DINOv3, SigLIP, ViT-MAE, ViT,
+    DeiT) give a `FamilyEncoder`. `heads` is their number of attention heads, where neither the file
+    nor a config.json next to it has it. `image_size` (a side, or height and width) changes the size
+    of their images. Raises UserError for weights without a touch encoder or with values that are
+    not finite, and in a process that cannot use jax.
     """
     refuse_forked()
     name = str(path)
@@ -76,7 +78,8 @@ def load_encoder(
             names = set(read_arrays(path, only=lambda _: False))
     if {"features", "rows"} <= names:
         raise UserError(
-            f"{path} contains features, not an encoder; pass it to `anytouch probe label --features`"
+            f"{path} contains features, not an encoder; pass it to `anytouch probe label "
+            "--features`"
         )
     if path.suffix == ".onnx":
         return load_engine(path, None if engine == "auto" else engine)
@@ -117,7 +120,10 @@ def load_encoder(
 
 @dataclass(frozen=True, repr=False)
 class EngineEncoder(Encoder):
-    """An exported encoder on an engine: for one number of frames and one pooling. It has no parameters."""
+    """An exported encoder on an engine: for one number of frames and one pooling.
+
+    It has no parameters.
+    """
 
     run: export.Exported = field(kw_only=True, repr=False)
 
@@ -166,7 +172,8 @@ class EngineEncoder(Encoder):
         about = self.run.about
         if pooling != about["pooling"]:
             raise UserError(
-                f"{self.source} has pooling {about['pooling']}, not {pooling}; export it again with that"
+                f"{self.source} has pooling {about['pooling']}, not {pooling}; export it again "
+                "with that"
             )
         rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(self.config.model.sensors))
         if len(frames):
@@ -175,11 +182,15 @@ class EngineEncoder(Encoder):
 
 
 def load_engine(path: str | Path, engine: Engine | None = None) -> EngineEncoder:
-    """Load an ONNX model of `export` as an encoder, on onnxruntime or another engine. Raises UserError."""
+    """Load an ONNX model of `export` as an encoder, on onnxruntime or another engine.
+
+    Raises UserError.
+    """
     run = export.load(path, engine)
     if run.about["form"] != "onnx":
         raise UserError(
-            f"{path} is for jax alone; call it by anytouch_jax.load_exported, or export it with --to onnx"
+            f"{path} is for jax alone; call it by anytouch_jax.load_exported, or export it with "
+            "--to onnx"
         )
     config = from_json(json.dumps(run.about["config"]))
     trained = run.about.get("trained_sensors")
@@ -191,7 +202,9 @@ def load_engine(path: str | Path, engine: Engine | None = None) -> EngineEncoder
 
 
 def find_tokenizer(path: Path) -> Path | None:
-    """Return the tokenizer.json of a run, of the run of a checkpoint, or of the folder of a file."""
+    """Return the tokenizer.json of a run, of the run of a checkpoint, or of the folder of a
+    file.
+    """
     is_checkpoint = path.is_dir() and not (path / "config.json").is_file()
     folders = (
         [path, path.parent, path.parent.parent]
@@ -206,7 +219,9 @@ def find_tokenizer(path: Path) -> Path | None:
 
 @shown_short
 class ExampleTouch(NamedTuple):
-    """A touch by one sensor: `frame` and `background` are RGB u8 (h, w, 3), `press` names the touched place."""
+    """A touch by one sensor: `frame` and `background` are RGB u8 (h, w, 3), `press` names the
+    touched place.
+    """
 
     press: str
     sensor: str
@@ -215,7 +230,10 @@ class ExampleTouch(NamedTuple):
 
 
 def example_touches() -> list[ExampleTouch]:
-    """Return simulated touches: each of a few presses by several sensors. They are in the public domain (CC0)."""
+    """Return simulated touches: each of a few presses by several sensors.
+
+    They are in the public domain (CC0).
+    """
     files = sorted(file for file in FOLDER.glob("*.jpg") if not file.stem.endswith("-background"))
     touches = []
     for file in files:

@@ -1,4 +1,5 @@
-"""A touch encoder (`nn.touch`) as an ONNX graph, its int8 form, and its engines (onnxruntime, OpenVINO).
+"""A touch encoder (`nn.touch`) as an ONNX graph, its int8 form, and its engines (onnxruntime,
+OpenVINO).
 
 Blocks are written out one after the other and constants are folded, so that engines can fuse them.
 """
@@ -40,7 +41,10 @@ def _needed(package: str) -> Iterator[None]:
 
 
 class _Graph:
-    """Nodes and constants so far. A value is the name of a node's output, a constant, or an input of the graph."""
+    """Nodes and constants so far.
+
+    A value is the name of a node's output, a constant, or an input of the graph.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
@@ -76,16 +80,19 @@ class _Graph:
 
 
 def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling = "class") -> bytes:
-    """Return an ONNX model of touches u8 (B, T, H, W, 3) and sensor rows i32 (B,) to features f32 (B, E).
+    """Return an ONNX model of touches u8 (B, T, H, W, 3) and sensor rows i32 (B,) to features f32
+    (B, E).
 
-    If `params` have fields, it takes aspects f32 (B,) too and returns `FieldOutput`. UserError for several segments.
+    If `params` have fields, it takes aspects f32 (B,) too and returns `FieldOutput`. UserError for
+    several segments.
     """
     with _needed("anytouch_jax[engines]"):
         from onnx import TensorProto, helper
 
     if frames not in (1, model.frames):
         raise UserError(
-            f"ONNX is written for touches of 1 or {model.frames} frames, not of {frames}; use --to jax"
+            f"ONNX is written for touches of 1 or {model.frames} frames, not of {frames}; use --to "
+            "jax"
         )
     touch = jax.tree.map(np.asarray, params["touch"])
     graph = _Graph()
@@ -165,7 +172,9 @@ def _tokens(graph: _Graph, touch: Any, model: ModelConfig, frames: int) -> str:
 def _fields(
     graph: _Graph, own: Any, model: ModelConfig, frames: int, states: list[str]
 ) -> dict[str, tuple[int, ...]]:
-    """Add the outputs of `nn.fields.FieldDecoder` from states (B, 1 + S + N, D), and return their shapes."""
+    """Add the outputs of `nn.fields.FieldDecoder` from states (B, 1 + S + N, D), and return their
+    shapes.
+    """
     from onnx import helper
 
     half = model.image_size // HALF
@@ -305,11 +314,12 @@ def _block(graph: _Graph, x: str, block: Any, model: ModelConfig, *, first: bool
 
 
 def quantised(data: bytes, touches: np.ndarray, rows: np.ndarray) -> bytes:
-    """Return `touch_graph` with the linear layers of its blocks in int8: weights per channel, activations per tensor.
+    """Return `touch_graph` with the linear layers of its blocks in int8: weights per channel,
+    activations per tensor.
 
-    Ranges are those on `touches` u8 (200, T, H, W, 3) of sensor `rows` i32 (200,). Weights have 7 bits, so that sums of
-    two products fit in 16 bits on a CPU without VNNI. The patch projection stays float32: brightness multiplies its
-    errors. Raises UserError for another number of touches.
+    Ranges are those on `touches` u8 (200, T, H, W, 3) of sensor `rows` i32 (200,). Weights have 7
+    bits, so that sums of two products fit in 16 bits on a CPU without VNNI. The patch projection
+    stays float32: brightness multiplies its errors. Raises UserError for another number of touches.
     """
     if len(touches) != CALIBRATION:
         raise UserError(
@@ -365,9 +375,11 @@ def imported(engine: Engine) -> Any:
 
 
 def session(data: bytes, engine: Engine = "onnxruntime") -> Callable[..., Any]:
-    """Return the function of an ONNX model on an engine: touches u8, sensor rows i32 (B,) to features f32 (B, E).
+    """Return the function of an ONNX model on an engine: touches u8, sensor rows i32 (B,) to
+    features f32 (B, E).
 
-    A model with fields takes aspects f32 (B,) too, and returns `FieldOutput`. UserError without the engine.
+    A model with fields takes aspects f32 (B,) too, and returns `FieldOutput`. UserError without the
+    engine.
     """
     threads = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

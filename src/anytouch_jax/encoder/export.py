@@ -1,7 +1,9 @@
-"""Export of a touch encoder as one file that needs jax or an engine alone, its loading, and exports in a cache.
+"""Export of a touch encoder as one file that needs jax or an engine alone, its loading, and exports
+in a cache.
 
-The file is a `jax.export` artefact or an ONNX model: uint8 frames and sensor rows in, features out, for any number of
-touches. A JSON description says how to call it. Loading imports none of the network's code.
+The file is a `jax.export` artefact or an ONNX model: uint8 frames and sensor rows in, features out,
+for any number of touches. A JSON description says how to call it. Loading imports none of the
+network's code.
 """
 
 from __future__ import annotations
@@ -107,9 +109,11 @@ class Exported:
     def __call__(
         self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL
     ) -> np.ndarray:
-        """Return features f32 (B, E) of touches (B, T, H, W, 3), u8 RGB or as another family prepares them.
+        """Return features f32 (B, E) of touches (B, T, H, W, 3), u8 RGB or as another family
+        prepares them.
 
-        `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape, type or sensor.
+        `sensor` is one name, names (B,), or rows i32 (B,). Raises UserError for another shape, type
+        or sensor.
         """
         frames = arrays.as_array(frames, "frames")
         side = self.about["image_size"]
@@ -123,7 +127,8 @@ class Exported:
         ):
             shape = ", ".join(str(size) for size in wanted)
             raise UserError(
-                f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} {frames.shape}"
+                f"touches must be {kind} RGB (B, {shape}), at least one, not {frames.dtype} "
+                f"{frames.shape}"
             )
         rows = arrays.rows_of_sensors(sensor, len(frames), self._row, len(self.about["sensors"]))
         if "fields" in self.about:  # the aspect does not change features
@@ -136,7 +141,9 @@ class Exported:
 
     @property
     def gels(self) -> dict[str, np.ndarray]:
-        """Pictures RGB u8 (h, w, 3) of the untouched gel, by unit, of the touches that int8 was calibrated on."""
+        """Pictures RGB u8 (h, w, 3) of the untouched gel, by unit, of the touches that int8 was
+        calibrated on.
+        """
         return {
             name: decode_bytes(b64decode(text), name)
             for name, text in self.about.get("gels", {}).items()
@@ -145,7 +152,9 @@ class Exported:
     def measure(
         self, frames: np.ndarray, rows: np.ndarray, aspect: np.ndarray
     ) -> tuple[np.ndarray, FieldOutput]:
-        """Return features and fields, as `Encoder.encode_and_measure`, of a model that has fields."""
+        """Return features and fields, as `Encoder.encode_and_measure`, of a model that has
+        fields.
+        """
         values, out = self._run(frames, rows, aspect)
         return values, out
 
@@ -153,7 +162,8 @@ class Exported:
         sensors: dict[str, int] = self.about["sensors"]
         if name not in sensors:
             raise UserError(
-                f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other"
+                f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any "
+                "other"
             )
         return sensors[name]
 
@@ -164,18 +174,23 @@ def describes(path: Path) -> Path:
 
 
 def load(path: str | Path, engine: Engine | None = None) -> Exported:
-    """Load what `export` wrote to `path`, to run on an `engine`. Raises UserError for a damaged or unfit file."""
+    """Load what `export` wrote to `path`, to run on an `engine`.
+
+    Raises UserError for a damaged or unfit file.
+    """
     path = Path(path)
     data, about = read_checked(path)
     form = about["form"]
     runs_on = _ENGINES[about["form"]]
     if engine not in (None, *runs_on):
         raise UserError(
-            f"{path} runs on {' or '.join(runs_on)}, not on {engine}; name the encoder that it was made of"
+            f"{path} runs on {' or '.join(runs_on)}, not on {engine}; name the encoder that it was "
+            "made of"
         )
     if form == "jax" and _here() not in about["platforms"]:
         raise UserError(
-            f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs jax on {_here()}; "
+            f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs "
+            f"jax on {_here()}; "
             "export it again for this machine"
         )
     exported = Exported(about, data, engine)
@@ -206,13 +221,15 @@ def export(
     fields: bool = False,
     engine: Engine = "onnxruntime",
 ) -> dict[str, Any]:
-    """Write an encoder of touches of `frames` frames to `path` and its description, and return the description.
+    """Write an encoder of touches of `frames` frames to `path` and its description, and return the
+    description.
 
-    The artefact is first called with 1 and 5 touches and compared with the live model by XLA. ONNX is float32, for
-    CPUs, and compared on `engine`. With `calibration`, touches u8 (200, T, H, W, 3) and sensor rows i32 (200,), its
-    linear layers then become int8. `gels` are pictures of the untouched gel of their units. With `fields`, ONNX has the
-    outputs of `nn.fields` too. Raises CheckError if they differ, UserError for what cannot be exported or compared
-    here, OSError for a full disk.
+    The artefact is first called with 1 and 5 touches and compared with the live model by XLA. ONNX
+    is float32, for CPUs, and compared on `engine`. With `calibration`, touches u8 (200, T, H, W, 3)
+    and sensor rows i32 (200,), its linear layers then become int8. `gels` are pictures of the
+    untouched gel of their units. With `fields`, ONNX has the outputs of `nn.fields` too. Raises
+    CheckError if they differ, UserError for what cannot be exported or compared here, OSError for a
+    full disk.
     """
     encoder = replace(encoder, engine="xla")
     if form == "onnx":
@@ -250,7 +267,8 @@ def export(
         differs, width = _worst(live, run, frames, pooling, join, fields)
     if differs > (tolerance := ONNX_TOLERANCE if form == "onnx" else TOLERANCE[model.dtype]):
         raise CheckError(
-            f"the artefact differs from the live model by {differs:.2g} of its largest feature, more than "
+            f"the artefact differs from the live model by {differs:.2g} of its largest feature, "
+            "more than "
             f"{tolerance:g}: not written"
         )
     more: dict[str, Any] = {"platforms": list(platforms)}
@@ -326,7 +344,9 @@ def _artefact(
 def _worst(
     encoder: Encoder, run: Any, frames: int, pooling: Pooling, join: Join, fields: bool
 ) -> tuple[float, int]:
-    """Return the largest difference from the live model, over the largest (or a usual) value, and the feature count."""
+    """Return the largest difference from the live model, over the largest (or a usual) value, and
+    the feature count.
+    """
     model = encoder.config.model
     rng = np.random.default_rng(0)
     worst = 0.0
@@ -353,7 +373,8 @@ def _worst(
             np.isfinite(exported).all() and np.isfinite(live).all()
         ):
             raise CheckError(
-                f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not finite"
+                f"the artefact gives {exported.shape}, the live model {live.shape}, or what is not "
+                "finite"
             )
         worst = max(worst, float(np.abs(exported - live).max() / np.abs(live).max()))
         width = live.shape[1]
@@ -363,7 +384,9 @@ def _worst(
 def _int8_error(
     encoder: Encoder, run: Any, touches: Array, rows: Array, pooling: Pooling
 ) -> dict[str, float]:
-    """Return the largest difference of int8 on its calibration touches, and the mean cosine with the live features."""
+    """Return the largest difference of int8 on its calibration touches, and the mean cosine with
+    the live features.
+    """
     items = list(zip(touches, rows, strict=True))
     live = arrays.run_in_batches(
         lambda part: encoder.encode_touch(*part, pooling=pooling), items, 20
@@ -375,14 +398,18 @@ def _int8_error(
 
 
 def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
-    """Return the bytes of an artefact and its description, after comparing them. Raises UserError."""
+    """Return the bytes of an artefact and its description, after comparing them.
+
+    Raises UserError.
+    """
     try:
         data = path.read_bytes()
         text = describes(path).read_bytes()
     except OSError as error:
         missing = describes(path) if path.is_file() else path
         raise UserError(
-            f"{missing} cannot be read: {error.strerror or error}; an artefact is two files, FILE and FILE.json"
+            f"{missing} cannot be read: {error.strerror or error}; an artefact is two files, FILE "
+            "and FILE.json"
         ) from None
     try:
         about = parse_json(text)
@@ -393,7 +420,8 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
         ) from None
     if not known:
         raise UserError(
-            f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads {FORMAT!r}"
+            f"{describes(path)} has format {str(about['format'])[:100]!r}; this program reads "
+            f"{FORMAT!r}"
         )
     about.setdefault("form", "jax")  # files of version 0.2
     fields = _FIELDS | (_ONNX_FIELDS if about["form"] == "onnx" else {})
@@ -413,7 +441,8 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
         )
     if len(data) != about["bytes"] or hashlib.sha256(data).hexdigest() != about["sha256"]:
         raise UserError(
-            f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it again"
+            f"{path} is damaged: its checksum is not the one in {describes(path).name}; export it "
+            "again"
         )
     return data, about
 
@@ -421,12 +450,13 @@ def read_checked(path: Path) -> tuple[bytes, dict[str, Any]]:
 def cached_export(
     encoder: Encoder, frames: int, pooling: Pooling, *, fields: bool = False
 ) -> Exported | None:
-    """Return the export of touches of `frames` frames on the encoder's engine, None where XLA computes.
+    """Return the export of touches of `frames` frames on the encoder's engine, None where XLA
+    computes.
 
-    "auto" is onnxruntime if it is installed and jax runs on a CPU. The encoder must compute in float32, have at most
-    LARGEST parameters, and differ from its export by at most 1e-5. XLA computes clips of more than one segment. For an
-    engine that was named, raises UserError if it is not installed and for bfloat16, and CheckError if the export
-    differs.
+    "auto" is onnxruntime if it is installed and jax runs on a CPU. The encoder must compute in
+    float32, have at most LARGEST parameters, and differ from its export by at most 1e-5. XLA
+    computes clips of more than one segment. For an engine that was named, raises UserError if it is
+    not installed and for bfloat16, and CheckError if the export differs.
     """
     engine, model, is_auto = encoder.engine, encoder.config.model, encoder.engine == "auto"
     if frames not in (1, model.frames):
@@ -467,7 +497,10 @@ def _made(
     pooling: Pooling,
     fields: bool,
 ) -> Exported:
-    """Make an export, and store it in the first folder that can be written. Raises CheckError, which is stored too."""
+    """Make an export, and store it in the first folder that can be written.
+
+    Raises CheckError, which is stored too.
+    """
     with TemporaryDirectory() as folder:
         path = Path(folder) / name
         try:
@@ -496,7 +529,9 @@ def _made(
 
 
 def _key(encoder: Encoder, engine: Engine, frames: int, pooling: Pooling, fields: bool) -> str:
-    """Return a name for everything that decides the features: weights, preprocessing, code, engine and its version."""
+    """Return a name for everything that decides the features: weights, preprocessing, code, engine
+    and its version.
+    """
     params = encoder.params | ({"fields": encoder.part_params("fields")} if fields else {})
     made_by = Path(engines.__file__).read_bytes(), engines.imported(engine).__version__
     asked = (
@@ -516,7 +551,9 @@ def _key(encoder: Encoder, engine: Engine, frames: int, pooling: Pooling, fields
 
 
 def _folders(source: str) -> list[Path]:
-    """Return where an export is looked for: next to weights of the user, then in the user's cache."""
+    """Return where an export is looked for: next to weights of the user, then in the user's
+    cache.
+    """
     path = Path(source)
     own = cache_folder() / "engines"
     if source in list_encoders() or source.startswith("hf:") or not path.exists():

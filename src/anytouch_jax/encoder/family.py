@@ -1,4 +1,6 @@
-"""Encoders of other families, under the interface of `Encoder`: their own preprocessing, networks and features."""
+"""Encoders of other families, under the interface of `Encoder`: their own preprocessing, networks
+and features.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ _CALIBRATIONS = {4: (1, 3, 7, 9), 8: (1, 3, 7, 9, 10, 12, 16, 18), 9: tuple(rang
 
 @dataclass(frozen=True, repr=False)
 class FamilyEncoder(Encoder):
-    """An encoder of another family: `form` describes its network in full, `preparation` what `preprocess` does."""
+    """An encoder of another family: `form` describes its network in full, `preparation` what
+    `preprocess` does.
+    """
 
     family: Family = field(kw_only=True)
     form: VitConfig = field(kw_only=True)
@@ -67,7 +71,9 @@ class FamilyEncoder(Encoder):
         return np.zeros((*self.image_size, 3), np.float32)
 
     def input_form(self, frames: int) -> dict[str, Any]:
-        """Return what an exported encoder says about its input, and the steps of its preparation."""
+        """Return what an exported encoder says about its input, and the steps of its
+        preparation.
+        """
         shape = ", ".join(map(str, self.image_size))
         return {
             "input": f"frames: float32 (B, {frames}, {shape}, 3), oldest first, each from encoder.preprocess of "
@@ -124,7 +130,8 @@ class FamilyEncoder(Encoder):
             return names.index(UNIVERSAL)
         if len(names) > 2 and _FALLBACK not in names:
             raise UserError(
-                f"{self.source} has no file for sensor {name!r}; choose one of {', '.join(names[:-1])}"
+                f"{self.source} has no file for sensor {name!r}; choose one of "
+                f"{', '.join(names[:-1])}"
             )
         used = names[0] if len(names) == 2 else _FALLBACK
         log(f"there is no file for sensor {name!r}: using that of {used}")
@@ -135,15 +142,20 @@ class FamilyEncoder(Encoder):
         return set()
 
     def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
-        """Return a frame u8 (h, w, 3) as the network reads it, f32 (height, width, 3). Raises UserError."""
+        """Return a frame u8 (h, w, 3) as the network reads it, f32 (height, width, 3).
+
+        Raises UserError.
+        """
         return prepare(frame, background, self.preparation, self.image_size)
 
     def calibrated(
         self, frames: Sequence[npt.ArrayLike], background: npt.ArrayLike
     ) -> FamilyEncoder:
-        """Return the encoder of a sensor with SITR's calibration images, and the picture of its untouched gel.
+        """Return the encoder of a sensor with SITR's calibration images, and the picture of its
+        untouched gel.
 
-        `frames` are 9 presses of a sphere, then 9 of a cube's corner, row by row. Raises UserError for another number.
+        `frames` are 9 presses of a sphere, then 9 of a cube's corner, row by row. Raises UserError
+        for another number.
         """
         need = self.form.calibration
         if not need:
@@ -166,11 +178,13 @@ class FamilyEncoder(Encoder):
         pooling: Pooling = "class",
         join: Join = "mean",
     ) -> np.ndarray:
-        """Return features f32 (B, E) of prepared frames (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3), oldest first.
+        """Return features f32 (B, E) of prepared frames (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3),
+        oldest first.
 
-        A family of clips takes exactly its frames, or enough consecutive ones to choose them at its stride, or a still.
-        One of stills takes any number, and their features are joined. `pooling` "class" is the family's own feature. H
-        and W may be others than `image_size` if the positions allow it. Raises UserError for another shape or type.
+        A family of clips takes exactly its frames, or enough consecutive ones to choose them at its
+        stride, or a still. One of stills takes any number, and their features are joined. `pooling`
+        "class" is the family's own feature. H and W may be others than `image_size` if the
+        positions allow it. Raises UserError for another shape or type.
         """
         return self._encode(
             self._checked(frames), sensor, self.traceable(pooling, join), (pooling, join)
@@ -179,7 +193,9 @@ class FamilyEncoder(Encoder):
     def encode_tokens(
         self, frames: Any, sensor: str | Sequence[str] | np.ndarray = UNIVERSAL
     ) -> np.ndarray:
-        """Return the tokens f32 (B, S, D) that the family's authors publish, for frames as in `encode_touch`."""
+        """Return the tokens f32 (B, S, D) that the family's authors publish, for frames as in
+        `encode_touch`.
+        """
         return self._encode(self._checked(frames), sensor, self._tokens, "tokens")
 
     def _checked(self, frames: Any) -> np.ndarray:
@@ -196,7 +212,8 @@ class FamilyEncoder(Encoder):
         if frames.dtype != np.float32 or not is_clip or not fits:
             high, wide = self.image_size
             raise UserError(
-                f"frames must be float32 of {high} x {wide} pixels, (B, T, {high}, {wide}, 3), not {frames.dtype} "
+                f"frames must be float32 of {high} x {wide} pixels, (B, T, {high}, {wide}, 3), not "
+                f"{frames.dtype} "
                 f"{frames.shape}; prepare each frame with encoder.preprocess(frame)"
             )
         return frames
@@ -204,7 +221,9 @@ class FamilyEncoder(Encoder):
     def traceable(
         self, pooling: Pooling = "class", join: Join = "mean"
     ) -> Callable[..., jax.Array]:
-        """Return the function from params, frames (B, T, H, W, 3) and sensor rows (B,) to features (B, E)."""
+        """Return the function from params, frames (B, T, H, W, 3) and sensor rows (B,) to features
+        (B, E).
+        """
         return partial(self._features, pooling=pooling, join=join)
 
     def _features(
@@ -235,7 +254,9 @@ class FamilyEncoder(Encoder):
         }[self.family.tokens].astype(jnp.float32)
 
     def _clips(self, clips: jax.Array) -> jax.Array:
-        """Return the network's clips (B, P, F, H, W, 3): P is 1 for a family of clips, and F is 1 for one of stills."""
+        """Return the network's clips (B, P, F, H, W, 3): P is 1 for a family of clips, and F is 1
+        for one of stills.
+        """
         count = self.form.model.frames
         stride = self.preparation.stride
         given = clips.shape[1]
@@ -248,7 +269,8 @@ class FamilyEncoder(Encoder):
             clips = clips[:, given - span :: stride]
         elif given != count:
             raise UserError(
-                f"{self.family.title} takes 1 frame, {count} frames ({stride} apart), or at least {span} consecutive "
+                f"{self.family.title} takes 1 frame, {count} frames ({stride} apart), or at least "
+                f"{span} consecutive "
                 f"ones, not {given}"
             )
         return (clips[:, ::-1] if self.preparation.newest_first else clips)[:, None]
@@ -256,8 +278,10 @@ class FamilyEncoder(Encoder):
     def _run(self, params: Any, clips: jax.Array, rows: jax.Array) -> VitOutput:
         if self.form.calibration and self.calibration is None:
             raise UserError(
-                f"{self.family.title} needs the calibration images of the sensor: encoder.calibrated(frames, "
-                "background), or a folder calibration beside the weights with 0000.png (the untouched gel) to 0018.png"
+                f"{self.family.title} needs the calibration images of the sensor: "
+                "encoder.calibrated(frames, "
+                "background), or a folder calibration beside the weights with 0000.png (the "
+                "untouched gel) to 0018.png"
             )
         network = self.part
         more = () if self.calibration is None else (jnp.asarray(self.calibration),)
@@ -281,7 +305,9 @@ class FamilyEncoder(Encoder):
 
 
 def pooled(family: Family, form: VitConfig, output: VitOutput, pooling: Pooling) -> jax.Array:
-    """Return features (B, E) from the tokens of a family: its own feature, the mean of the patches, or both."""
+    """Return features (B, E) from the tokens of a family: its own feature, the mean of the patches,
+    or both.
+    """
     patches = output.projected if family.feature == "projected" else output.normed
     mean = jnp.mean(patches[:, form.start :], axis=1)
     own = {"class": output.normed, "mean": output.normed}.get(family.feature, output.projected)[
@@ -300,14 +326,17 @@ def pooled(family: Family, form: VitConfig, output: VitOutput, pooling: Pooling)
 def prepare(
     frame: np.ndarray, background: np.ndarray | None, steps: Preparation, size: Size
 ) -> np.ndarray:
-    """Return a frame u8 (h, w, 3) prepared by the steps of a family, f32 (height, width, 3) of `size`."""
+    """Return a frame u8 (h, w, 3) prepared by the steps of a family, f32 (height, width, 3) of
+    `size`.
+    """
     if background is not None and background.shape != frame.shape:
         if (
             abs(background.shape[1] * frame.shape[0] / (background.shape[0] * frame.shape[1]) - 1)
             > 0.05
         ):
             raise UserError(
-                f"the background {background.shape} and the frame {frame.shape} have other proportions"
+                f"the background {background.shape} and the frame {frame.shape} have other "
+                "proportions"
             )
         background = cv2.resize(background, frame.shape[1::-1], interpolation=cv2.INTER_AREA)
     image = frame
@@ -356,7 +385,10 @@ def _resized(image: np.ndarray, size: Size, kernel: str) -> np.ndarray:
 
 
 def family_encoder(model: FamilyModel, source: str, path: Path) -> FamilyEncoder:
-    """Return the encoder of what a file of a family has. SITR's calibration images may be next to it."""
+    """Return the encoder of what a file of a family has.
+
+    SITR's calibration images may be next to it.
+    """
     background = model.preparation.background
     encoder = FamilyEncoder(
         Config(model.form.model, data=DataConfig(background=background)),

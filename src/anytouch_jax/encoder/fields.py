@@ -1,4 +1,6 @@
-"""Touch in millimetres and newtons: depth, shear, contact and force of frames, with standard deviations."""
+"""Touch in millimetres and newtons: depth, shear, contact and force of frames, with standard
+deviations.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ from anytouch_jax.shown import shown_short
 
 
 class KnownGel(NamedTuple):
-    """What a sensor shows: mm of the picture's width, its height over its width, and kPa of the gel's modulus."""
+    """What a sensor shows: mm of the picture's width, its height over its width, and kPa of the
+    gel's modulus.
+    """
 
     width: float
     shape: float
@@ -54,9 +58,11 @@ _EDGE = 4  # pixels, along each side, of one vertex of a surface
 
 
 class Scale(NamedTuple):
-    """What turns outputs into mm and N: `width` mm of the picture or None, and the gel's `modulus` in kPa.
+    """What turns outputs into mm and N: `width` mm of the picture or None, and the gel's `modulus`
+    in kPa.
 
-    `spread` is the modulus' deviation as a share, `shape` height over width. `factors` multiply deviations, by name.
+    `spread` is the modulus' deviation as a share, `shape` height over width. `factors` multiply
+    deviations, by name.
     """
 
     width: float | None
@@ -67,7 +73,10 @@ class Scale(NamedTuple):
 
 
 def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = None) -> Scale:
-    """Return the scale of a sensor: that of GELS, of the weights' `metadata`, or of `width_mm`. Raises UserError."""
+    """Return the scale of a sensor: that of GELS, of the weights' `metadata`, or of `width_mm`.
+
+    Raises UserError.
+    """
     if width_mm is not None and not 0 < width_mm < np.inf:
         raise UserError(
             f"the width of the picture must be a number of mm above 0, not {width_mm:g}"
@@ -92,13 +101,15 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
 @shown_short
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """What B frames measure, each value with its standard deviation, as maps (B, h, w) over the whole picture.
+    """What B frames measure, each value with its standard deviation, as maps (B, h, w) over the
+    whole picture.
 
-    `depth` mm into the gel. `shear` (B, h, w, 2) mm along x and y of the picture, and one deviation for both: that of
-    the dots, or a guess without them. `contact` is a probability. `force` (B, 3) N along x, along y and into the gel.
-    `torque` (B,) N mm about the centre of pressure. `slip` (B,) share of the contact that slides. `area` (B,) mm2.
-    `centre` (B, 2) mm of the pressure from the middle of the picture, x to the right and y down, NaN without contact.
-    Without a width (`width_mm` None) lengths are shares of the picture's width, areas of its square, and force and
+    `depth` mm into the gel. `shear` (B, h, w, 2) mm along x and y of the picture, and one deviation
+    for both: that of the dots, or a guess without them. `contact` is a probability. `force` (B, 3)
+    N along x, along y and into the gel. `torque` (B,) N mm about the centre of pressure. `slip`
+    (B,) share of the contact that slides. `area` (B,) mm2. `centre` (B, 2) mm of the pressure from
+    the middle of the picture, x to the right and y down, NaN without contact. Without a width
+    (`width_mm` None) lengths are shares of the picture's width, areas of its square, and force and
     torque are None. `shape` is height over width. With `faults` the deviations are wide.
     """
 
@@ -151,7 +162,9 @@ class Fields:
         return self._each(resized)
 
     def points(self) -> Array:
-        """Return the surface of the gel f32 (B, h, w, 3), x to the right and y down from the middle, z into the gel."""
+        """Return the surface of the gel f32 (B, h, w, 3), x to the right and y down from the
+        middle, z into the gel.
+        """
         height, width = self.depth.shape[1:]
         mm = self.width_mm or 1.0
         y, x = np.mgrid[:height, :width] + 0.5
@@ -161,7 +174,9 @@ class Fields:
         ).astype("f4")
 
     def summary(self, row: int = 0) -> dict[str, Any]:
-        """Return the numbers of a frame by name, each with its deviation `*_std`; None for what is unknown."""
+        """Return the numbers of a frame by name, each with its deviation `*_std`; None for what is
+        unknown.
+        """
         y, x = np.unravel_index(np.argmax(self.depth[row]), self.depth.shape[1:])
 
         def at(name: str, *place: Any) -> dict[str, Any]:
@@ -193,7 +208,10 @@ _ARRAYS = tuple(
 
 
 def stacked(parts: Sequence[Fields]) -> dict[str, Array]:
-    """Return the arrays of several `Fields` as one, by name, maps as float16. Unknown force is NaN."""
+    """Return the arrays of several `Fields` as one, by name, maps as float16.
+
+    Unknown force is NaN.
+    """
     arrays = {}
     for name in _ARRAYS:
         values = [getattr(part, name) for part in parts]
@@ -215,12 +233,16 @@ def stacked(parts: Sequence[Fields]) -> dict[str, Array]:
 
 
 def _deviation(log: Any) -> Array:
-    """Return the standard deviation of a Laplace error from its bent logarithm, as `ops.losses.laplace_loss`."""
+    """Return the standard deviation of a Laplace error from its bent logarithm, as
+    `ops.losses.laplace_loss`.
+    """
     return np.asarray(np.sqrt(2) * np.exp(5 * np.tanh(log / 5)))
 
 
 def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, ...] = ()) -> Fields:
-    """Return the output of the network, as numpy arrays, in mm and N. `shape` is the picture's height over width."""
+    """Return the output of the network, as numpy arrays, in mm and N. `shape` is the picture's
+    height over width.
+    """
     out = FieldOutput._make(np.asarray(value, np.float32) for value in out)
     mm = scale.width or 1.0
     own = scale.factors
@@ -294,10 +316,11 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
 
 
 def _dragged(measured: Fields, scale: Scale) -> Fields:
-    """Return fields whose force along the gel is that which drags the contact by its `shear`: none without contact.
+    """Return fields whose force along the gel is that which drags the contact by its `shear`: none
+    without contact.
 
-    The force on a disc is the modulus times its shift times the root of its area, times a number (Johnson 1985,
-    "Contact Mechanics", 3.7). The number is fitted to simulated layers.
+    The force on a disc is the modulus times its shift times the root of its area, times a number
+    (Johnson 1985, "Contact Mechanics", 3.7). The number is fitted to simulated layers.
     """
     assert measured.force is not None and measured.force_std is not None
     inside = (measured.contact > 0.5)[..., None]
@@ -313,10 +336,12 @@ def _dragged(measured: Fields, scale: Scale) -> Fields:
 
 
 class Measure:
-    """Turns outputs of the network for frames of one sensor into `Fields`, and logs faults of the first frame once.
+    """Turns outputs of the network for frames of one sensor into `Fields`, and logs faults of the
+    first frame once.
 
-    `background` is the picture of its untouched gel. If that has dots, shear is their motion (`DotFlow`), and the force
-    along the gel follows from it. `oriented` turns and mirrors pictures as `Preprocess` does.
+    `background` is the picture of its untouched gel. If that has dots, shear is their motion
+    (`DotFlow`), and the force along the gel follows from it. `oriented` turns and mirrors pictures
+    as `Preprocess` does.
     """
 
     def __init__(
@@ -361,7 +386,10 @@ class Measure:
 def faults_of(
     frame: Array, background: Array | None, sensor: str, shape: float | None
 ) -> tuple[str, ...]:
-    """Return sentences on a frame RGB u8 (h, w, 3) that a sensor in order does not give. UserError if parts differ."""
+    """Return sentences on a frame RGB u8 (h, w, 3) that a sensor in order does not give.
+
+    UserError if parts differ.
+    """
     (height, width) = frame.shape[:2]
     faults = list[str]()
     if (
@@ -370,11 +398,13 @@ def faults_of(
     ):
         raise UserError(
             f"the frame has {width} x {height} pixels and its background {background.shape[1]} x "
-            f"{background.shape[0]}: they show different parts of the gel. Take both with one setting of the camera."
+            f"{background.shape[0]}: they show different parts of the gel. Take both with one "
+            "setting of the camera."
         )
     if shape is not None and abs(np.log(height / (width * shape))) > SHAPE_LIMIT:
         faults.append(
-            f"a picture of {sensor} has a height of {shape:.3g} widths, and this one has {width} x {height} pixels. "
+            f"a picture of {sensor} has a height of {shape:.3g} widths, and this one has {width} x "
+            f"{height} pixels. "
             "Turn it, or name the width that it shows (width_mm)."
         )
     few = frame[::4, ::4].astype(np.int16)
@@ -395,7 +425,8 @@ def faults_of(
 def _unlike(frame: Array, background: Array) -> str:
     """Return how a frame was turned or recoloured against its background, "" if it was not.
 
-    A press covers the smaller part of a picture. Of simulated presses 4 % look exchanged by a factor of up to 1.17.
+    A press covers the smaller part of a picture. Of simulated presses 4 % look exchanged by a
+    factor of up to 1.17.
     """
     size = (_SIDE, max(1, round(_SIDE * frame.shape[0] / frame.shape[1])))
     small, gel = (
@@ -420,13 +451,17 @@ def _unlike(frame: Array, background: Array) -> str:
 
 
 def depth_levels(depth: Array, width_mm: float | None) -> tuple[Array, float]:
-    """Return a map of depth as u8, and the depth of 255: the deepest place, but no less than a usual touch."""
+    """Return a map of depth as u8, and the depth of 255: the deepest place, but no less than a
+    usual touch.
+    """
     deepest = max(float(depth.max()), LENGTH * (width_mm or 1.0))
     return np.clip(255 * depth / deepest, 0, 255).astype(np.uint8), deepest
 
 
 def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) -> Array:
-    """Return a picture u8 (h, w, 3) of a frame: depth in colour, rim of contact, sure shear, and force as `text`."""
+    """Return a picture u8 (h, w, 3) of a frame: depth in colour, rim of contact, sure shear, and
+    force as `text`.
+    """
     height, width = frame.shape[:2]
     one = measured[row].at(height, width)
     level, _ = depth_levels(one.depth[0], one.width_mm)
@@ -466,7 +501,10 @@ def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) 
 
 
 def write_surface(path: Path, frame: Array, measured: Fields, row: int = 0) -> None:
-    """Write the surface of the gel as a PLY mesh in mm, coloured by the frame. Depth goes down along z."""
+    """Write the surface of the gel as a PLY mesh in mm, coloured by the frame.
+
+    Depth goes down along z.
+    """
     height, width = (max(side // _EDGE, 2) for side in frame.shape[:2])
     kinds = [(axis, "<f4") for axis in "xyz"] + [
         (colour, "u1") for colour in ("red", "green", "blue")
@@ -503,6 +541,7 @@ def write_surface(path: Path, frame: Array, measured: Fields, row: int = 0) -> N
 def missing(source: str) -> UserError:
     """Return the error of an encoder without a decoder of fields."""
     return UserError(
-        f"{source} does not measure depth and force: its weights have no fields. Use anytouch-tiny, or train with "
+        f"{source} does not measure depth and force: its weights have no fields. Use "
+        "anytouch-tiny, or train with "
         "--model.fields 32"
     )

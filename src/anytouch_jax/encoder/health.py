@@ -1,7 +1,9 @@
-"""Health of sensor units: orientation, colour order, exposure, focus, frozen frames, drift, wear, background, contact.
+"""Health of sensor units: orientation, colour order, exposure, focus, frozen frames, drift, wear,
+background, contact.
 
-A check reads some recordings of a unit and gives a value, a limit and what to do. The limits were set on real units in
-good order (`experiments/real/trust.py`). Pictures are compared at 160 pixels on the long side.
+A check reads some recordings of a unit and gives a value, a limit and what to do. The limits were
+set on real units in good order (`experiments/real/trust.py`). Pictures are compared at 160 pixels
+on the long side.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -84,7 +86,9 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class Check:
-    """The result of a check: `ok` is None if it cannot be decided; `advice` is what to do if it failed."""
+    """The result of a check: `ok` is None if it cannot be decided; `advice` is what to do if it
+    failed.
+    """
 
     name: str
     ok: bool | None
@@ -94,9 +98,11 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class UnitFrames:
-    """Frames of one sensor unit: `recordings` are lists of pictures RGB u8 (h, w, 3), in order, all of one size.
+    """Frames of one sensor unit: `recordings` are lists of pictures RGB u8 (h, w, 3), in order, all
+    of one size.
 
-    `background` is its untouched gel. `steps` (n,): distances of neighbouring frame numbers. `rows` counts all.
+    `background` is its untouched gel. `steps` (n,): distances of neighbouring frame numbers. `rows`
+    counts all.
     """
 
     sensor: str
@@ -157,7 +163,9 @@ class UnitHealth:
 
 
 def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
-    """Yield the frames of each unit of a manifest: at most RECORDINGS recordings, evenly spaced, and FRAMES of each."""
+    """Yield the frames of each unit of a manifest: at most RECORDINGS recordings, evenly spaced,
+    and FRAMES of each.
+    """
     names = ("dataset", "sensor", "unit")
     codes = np.stack([manifest.codes(name) for name in names], 1)
     sequence = manifest.codes("sequence", own=True)
@@ -194,7 +202,9 @@ def _pictures(manifest: Manifest, rows: Array) -> list[Array]:
 
 
 def _background(manifest: Manifest, rows: Array, free: Array) -> Array | None:
-    """Return the commonest background picture of `rows`, or the first picture of the `free` rows."""
+    """Return the commonest background picture of `rows`, or the first picture of the `free`
+    rows.
+    """
     paths = [
         manifest.file(int(row), "background_path")
         for row in rows[manifest.present("background_path")[rows]]
@@ -216,7 +226,8 @@ def examine(
 ) -> UnitHealth:
     """Return the checks of a unit, or the one called `only`.
 
-    `references` are untouched gels of the same family. Recordings are compared with the `others` of the data.
+    `references` are untouched gels of the same family. Recordings are compared with the `others` of
+    the data.
     """
     checks: dict[str, Callable[[], Check]] = {
         "orientation and colours": lambda: check_layout(unit, references),
@@ -240,7 +251,9 @@ def examine(
 def check_units(
     units: Sequence[UnitFrames], references: Mapping[str, Sequence[Array]]
 ) -> list[UnitHealth]:
-    """Return the health of all units; `references` by sensor are joined by the other units of the same sensor."""
+    """Return the health of all units; `references` by sensor are joined by the other units of the
+    same sensor.
+    """
     results = []
     for unit in units:
         others = [other for other in units if other.sensor == unit.sensor and other is not unit]
@@ -253,7 +266,9 @@ def check_units(
 
 @lru_cache
 def known_gels(sensor: str) -> list[Array]:
-    """Return small untouched gels RGB u8 (30, 40, 3) of real units of a sensor family, none of an unknown one."""
+    """Return small untouched gels RGB u8 (30, 40, 3) of real units of a sensor family, none of an
+    unknown one.
+    """
     name = f"{sensor}.bases"
     gels = read_arrays(_LOOKS, only=name.__eq__).get(name, np.zeros(0))
     # the simulator invents the look of the others
@@ -263,7 +278,9 @@ def known_gels(sensor: str) -> list[Array]:
 
 
 def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
-    """Compare with the references: which turn and order of colours fits them best? A near symmetry is no fault."""
+    """Compare with the references: which turn and order of colours fits them best? A near symmetry
+    is no fault.
+    """
     name = "orientation and colours"
     if not references:
         return Check(name, None, "no reference of this sensor")
@@ -298,7 +315,9 @@ def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
 
 
 def _layout(picture: Array) -> Array:
-    """Return where a picture has which colour, f32 (SIDE, SIDE, 3) of norm 1, without brightness and contrast."""
+    """Return where a picture has which colour, f32 (SIDE, SIDE, 3) of norm 1, without brightness
+    and contrast.
+    """
     small = _look(np.ascontiguousarray(picture)).reshape(SIDE, SIDE, 3)
     small = small - small.mean()
     return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6))
@@ -371,7 +390,9 @@ def _dropped(unit: UnitFrames) -> Check:
 
 
 def _tint(unit: UnitFrames) -> Check:
-    """Measure the drift of colour from the first recordings to the last, in logarithms of red and blue over green."""
+    """Measure the drift of colour from the first recordings to the last, in logarithms of red and
+    blue over green.
+    """
     if len(unit.recordings) < _FEWEST:
         return Check("tint drift", None, "too few recordings")
     colours = np.stack([np.median(middle, axis=(0, 1)) + 4 for middle in unit.middles])
@@ -395,7 +416,9 @@ def _dead(unit: UnitFrames) -> Check:
 
 
 def _difference(unit: UnitFrames) -> tuple[Array, Array] | None:
-    """Return the usual picture minus the background f32 (h, w, 3) at 160 pixels without tint, and where no dots are."""
+    """Return the usual picture minus the background f32 (h, w, 3) at 160 pixels without tint, and
+    where no dots are.
+    """
     if unit.background is None or unit.background.shape != unit.frames[0].shape:
         return None
     gel = scale_picture(unit.background)
@@ -418,7 +441,9 @@ def _blurred(change: Array, clear: Array, sigma: float) -> Array:
 
 
 def _scratch(unit: UnitFrames) -> Check:
-    """Look for a long thin pattern that never moves and that the background lacks: a scratch, a tear, a hair."""
+    """Look for a long thin pattern that never moves and that the background lacks: a scratch, a
+    tear, a hair.
+    """
     name = "worn gel"
     found = _difference(unit)
     if found is None or len(unit.recordings) < _FEWEST:
@@ -435,7 +460,9 @@ def _scratch(unit: UnitFrames) -> Check:
 
 
 def _background_fits(unit: UnitFrames) -> Check:
-    """Compare the background with the usual picture: a press in one of them is a broad difference."""
+    """Compare the background with the usual picture: a press in one of them is a broad
+    difference.
+    """
     name = "background"
     found = _difference(unit)
     if found is None or len(unit.recordings) < _FEWEST:
@@ -446,7 +473,10 @@ def _background_fits(unit: UnitFrames) -> Check:
 
 
 def _contact(unit: UnitFrames) -> Check:
-    """Report the share of frames in contact. All or none of many recordings is a fault of the data."""
+    """Report the share of frames in contact.
+
+    All or none of many recordings is a fault of the data.
+    """
     if unit.background is None or unit.background.shape != unit.frames[0].shape:
         return Check("contact", None, "no background")
     if len(unit.recordings) < _FEWEST:
@@ -463,7 +493,9 @@ def _contact(unit: UnitFrames) -> Check:
 
 
 def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
-    """Look for recordings that look like another gel: two units in one folder, or left and right exchanged."""
+    """Look for recordings that look like another gel: two units in one folder, or left and right
+    exchanged.
+    """
     name = "one unit"
     if len(unit.recordings) < _FEWEST:
         return Check(name, None, "too few recordings")
@@ -484,7 +516,8 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
                 )
     far = own > LIMITS["two units"]
     value = float(np.percentile(own, 95))
-    # Deep touches of a soft gel look unlike the others, and unlike each other. Those of another unit look alike.
+    # Deep touches of a soft gel look unlike the others, and unlike each other. Those of another
+    # unit look alike.
     apart = (
         np.sqrt(np.mean((looks[far] - np.median(looks[far], axis=0)) ** 2, axis=1))
         if far.any()
@@ -506,9 +539,11 @@ def _look(picture: Array) -> Array:
 
 
 def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
-    """Return whether features (n, d) of frames in contact (n,) bool differ from the others more than by chance.
+    """Return whether features (n, d) of frames in contact (n,) bool differ from the others more
+    than by chance.
 
-    The value is the distance of the means over the spread. The limit is that of 95 % of `draws` random assignments.
+    The value is the distance of the means over the spread. The limit is that of 95 % of `draws`
+    random assignments.
     """
     if min(contact.sum(), (~contact).sum()) < _FEWEST:
         return Check(

@@ -1,8 +1,9 @@
-"""Saved linear heads, and their calibration: temperature, conformal sets, abstention, novelty, contact and sensor.
+"""Saved linear heads, and their calibration: temperature, conformal sets, abstention, novelty,
+contact and sensor.
 
-All limits come from touches that the head was not fitted on. Every recording has the same weight, since its frames are
-alike. A limit holds for a frame of a new recording from the same source, on average over recordings (Lee, Barber and
-Willett 2023).
+All limits come from touches that the head was not fitted on. Every recording has the same weight,
+since its frames are alike. A limit holds for a frame of a new recording from the same source, on
+average over recordings (Lee, Barber and Willett 2023).
 """
 
 from __future__ import annotations
@@ -47,10 +48,11 @@ _CHUNK = 1024
 class Calibration:
     """What a head knows about its own errors.
 
-    Logits are divided by `temperature`. A class is in the set if 1 - p is at most `set_limit`: such sets hold the true
-    class in a share `coverage` of touches. A touch is novel above `novelty_limit`, which a share `false_alarms` of
-    known touches exceed. `references` f32 (m, d) are scaled training features times `whitening` f32 (d, d), of
-    `sensors` (m,). With too few `recordings` a limit is infinite.
+    Logits are divided by `temperature`. A class is in the set if 1 - p is at most `set_limit`: such
+    sets hold the true class in a share `coverage` of touches. A touch is novel above
+    `novelty_limit`, which a share `false_alarms` of known touches exceed. `references` f32 (m, d)
+    are scaled training features times `whitening` f32 (d, d), of `sensors` (m,). With too few
+    `recordings` a limit is infinite.
     """
 
     temperature: float
@@ -69,7 +71,10 @@ class Calibration:
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, Array], width: int) -> Calibration | None:
-        """Return the calibration among arrays for `width` features, or None. Raises KeyError or ValueError."""
+        """Return the calibration among arrays for `width` features, or None.
+
+        Raises KeyError or ValueError.
+        """
         if not any(name.startswith("calibration/") for name in arrays):
             return None
         names = [field.name for field in dataclasses.fields(Calibration)]
@@ -88,12 +93,17 @@ class Calibration:
         return Calibration(**values)
 
     def sensor_warning(self, x: Array, sensor: str) -> str:
-        """Return a sentence if most scaled features (n, d) are not of the `sensor` that the user named, else ""."""
+        """Return a sentence if most scaled features (n, d) are not of the `sensor` that the user
+        named, else "".
+        """
         if len(x) < _FEWEST:
             return ""
         known = np.unique(self.sensors)
         if sensor not in known:
-            return f"The head was fitted on {', '.join(known)}, not on {sensor}. Do not trust its classes."
+            return (
+                f"The head was fitted on {', '.join(known)}, not on {sensor}. Do not trust its "
+                "classes."
+            )
         away = [
             novelty_scores(x @ self.whitening, self.references[self.sensors == name])
             for name in known
@@ -103,13 +113,15 @@ class Calibration:
             counts.argmax()
         ] != sensor:
             return (
-                f"{counts.max()} of {len(x)} frames look like {looks[counts.argmax()]}, not {sensor}. "
+                f"{counts.max()} of {len(x)} frames look like {looks[counts.argmax()]}, not "
+                f"{sensor}. "
                 "Check --sensor, --rotate and --flip."
             )
         novel = np.mean(self.novelty(x) > self.novelty_limit)
         if novel > max(_OTHERS, 4 * self.false_alarms):
             return (
-                f"{novel:.0%} of the frames are unlike every touch of {sensor} that the head was fitted on. "
+                f"{novel:.0%} of the frames are unlike every touch of {sensor} that the head was "
+                "fitted on. "
                 "Check the sensor's name, its orientation and its background."
             )
         return ""
@@ -117,9 +129,11 @@ class Calibration:
 
 @shown_short
 class Assessment(NamedTuple):
-    """Predictions for n touches: likeliest class (n,) str, `p` f32 (n, K), conformal sets bool (n, K), novelty (n,).
+    """Predictions for n touches: likeliest class (n,) str, `p` f32 (n, K), conformal sets bool (n,
+    K), novelty (n,).
 
-    A touch whose set has not exactly one class is not decided: abstain. So is one that is `novel` (n,).
+    A touch whose set has not exactly one class is not decided: abstain. So is one that is `novel`
+    (n,).
     """
 
     label: Array
@@ -136,11 +150,13 @@ class Assessment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearHead:
-    """A saved linear classifier of features, with its calibration (None in files of older versions).
+    """A saved linear classifier of features, with its calibration (None in files of older
+    versions).
 
-    `classes` (K,) str; `weights` (d, columns) and `bias` (columns,), one column for two classes, else K; features minus
-    `mean` (d,) are divided by `scale` (d,). It predicts `label` from features of `frames` a touch and `pooling` by the
-    encoder with that `fingerprint`. `gels` are pictures of the untouched gel by unit.
+    `classes` (K,) str; `weights` (d, columns) and `bias` (columns,), one column for two classes,
+    else K; features minus `mean` (d,) are divided by `scale` (d,). It predicts `label` from
+    features of `frames` a touch and `pooling` by the encoder with that `fingerprint`. `gels` are
+    pictures of the untouched gel by unit.
     """
 
     classes: Array
@@ -159,7 +175,9 @@ class LinearHead:
         classes, more = self.classes.tolist(), len(self.classes) - 8
         return described(
             f"LinearHead for {self.label}",
-            classes=f"{len(classes)}: {', '.join(classes[:8])}{f' and {more} more' if more > 0 else ''}",
+            classes=(
+                f"{len(classes)}: {', '.join(classes[:8])}{f' and {more} more' if more > 0 else ''}"
+            ),
             input=f"features of {len(self.mean)}, pooling {self.pooling}, frames {self.frames}",
             encoder=self.fingerprint,
             calibration="; ".join(self.promises()) or "none",
@@ -172,14 +190,20 @@ class LinearHead:
         return self.classes[p.argmax(1)], p
 
     def scaled(self, features: npt.ArrayLike) -> Array:
-        """Return features (n, d) minus the mean, over the scale. Raises UserError for another shape."""
+        """Return features (n, d) minus the mean, over the scale.
+
+        Raises UserError for another shape.
+        """
         x = np.asarray(features, np.float32)
         if x.ndim != 2 or x.shape[1] != len(self.mean):
             raise UserError(f"This head reads features (n, {len(self.mean)}), not {x.shape}.")
         return (x - self.mean) / self.scale
 
     def assess(self, features: npt.ArrayLike) -> Assessment:
-        """Return what the head predicts for features (n, d), and whether to believe it. UserError if uncalibrated."""
+        """Return what the head predicts for features (n, d), and whether to believe it.
+
+        UserError if uncalibrated.
+        """
         label, p = self(features)
         known = self.calibration
         if known is None:
@@ -207,13 +231,15 @@ class LinearHead:
     ) -> LinearHead:
         """Return the head with a calibration from `logits` (n, columns) of rows that no fit saw.
 
-        `y` (n,) str and `held_out` (n,) are their classes and groups. `features` (N, d), `groups` (N,) and `sensors`
-        (N,) are of all rows, of which `fit` were fitted on and `val` were not. Raises UserError without a known class.
+        `y` (n,) str and `held_out` (n,) are their classes and groups. `features` (N, d), `groups`
+        (N,) and `sensors` (N,) are of all rows, of which `fit` were fitted on and `val` were not.
+        Raises UserError without a known class.
         """
         known = np.isin(y, self.classes)
         if not known.any():
             raise UserError(
-                "No row is left to calibrate on. Give rows of split val, or classes of several groups."
+                "No row is left to calibrate on. Give rows of split val, or classes of several "
+                "groups."
             )
         z = logits[known].astype(np.float64)
         held_out = held_out[known]
@@ -238,7 +264,9 @@ class LinearHead:
         )
 
     def promises(self) -> list[str]:
-        """Return sentences on what the limits of the calibration promise, and on those that need more groups."""
+        """Return sentences on what the limits of the calibration promise, and on those that need
+        more groups.
+        """
         known = self.calibration
         if known is None:
             return []
@@ -246,7 +274,8 @@ class LinearHead:
         novel = f"{known.false_alarms:.0%} of known touches"
         about = f"calibrated on {known.recordings} groups (temperature {known.temperature:.2f})"
         return [f"{about}: sets hold {sets}, {novel} are called novel"] + [
-            f"{share:.0%} takes {int(np.ceil(share / (1 - share) - 1e-9))} groups or more. With fewer {what}."
+            f"{share:.0%} takes {int(np.ceil(share / (1 - share) - 1e-9))} groups or more. With "
+            f"fewer {what}."
             for limit, share, what in (
                 (known.set_limit, known.coverage, "sets hold every class"),
                 (known.novelty_limit, 1 - known.false_alarms, "no touch is novel"),
@@ -257,7 +286,9 @@ class LinearHead:
     def check(
         self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean"
     ) -> None:
-        """Raise UserError unless the head was fitted on features of that encoder, pooling and number of frames."""
+        """Raise UserError unless the head was fitted on features of that encoder, pooling and
+        number of frames.
+        """
         pairs = (
             ("pooling", self.pooling, pooling),
             ("frames", self.frames, frames),
@@ -268,7 +299,8 @@ class LinearHead:
             raise UserError(f"The head was fitted on other features. Give {' '.join(wrong)}.")
         if fingerprint != self.fingerprint:
             raise UserError(
-                f"The head was fitted on features of another encoder ({self.fingerprint}) than {source} "
+                f"The head was fitted on features of another encoder ({self.fingerprint}) than "
+                f"{source} "
                 f"({fingerprint}). Fit one with `anytouch probe label --save`."
             )
 
@@ -291,7 +323,10 @@ def save_head(path: str | Path, head: LinearHead) -> None:
 
 
 def load_head(path: str | Path) -> LinearHead:
-    """Load the head that `anytouch probe label --save` wrote. Raises UserError for any other file."""
+    """Load the head that `anytouch probe label --save` wrote.
+
+    Raises UserError for any other file.
+    """
     if not Path(path).is_file():
         raise UserError(f"There is no head {path}. `anytouch probe label --save` writes one.")
     try:
@@ -320,7 +355,10 @@ def load_head(path: str | Path) -> LinearHead:
         return head
     except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else error
-        message = f"{path} is not the head of a probe ({reason}). `anytouch probe label --save` writes one."
+        message = (
+            f"{path} is not the head of a probe ({reason}). `anytouch probe label --save` writes "
+            "one."
+        )
         raise UserError(message) from None
 
 
@@ -354,7 +392,9 @@ def _check_head(head: LinearHead) -> None:
 
 
 class ContactGate:
-    """Contact of frames of one sensor, by the difference from `background`: a picture, a `Preprocess`, or None."""
+    """Contact of frames of one sensor, by the difference from `background`: a picture, a
+    `Preprocess`, or None.
+    """
 
     def __init__(self, background: Array | Preprocess | None, sensor: str) -> None:
         self._source: Any = background
@@ -387,7 +427,8 @@ def probabilities(logits: Array, temperature: float = 1.0) -> Array:
 
 
 def fit_temperature(logits: Array, y: Array, groups: Array) -> float:
-    """Return the temperature that minimises the log loss of class numbers `y` (n,), 0.05 to 20 (Guo et al. 2017).
+    """Return the temperature that minimises the log loss of class numbers `y` (n,), 0.05 to 20 (Guo
+    et al. 2017).
 
     `logits` (n, K), or (n, 1) of two classes. Each of the `groups` (n,) has the same weight.
     """
@@ -414,9 +455,10 @@ def group_weights(groups: Array) -> Array:
 def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     """Return the limit that a score of a new group is at most with probability `share`.
 
-    `scores` (n,) are of rows in `groups` (n,), which have equal weight. The limit covers each group in turn by the
-    others. At most it is the limit for groups of equal rows, with one more group that is infinite. It is infinite below
-    share / (1 - share) groups. Raises UserError for a `share` outside 0..1, no scores or NaN.
+    `scores` (n,) are of rows in `groups` (n,), which have equal weight. The limit covers each group
+    in turn by the others. At most it is the limit for groups of equal rows, with one more group
+    that is infinite. It is infinite below share / (1 - share) groups. Raises UserError for a
+    `share` outside 0..1, no scores or NaN.
     """
     scores = np.asarray(scores, np.float64)
     groups = np.asarray(groups)
@@ -424,7 +466,8 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
         raise UserError(f"A coverage must lie between 0 and 1, not {share!r}.")
     if not scores.size or scores.shape != groups.shape or np.isnan(scores).any():
         raise UserError(
-            f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape} {groups.shape}."
+            f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape} "
+            f"{groups.shape}."
         )
     order = np.argsort(scores, kind="stable")
     scores = scores[order]
@@ -451,7 +494,9 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
 def novelty_scores(
     x: Array, references: Array, groups: Array | None = None, reference_groups: Any = None
 ) -> Array:
-    """Return the mean distance f64 (n,) of rows (n, d) to their nearest `references` (m, d) of other groups, or inf."""
+    """Return the mean distance f64 (n,) of rows (n, d) to their nearest `references` (m, d) of
+    other groups, or inf.
+    """
     # once: live touch waits for it
     scores = np.empty(len(x))
     references = references.astype(np.float64)
@@ -471,10 +516,11 @@ def novelty_scores(
 
 
 def reference_space(x: Array, groups: Array) -> tuple[Array, Array, Array]:
-    """Return a whitening f32 (d, d) by scaled features (n, d), numbers (m,) of reference rows, and these, whitened.
+    """Return a whitening f32 (d, d) by scaled features (n, d), numbers (m,) of reference rows, and
+    these, whitened.
 
-    It gives every direction equal spread, but those of almost none only a tenth. At most REFERENCES rows, evenly spread
-    over the `groups` (n,), are references.
+    It gives every direction equal spread, but those of almost none only a tenth. At most REFERENCES
+    rows, evenly spread over the `groups` (n,), are references.
     """
     values, vectors = np.linalg.eigh(
         np.cov(x.astype(np.float64), rowvar=False).reshape(x.shape[1], x.shape[1])
@@ -488,7 +534,9 @@ def reference_space(x: Array, groups: Array) -> tuple[Array, Array, Array]:
 
 
 def left_out_scores(x: Array, groups: Array) -> Array:
-    """Return the novelty (n,) of scaled features (n, d) by other groups alone: a fifth is left out in turn."""
+    """Return the novelty (n,) of scaled features (n, d) by other groups alone: a fifth is left out
+    in turn.
+    """
     # A whitening that has seen a row stretches its direction less, and the row looks too familiar.
     part = np.unique(groups, return_inverse=True)[1] % 5
     scores = np.full(len(x), np.inf)

@@ -1,8 +1,10 @@
-"""Live features of a camera or a video, frame by frame, with the latency of each part (`anytouch stream`).
+"""Live features of a camera or a video, frame by frame, with the latency of each part (`anytouch
+stream`).
 
-A thread reads and preprocesses frames, and a mailbox of one slot holds the newest clip. A camera is never waited for:
-frames that arrive while the encoder is busy are dropped, and a clip still has consecutive frames. None of a video's
-frames is dropped, and its end ends the stream. A missed read of a camera is tried again.
+A thread reads and preprocesses frames, and a mailbox of one slot holds the newest clip. A camera is
+never waited for: frames that arrive while the encoder is busy are dropped, and a clip still has
+consecutive frames. None of a video's frames is dropped, and its end ends the stream. A missed read
+of a camera is tried again.
 """
 
 import contextlib
@@ -32,7 +34,8 @@ PARTS = ("decode", "resize", "copy", "encoder")
 KEPT = 100_000  # last frames whose times are stored if their features are not
 RETRY = 2.0  # seconds in which a missed read of a camera is tried again
 HANG = 20.0  # seconds to wait for a read that does not return; V4L2 itself gives up after 10
-# seconds of the same bytes, or of black, until they are reported: the noise of a sensor never repeats
+# seconds of the same bytes, or of black, until they are reported: the noise of a sensor never
+# repeats
 STUCK = 0.3
 BLACK = 8.0  # mean pixel below which a picture is black; untouched gels have 30 and more
 CELL = 14  # pixels of a side over which a change is averaged
@@ -55,9 +58,11 @@ class CameraError(UserError):
 
 @shown_short
 class Frame(NamedTuple):
-    """Pixels RGB u8 (h, w, 3) of frame `number`, the clock when it was `read`, and the seconds of decoding.
+    """Pixels RGB u8 (h, w, 3) of frame `number`, the clock when it was `read`, and the seconds of
+    decoding.
 
-    `time`: its time stamp in a video. `picture`: "ok", "frozen" or "black". `missed`: missed reads so far.
+    `time`: its time stamp in a video. `picture`: "ok", "frozen" or "black". `missed`: missed reads
+    so far.
     """
 
     number: int
@@ -71,7 +76,9 @@ class Frame(NamedTuple):
 
 @shown_short
 class Clip(NamedTuple):
-    """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0 or NaN."""
+    """Frames u8 (T, H, W, 3) up to frame `last`, the seconds of resizing it, and its contact: 1, 0
+    or NaN.
+    """
 
     last: Frame
     frames: np.ndarray
@@ -84,10 +91,11 @@ class Clip(NamedTuple):
 class Embedded(NamedTuple):
     """Features f32 (E,) of the clip that ends with frame `number`.
 
-    `at`: seconds from the start of the stream to the frame. `seconds`: those of PARTS. `age`: seconds from the grabbed
-    frame to its features. `started`: start of the stream in Unix seconds. `time`: the time stamp of a video's frame, or
-    `at` of a camera's. `contact`: 1, 0 or NaN (unknown). `reused`: see `Reuse`. `estimated`: the untouched gel is a
-    running estimate, which may still improve. `fields` is what was measured.
+    `at`: seconds from the start of the stream to the frame. `seconds`: those of PARTS. `age`:
+    seconds from the grabbed frame to its features. `started`: start of the stream in Unix seconds.
+    `time`: the time stamp of a video's frame, or `at` of a camera's. `contact`: 1, 0 or NaN
+    (unknown). `reused`: see `Reuse`. `estimated`: the untouched gel is a running estimate, which
+    may still improve. `fields` is what was measured.
     """
 
     number: int
@@ -106,7 +114,9 @@ class Embedded(NamedTuple):
 
 
 class Mailbox:
-    """One slot between the reader and the encoder, in which a newer clip may `replace` one that was not taken."""
+    """One slot between the reader and the encoder, in which a newer clip may `replace` one that was
+    not taken.
+    """
 
     def __init__(self, *, replace: bool) -> None:
         self.is_closed = False
@@ -117,7 +127,10 @@ class Mailbox:
         self._error: BaseException | None = None
 
     def put(self, clip: Clip) -> bool:
-        """Leave a clip, after waiting for an empty slot unless it may be replaced. Return False once it is closed."""
+        """Leave a clip, after waiting for an empty slot unless it may be replaced.
+
+        Return False once it is closed.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._replace or self._clip is None or self.is_closed)
             if not self.is_closed:
@@ -128,7 +141,8 @@ class Mailbox:
     def take(self, hang: float | None = None) -> Clip | None:
         """Wait for a clip and return it, None after the last one.
 
-        Raises the error of the reader, and CameraError after `hang` seconds in which the reader did not come back.
+        Raises the error of the reader, and CameraError after `hang` seconds in which the reader did
+        not come back.
         """
         with self._changed:
             while not self._changed.wait_for(
@@ -136,7 +150,8 @@ class Mailbox:
             ):
                 if hang is not None and time.perf_counter() - self.alive > hang:
                     raise CameraError(
-                        f"the camera has not answered for {hang:g} s. Check its cable, and start again."
+                        f"the camera has not answered for {hang:g} s. Check its cable, and start "
+                        "again."
                     )
             clip = self._clip
             self._clip = None
@@ -169,14 +184,16 @@ def stream(
     reuse: float = 0.0,
     measure: Measure | None = None,
 ) -> Generator[Embedded]:
-    """Yield features of the frames of `source`; the encoder is compiled before the first frame is read.
+    """Yield features of the frames of `source`; the encoder is compiled before the first frame is
+    read.
 
-    A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess` is
-    `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy, and `log` gets one
-    sentence each about a missed read, a frozen and a black picture. `contact` decides contact of a frame, as
-    `ContactGate` does. `reuse` is the factor of `Reuse`. `measure`, of `Encoder.measure_of`, measures in the same pass.
-    Close the iterator to stop and to release the source. Raises UserError for a wrong length or factor, and CameraError
-    after RETRY seconds without a frame.
+    A clip is the last `frames` frames, `stride` apart. `sensor` is a row of the table. `preprocess`
+    is `Preprocess(encoder)` by default. With `live`, frames are dropped while the encoder is busy,
+    and `log` gets one sentence each about a missed read, a frozen and a black picture. `contact`
+    decides contact of a frame, as `ContactGate` does. `reuse` is the factor of `Reuse`. `measure`,
+    of `Encoder.measure_of`, measures in the same pass. Close the iterator to stop and to release
+    the source. Raises UserError for a wrong length or factor, and CameraError after RETRY seconds
+    without a frame.
     """
     check_frames(encoder.config.model, frames)
     if stride < 1:
@@ -184,7 +201,8 @@ def stream(
     is_served = Reuse(reuse)
     if measure is not None and frames not in (1, encoder.config.model.frames):
         raise UserError(
-            f"fields are measured on 1 frame or clips of {encoder.config.model.frames}, not of {frames}"
+            f"fields are measured on 1 frame or clips of {encoder.config.model.frames}, not of "
+            f"{frames}"
         )
     embed = compile_for_one(encoder, sensor, frames, pooling, join, measures=measure is not None)
     mailbox = Mailbox(replace=live)
@@ -229,11 +247,13 @@ def stream(
 
 
 class Reuse:
-    """Whether the features of the last embedded clip serve a clip: no place changed by more than noise.
+    """Whether the features of the last embedded clip serve a clip: no place changed by more than
+    noise.
 
-    Clips are arrays (T, H, W, 3) of one shape. The noise is what a tenth of the last CHANGES from one clip to the next
-    stay below, known after LEARNED of them. A clip is served if its largest change is at most `factor` times the noise,
-    and with a factor of 0 if it is equal. Raises UserError for a negative factor.
+    Clips are arrays (T, H, W, 3) of one shape. The noise is what a tenth of the last CHANGES from
+    one clip to the next stay below, known after LEARNED of them. A clip is served if its largest
+    change is at most `factor` times the noise, and with a factor of 0 if it is equal. Raises
+    UserError for a negative factor.
     """
 
     def __init__(self, factor: float) -> None:
@@ -258,7 +278,9 @@ class Reuse:
 
 
 def largest_change(clip: np.ndarray, other: np.ndarray) -> float:
-    """Return the largest mean absolute difference, over cells of CELL pixels, of two clips (T, H, W, 3)."""
+    """Return the largest mean absolute difference, over cells of CELL pixels, of two clips (T, H,
+    W, 3).
+    """
     rows = clip.shape[0] * clip.shape[1]
     width = clip.shape[2]
     change = cv2.absdiff(*(one.reshape(rows, -1) for one in (clip, other))).astype(np.float32)
@@ -276,7 +298,8 @@ def compile_for_one(
     *,
     measures: bool = False,
 ) -> Callable[..., Any]:
-    """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm, parameters on the device.
+    """Return the encoder of one touch u8 (1, T, H, W, 3) of one sensor, compiled and warm,
+    parameters on the device.
 
     If it `measures`, it takes the aspect f32 (1,) too, and returns the features and the fields.
     """
@@ -309,7 +332,10 @@ def _read(
     mailbox: Mailbox,
     contact: Callable[[np.ndarray], float] | None = None,
 ) -> None:
-    """Put the newest clip of preprocessed frames into the mailbox: the reader's thread. No clip has a missed read."""
+    """Put the newest clip of preprocessed frames into the mailbox: the reader's thread.
+
+    No clip has a missed read.
+    """
     ring: deque[np.ndarray] = deque(maxlen=(frames - 1) * stride + 1)
     missed = 0
     try:
@@ -331,7 +357,10 @@ def _read(
 
 
 def _video_frames(source: Source) -> Iterator[Frame]:
-    """Yield the frames of a video with their time stamps. Raises UserError for pixels that cannot be used."""
+    """Yield the frames of a video with their time stamps.
+
+    Raises UserError for pixels that cannot be used.
+    """
     number = 0
     last = -1.0
     while True:
@@ -353,9 +382,11 @@ def _video_frames(source: Source) -> Iterator[Frame]:
 
 
 def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]:
-    """Yield the frames of a camera until the mailbox is closed; a read that fails or changes shape is tried again.
+    """Yield the frames of a camera until the mailbox is closed; a read that fails or changes shape
+    is tried again.
 
-    Raises CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be used.
+    Raises CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be
+    used.
     """
     number = 0
     missed = 0
@@ -387,7 +418,8 @@ def _camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame
             failing, fault = (decoded, reason) if failing is None else (failing, fault)
             if decoded - failing > RETRY:
                 raise CameraError(
-                    f"no frame of the camera could be read for {RETRY:g} s after {number} frames: {fault}. "
+                    f"no frame of the camera could be read for {RETRY:g} s after {number} frames: "
+                    f"{fault}. "
                     "Check its cable and other programs that use it, and start again."
                 )
             time.sleep(_PAUSE)
@@ -442,8 +474,8 @@ class _Watch:
 class Result(NamedTuple):
     """Features f32 (n, E) of frames `numbers` (n,), with the other fields of `Embedded` as arrays.
 
-    `total` frames have features: the arrays may have only the last ones. `frozen` and `black` count such pictures.
-    `interrupted` by Ctrl-C or SIGTERM. `error`: a camera that delivers nothing.
+    `total` frames have features: the arrays may have only the last ones. `frozen` and `black` count
+    such pictures. `interrupted` by Ctrl-C or SIGTERM. `error`: a camera that delivers nothing.
     """
 
     values: np.ndarray
@@ -471,7 +503,8 @@ def collect(
 ) -> Result:
     """Return the frames of a stream up to its end, Ctrl-C, SIGTERM or the failure of the camera.
 
-    With `on_each`, features go there, and only the last KEPT times are stored: a stream may run for weeks.
+    With `on_each`, features go there, and only the last KEPT times are stored: a stream may run for
+    weeks.
     """
     stored: deque[Embedded] = deque(maxlen=KEPT if on_each else None)
     total = 0

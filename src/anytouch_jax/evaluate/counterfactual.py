@@ -1,7 +1,9 @@
-"""Does touch matter for a task? The same probe on touches that were exchanged, shifted, emptied or averaged.
+"""Does touch matter for a task? The same probe on touches that were exchanged, shifted, emptied or
+averaged.
 
-Each control removes one thing. Shuffled touch is that of another row, and time-shifted touch that of half a recording
-later. Background only is the untouched gel. Mean touch is the mean of all features.
+Each control removes one thing. Shuffled touch is that of another row, and time-shifted touch that
+of half a recording later. Background only is the untouched gel. Mean touch is the mean of all
+features.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,11 +39,12 @@ def probe_counterfactual(
     log: Log = print,
     **options: Any,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the results of `probe_tasks` for the five kinds of touch, and what real touch adds to each of the others.
+    """Return the results of `probe_tasks` for the five kinds of touch, and what real touch adds to
+    each of the others.
 
-    An entry of the second has task, head, control, difference, low and high: a paired difference of accuracy or R2 with
-    its 95 % interval. Without an untouched gel for every row "background only" is left out. `options` are others of
-    `probe_tasks`. Raises UserError.
+    An entry of the second has task, head, control, difference, low and high: a paired difference of
+    accuracy or R2 with its 95 % interval. Without an untouched gel for every row "background only"
+    is left out. `options` are others of `probe_tasks`. Raises UserError.
     """
     if len(models) != 1:
         raise UserError(
@@ -73,7 +76,9 @@ def touch_sources(
     log: Log = print,
     **encoding: Any,
 ) -> list[FeatureSource]:
-    """Return features of the real touch and of the four controls; "background only" where rows have backgrounds."""
+    """Return features of the real touch and of the four controls; "background only" where rows have
+    backgrounds.
+    """
     gels = UnitGels(table)
     real = encoder_features(encoder, table, folder=cache, gels=gels, log=log, **encoding)
 
@@ -129,7 +134,9 @@ def shuffle_rows(table: Manifest, rows: Array) -> Array:
 
 
 def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
-    """Return for each of `rows` (n,) the row half a recording later, around the end; one frame alone stays."""
+    """Return for each of `rows` (n,) the row half a recording later, around the end; one frame
+    alone stays.
+    """
     ends = np.arange(len(table)) if frames == 1 else np.unique(table.clips(frames)[:, -1])
     sequence = table.codes("sequence", own=True)
     number = np.asarray(table.column("frame_index"))
@@ -154,7 +161,10 @@ def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
         above = [gain for gain in without if gain["low"] is not None and gain["low"] > 0]
         if len(above) == len(without):
             least = min(without, key=lambda gain: gain["difference"])
-            points = f"{100 * least['difference']:.1f} points ({100 * least['low']:.1f} to {100 * least['high']:.1f})"
+            points = (
+                f"{100 * least['difference']:.1f} points ({100 * least['low']:.1f} to "
+                f"{100 * least['high']:.1f})"
+            )
             sentence = f"Touch matters for {key[0]}: it adds {points} to {least['control']}"
             late = own.get(SHIFTED, {"low": None})
             if late["low"] is not None and (late["low"], late["high"]) != (
@@ -168,7 +178,10 @@ def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
                 )
         else:
             failed = ", ".join(gain["control"] for gain in without if gain not in above)
-            sentence = f"There is no sign that touch matters for {key[0]}: real touch is not above {failed}"
+            sentence = (
+                f"There is no sign that touch matters for {key[0]}: real touch is not above "
+                f"{failed}"
+            )
         lines.append(f"{sentence} ({key[1]}).")
     return lines
 

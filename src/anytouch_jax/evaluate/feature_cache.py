@@ -1,4 +1,6 @@
-"""Feature caches: features by manifest row, of an encoder, a features file or raw pixels; in memory and on disk."""
+"""Feature caches: features by manifest row, of an encoder, a features file or raw pixels; in memory
+and on disk.
+"""
 
 import contextlib
 import hashlib
@@ -38,7 +40,8 @@ COMPONENTS = 200  # principal components of raw pixels
 
 
 class FeatureStore:
-    """Features by row and length of clip, each computed once and, with a `folder`, stored in an .npz named by content.
+    """Features by row and length of clip, each computed once and, with a `folder`, stored in an
+    .npz named by content.
 
     `describe()` names everything else that they depend on. It is called only if there is a folder.
     """
@@ -106,7 +109,9 @@ def encoder_features(
     gels: UnitGels | None = None,
     log: Callable[[str], None] = lambda _: None,
 ) -> FeatureStore:
-    """Return the features of an encoder; `universal`: the universal tokens for every sensor, as for unknown ones."""
+    """Return the features of an encoder; `universal`: the universal tokens for every sensor, as for
+    unknown ones.
+    """
     gels = gels or UnitGels(table)
 
     def describe() -> dict[str, Any]:
@@ -135,7 +140,9 @@ def pixel_features(
     folder: Path | None = None,
     gels: UnitGels | None = None,
 ) -> FeatureStore:
-    """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in 0..1."""
+    """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in
+    0..1.
+    """
     gels = gels or UnitGels(table)
     read = _pair_reader(
         table, gels, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA)
@@ -159,9 +166,11 @@ def pixel_features(
 
 
 def file_features(path: Path, table: Manifest) -> FeatureStore:
-    """Return the features of an .npz file: arrays `features` (n, d) and `rows` (n,) of the manifest.
+    """Return the features of an .npz file: arrays `features` (n, d) and `rows` (n,) of the
+    manifest.
 
-    Raises UserError for another file or manifest, and, when they are read, for other clips and missing rows.
+    Raises UserError for another file or manifest, and, when they are read, for other clips and
+    missing rows.
     """
     features, about = read_npz(path)
     values = features.values
@@ -169,7 +178,8 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
     length = about.get("frames")
     if len(np.unique(rows)) < len(rows) or rows.min() < 0 or rows.max() >= len(table):
         raise UserError(
-            f"{path}: rows must be distinct row numbers of the manifest, from 0 to {len(table) - 1}."
+            f"{path}: rows must be distinct row numbers of the manifest, from 0 to "
+            f"{len(table) - 1}."
         )
     paths = features.keys.get("path")
     if (
@@ -187,7 +197,8 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
     def compute(wanted: Array, frames: int) -> Array:
         if length not in (None, str(frames)):
             raise UserError(
-                f"{path} holds features of {length} frames a touch, not {frames}. Give --frames {length}."
+                f"{path} holds features of {length} frames a touch, not {frames}. Give --frames "
+                f"{length}."
             )
         missing = len(np.setdiff1d(wanted, rows))
         if missing:
@@ -200,7 +211,9 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
 
 
 def reorder_frames(clips: Array, rows: Array, order: Order) -> Array:
-    """Return clips (n, T, ...) untouched, with frames shuffled (by the row's number), or with the last repeated."""
+    """Return clips (n, T, ...) untouched, with frames shuffled (by the row's number), or with the
+    last repeated.
+    """
     frames = clips.shape[1]
     if order == "right" or frames == 1:
         return clips
@@ -241,9 +254,11 @@ def encoder_digest(encoder: Encoder) -> str:
 
 
 def image_digest(table: Manifest, count: int = 32) -> str:
-    """Return SHA-256 over size and mtime of each frame (or its shard), all backgrounds and `count` sampled frames.
+    """Return SHA-256 over size and mtime of each frame (or its shard), all backgrounds and `count`
+    sampled frames.
 
-    Pictures may change under an equal manifest. A copy of the folder that keeps its times has the same digest.
+    Pictures may change under an equal manifest. A copy of the folder that keeps its times has the
+    same digest.
     """
     digest = hashlib.sha256()
     files = distinct_files(table, ("path", "background_path"))
@@ -264,7 +279,9 @@ def image_digest(table: Manifest, count: int = 32) -> str:
 
 
 def raw_pixels(frame: Array, background: Array | None) -> Array:
-    """Return pixels in colour, and minus the background (0 if None): u8 RGB (h, w, 3) -> f32 (2 * 24 * 32 * 3,)."""
+    """Return pixels in colour, and minus the background (0 if None): u8 RGB (h, w, 3) -> f32 (2 *
+    24 * 32 * 3,).
+    """
     pixels = _small(frame)
     return np.concatenate(
         [pixels, np.zeros_like(pixels) if background is None else pixels - _small(background)]
@@ -280,7 +297,10 @@ def _pair_reader(
 
 
 def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = None) -> Array:
-    """Return frames minus their untouched gel in RGB: f32 (n, 24 * 32 * 3) in -1..1. Raises UserError without one."""
+    """Return frames minus their untouched gel in RGB: f32 (n, 24 * 32 * 3) in -1..1.
+
+    Raises UserError without one.
+    """
     read = _pair_reader(
         table, gels or UnitGels(table), lambda one: (_small(one), one.shape[1] / one.shape[0])
     )
@@ -303,7 +323,10 @@ def principal_components(
     components: int = COMPONENTS,
     solver: Literal["full", "randomized"] = "full",
 ) -> Array:
-    """Return `features` (n, d) on the principal components of their `train` (n,) rows. Raises UserError without any."""
+    """Return `features` (n, d) on the principal components of their `train` (n,) rows.
+
+    Raises UserError without any.
+    """
     fitted = features[np.asarray(train, bool)]
     if not len(fitted):
         raise UserError("No row is marked as train. The principal components need some.")
@@ -319,7 +342,9 @@ def _small(image: Array) -> Array:
 
 
 def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:
-    """Return the principal components of raw pixels, fitted on the rows of train (on all without these)."""
+    """Return the principal components of raw pixels, fitted on the rows of train (on all without
+    these).
+    """
     train = rows.split == "train"
     return principal_components(store.get(rows.rows, 1), train if train.any() else ~train)
 
@@ -351,14 +376,18 @@ def opened(models: Sequence[str | Path | FeatureSource]) -> list[Encoder | Featu
 
 
 def with_gel(rows: TaskRows, gels: UnitGels, models: Sequence[Encoder | FeatureSource]) -> TaskRows:
-    """Return the rows that all models can read, for those that need an untouched gel. Raises UserError without any."""
+    """Return the rows that all models can read, for those that need an untouched gel.
+
+    Raises UserError without any.
+    """
     encoders = [one if isinstance(one, Encoder) else one.encoder for one in models]
     if not any(encoder is not None and encoder.needs_background for encoder in encoders):
         return rows
     has = np.all(gels.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
     if not has.any():
         raise UserError(
-            f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. {ADVICE}"
+            f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. "
+            f"{ADVICE}"
         )
     note = f"{(~has).sum()} rows are left out: they have no picture of the untouched gel"
     return rows.take(np.flatnonzero(has))._replace(
@@ -381,7 +410,8 @@ def sources(
 ) -> list[FeatureSource]:
     """Return models, the random encoder, features files and raw pixels, in this order.
 
-    `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of every clip.
+    `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of
+    every clip.
     """
     several = [model for model in models if isinstance(model, FeatureSource)]
     encoders = {model.source: model for model in models if isinstance(model, Encoder)}

@@ -1,4 +1,6 @@
-"""Heads on frozen features: linear, nearest-neighbour, ridge and gradient-trained, each fitted for all its options."""
+"""Heads on frozen features: linear, nearest-neighbour, ridge and gradient-trained, each fitted for
+all its options.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,10 @@ STEPS = 300  # of logistic regression
 
 @dataclass(frozen=True)
 class GradientRecipe:
-    """The authors' probe: a linear layer, AdamW, cosine decay to 0. Defaults are of `run_probe_OF1.sh`, two devices."""
+    """The authors' probe: a linear layer, AdamW, cosine decay to 0.
+
+    Defaults are of `run_probe_OF1.sh`, two devices.
+    """
 
     epochs: int = 50
     batch: int = 128
@@ -51,9 +56,10 @@ class GradientRecipe:
 class ProbeHead:
     """A head to fit; on numbers "linear" is ridge regression.
 
-    `scaling` "column" brings every feature to unit variance, "common" divides all by one factor. `options` replace the
-    default penalties, numbers of neighbours or epochs, and are sorted. `recipe` and `seed` are of "gradient". Raises
-    UserError for an unknown head, and for options that are not above 0.
+    `scaling` "column" brings every feature to unit variance, "common" divides all by one factor.
+    `options` replace the default penalties, numbers of neighbours or epochs, and are sorted.
+    `recipe` and `seed` are of "gradient". Raises UserError for an unknown head, and for options
+    that are not above 0.
     """
 
     name: HeadName = "linear"
@@ -70,7 +76,8 @@ class ProbeHead:
         if self.options is not None:
             if not self.options or min(self.options) <= 0:
                 raise UserError(
-                    f"Penalties and numbers of neighbours must be above 0, not {list(self.options)}."
+                    "Penalties and numbers of neighbours must be above 0, not "
+                    f"{list(self.options)}."
                 )
             object.__setattr__(
                 self, "options", tuple(sorted(set(map(float, self.options)), reverse=True))
@@ -79,7 +86,9 @@ class ProbeHead:
 
 @shown_short
 class FittedHead(NamedTuple):
-    """A fit for each option; `models` are those of logistic regression, empty for the other heads."""
+    """A fit for each option; `models` are those of logistic regression, empty for the other
+    heads.
+    """
 
     options: tuple[float, ...]
     predict: Predict
@@ -108,9 +117,11 @@ def fit_head(
     weights: Array | None = None,
     start: LinearModel | None = None,
 ) -> FittedHead:
-    """Fit all options of a head on features f32 (n, d) and class numbers below `classes` (0: y are numbers).
+    """Fit all options of a head on features f32 (n, d) and class numbers below `classes` (0: y are
+    numbers).
 
-    `weights` (n,): how often each row counts, whole except in logistic regression. `start`: a fit that it starts from.
+    `weights` (n,): how often each row counts, whole except in logistic regression. `start`: a fit
+    that it starts from.
     """
     epochs = range(1, head.recipe.epochs + 1)
     defaults = {"linear": PENALTIES if classes else RIDGE, "knn": NEIGHBOURS, "gradient": epochs}
@@ -156,7 +167,9 @@ def linear_path(
     weights: Array | None = None,
     start: LinearModel | None = None,
 ) -> list[LinearModel]:
-    """Return logistic regression of `y` (n,) for each penalty, each from the fit before; `weights` (n,) of the rows."""
+    """Return logistic regression of `y` (n,) for each penalty, each from the fit before; `weights`
+    (n,) of the rows.
+    """
     mean, scale = _mean_and_scale(x, weights, scaling)
     classes, numbers = np.unique(y, return_inverse=True)
     first = start.fit if start is not None and np.array_equal(start.classes, classes) else None
@@ -169,7 +182,9 @@ def linear_path(
 def _mean_and_scale(
     x: Array, weights: Array | None = None, scaling: Scaling = "column"
 ) -> tuple[Array, Array]:
-    """Return the mean and deviation (d,) of each column, "common": one for all; a constant column gets deviation 1."""
+    """Return the mean and deviation (d,) of each column, "common": one for all; a constant column
+    gets deviation 1.
+    """
     shares = None if weights is None else weights / weights.sum(dtype=np.float64)
     mean = (x.mean(0, dtype=np.float64) if shares is None else shares @ x).astype(np.float32)
     centred = x - mean
@@ -186,7 +201,9 @@ def _mean_and_scale(
 def fit_ridge(
     x: Array, y: Array, penalties: Sequence[float], scaling: Scaling = "column"
 ) -> Predict:
-    """Return a function from features (m, d) to ridge predictions (m,), one array a penalty of the mean square."""
+    """Return a function from features (m, d) to ridge predictions (m,), one array a penalty of the
+    mean square.
+    """
     # here, so that other heads are fitted without it
     from sklearn.linear_model import Ridge
 
@@ -199,7 +216,9 @@ def fit_ridge(
 
 
 def vote(labels: Array, cosines: Array, classes: int) -> Array:
-    """Return the most frequent class of each row of `labels` (n, k); of equals the one of larger summed cosine."""
+    """Return the most frequent class of each row of `labels` (n, k); of equals the one of larger
+    summed cosine.
+    """
     votes = np.zeros((len(labels), classes))
     rows = np.repeat(np.arange(len(labels)), labels.shape[1])
     np.add.at(votes, (rows, labels.ravel()), (1 + 1e-3 * cosines / labels.shape[1]).ravel())
@@ -209,7 +228,10 @@ def vote(labels: Array, cosines: Array, classes: int) -> Array:
 def _fit_gradient(
     x: Array, y: Array, classes: int, options: Sequence[float], recipe: GradientRecipe, seed: int
 ) -> Predict:
-    """Fit the authors' layer; numbers are fitted in standard deviations. An option is an epoch, counted from 1."""
+    """Fit the authors' layer; numbers are fitted in standard deviations.
+
+    An option is an epoch, counted from 1.
+    """
     refuse_forked()
     rng = np.random.default_rng(seed)
     x, (n, d), columns = np.asarray(x, np.float32), x.shape, classes if classes > 2 else 1
@@ -250,7 +272,9 @@ def _fit_gradient(
 def _gradient_step(
     recipe: GradientRecipe, classes: int
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return optax's `init` and a compiled step of AdamW; two classes share one logit, as in the released code."""
+    """Return optax's `init` and a compiled step of AdamW; two classes share one logit, as in the
+    released code.
+    """
     import jax  # here, so that a saved head is read without it
     import optax
 
@@ -288,9 +312,10 @@ def calibrate(
 ) -> LinearHead:
     """Return the head with a calibration from rows that it was not fitted on.
 
-    `features` (N, d), class names `y` (N,), `groups` (N,) and `sensors` (N,) are of all rows. `fit` and `val` are row
-    numbers. `folds` yields rows of `fit` to fit on and left out: heads fitted again with `penalty` predict these.
-    `shares` are those of `LinearHead.calibrated`. Raises UserError if no row is left.
+    `features` (N, d), class names `y` (N,), `groups` (N,) and `sensors` (N,) are of all rows. `fit`
+    and `val` are row numbers. `folds` yields rows of `fit` to fit on and left out: heads fitted
+    again with `penalty` predict these. `shares` are those of `LinearHead.calibrated`. Raises
+    UserError if no row is left.
     """
     count = len(head.classes)
     logits = [head.scaled(features[val]) @ head.weights + head.bias]
@@ -325,14 +350,17 @@ def linear_head(
     return LinearHead(*arrays, label, pooling, frames, fingerprint)
 
 
-# Logistic regression for 100,000 rows: preconditioned L-BFGS along falling penalties. Features of a network are
-# correlated, which costs L-BFGS hundreds of passes. The Hessian at equal probabilities is known: 1/K (I - 11'/K) (x)
-# X'X/n. We change to the coordinates of its Cholesky factor, with the penalty on the diagonal. There tens of passes
-# suffice. Arithmetic on the features is float32, and losses are summed in float64.
+# Logistic regression for 100,000 rows: preconditioned L-BFGS along falling penalties. Features of a
+# network are correlated, which costs L-BFGS hundreds of passes. The Hessian at equal probabilities
+# is known: 1/K (I - 11'/K) (x) X'X/n. We change to the coordinates of its Cholesky factor, with the
+# penalty on the diagonal. There tens of passes suffice. Arithmetic on the features is float32, and
+# losses are summed in float64.
 
 
 class Logistic(NamedTuple):
-    """A fit: `weights` f32 (d, columns), `bias` (columns,), one column for two classes; `finished`: within STEPS."""
+    """A fit: `weights` f32 (d, columns), `bias` (columns,), one column for two classes; `finished`:
+    within STEPS.
+    """
 
     weights: Array
     bias: Array
@@ -355,10 +383,12 @@ def logistic_path(
     start: Logistic | None = None,
     weights: Array | None = None,
 ) -> Iterator[Logistic]:
-    """Yield multinomial logistic regressions of class numbers `y` (n,) below `classes` on features `x` f32 (n, d).
+    """Yield multinomial logistic regressions of class numbers `y` (n,) below `classes` on features
+    `x` f32 (n, d).
 
-    A penalty is the factor of half the squared weights, added to the mean log loss; the bias is free. Give standardised
-    features, and the strongest penalty first: each starts from the fit before. `weights` (n,) of rows in that mean.
+    A penalty is the factor of half the squared weights, added to the mean log loss; the bias is
+    free. Give standardised features, and the strongest penalty first: each starts from the fit
+    before. `weights` (n,) of rows in that mean.
     """
     x = np.ascontiguousarray(x, np.float32)
     columns = 1 if classes == 2 else classes
@@ -412,7 +442,9 @@ def _fit(
 
 
 def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
-    """Return the log loss, weighted by `shares` (n, 1), and its gradient by the logits (n, columns), overwritten."""
+    """Return the log loss, weighted by `shares` (n, 1), and its gradient by the logits (n,
+    columns), overwritten.
+    """
     if logits.shape[1] == 1:
         signed = np.where(y == 1, logits[:, 0], -logits[:, 0])
         loss = float(np.sum(shares[:, 0] * np.logaddexp(0, -signed), dtype=np.float64))

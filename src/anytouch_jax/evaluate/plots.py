@@ -48,7 +48,10 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Return the lines of metrics.jsonl of a run folder, or of the file. Raises UserError if there are none."""
+    """Return the lines of metrics.jsonl of a run folder, or of the file.
+
+    Raises UserError if there are none.
+    """
     file = run / "metrics.jsonl" if run.is_dir() else run
     try:
         lines = [parse_json(line) for line in file.read_text(encoding="utf-8").splitlines()]
@@ -64,7 +67,8 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
         ]
         if not all(isinstance(value, int | float) for value in values):
             raise UserError(
-                f"Line {number} of {file} has no step, or a loss that is not a number. Remove the line."
+                f"Line {number} of {file} has no step, or a loss that is not a number. Remove the "
+                "line."
             )
     if not lines:
         raise UserError(f"{file} has no step yet. Train first.")
@@ -72,7 +76,9 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 
 def loss_curves(path: Path, runs: Mapping[str, Path]) -> None:
-    """Draw loss against step, a panel for each run {title: run folder or metrics.jsonl}, raw and smoothed."""
+    """Draw loss against step, a panel for each run {title: run folder or metrics.jsonl}, raw and
+    smoothed.
+    """
     figure, axes = panels(1, len(runs), 5.0, 3.4)
     for axis, (title, run) in zip(axes[0], runs.items(), strict=True):
         lines = read_metrics(Path(run))
@@ -130,7 +136,9 @@ def sample_grid(
     rows: Sequence[str],
     columns: Sequence[str],
 ) -> None:
-    """Draw a grid of pictures RGB u8 (h, w, 3), or fields (h, w) as colour maps; None is an empty cell."""
+    """Draw a grid of pictures RGB u8 (h, w, 3), or fields (h, w) as colour maps; None is an empty
+    cell.
+    """
     figure, axes = panels(len(rows), len(columns), 1.75, 1.6)
     for i, (line, title) in enumerate(zip(images, rows, strict=True)):
         for j, (image, column) in enumerate(zip(line, columns, strict=True)):
@@ -160,7 +168,9 @@ def sample_grid(
 
 
 def bars(path: Path, series: Mapping[str, Mapping[str, ShareBar]], *, label: str = "share") -> None:
-    """Draw horizontal bars of shares with their intervals, {panel: {name: ShareBar}}; dashes mark chance."""
+    """Draw horizontal bars of shares with their intervals, {panel: {name: ShareBar}}; dashes mark
+    chance.
+    """
     longest = max(len(one) for one in series.values())
     figure, axes = panels(1, len(series), 4.2, 0.9 + 0.34 * longest, sharex=True, sharey=True)
     names = list(dict.fromkeys(name for one in series.values() for name in one))
@@ -192,7 +202,10 @@ def bars(path: Path, series: Mapping[str, Mapping[str, ShareBar]], *, label: str
 def panels(
     rows: int, columns: int, width: float, height: float, **options: Any
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Return a figure and its grid of axes, each `width` x `height` inches. Raises UserError without any."""
+    """Return a figure and its grid of axes, each `width` x `height` inches.
+
+    Raises UserError without any.
+    """
     from matplotlib.figure import Figure
 
     if not rows or not columns:
@@ -202,7 +215,9 @@ def panels(
 
 
 def _colours(count: int) -> Array:
-    """Return RGB colours (count, 3): ten distinct ones, or hues in an order that separates neighbours."""
+    """Return RGB colours (count, 3): ten distinct ones, or hues in an order that separates
+    neighbours.
+    """
     from matplotlib import colormaps
 
     if count <= 10:
@@ -212,7 +227,10 @@ def _colours(count: int) -> Array:
 
 @dataclass(frozen=True)
 class Space:
-    """Numbers of one feature space; see the functions of the same names. None: not defined for these labels."""
+    """Numbers of one feature space; see the functions of the same names.
+
+    None: not defined for these labels.
+    """
 
     name: str
     alignment: float | None
@@ -223,7 +241,9 @@ class Space:
 
 
 def alignment(first: Array, second: Array) -> float:
-    """Return the mean squared distance of unit-norm positive pairs (n, d); 0 is best (Wang & Isola, 2020)."""
+    """Return the mean squared distance of unit-norm positive pairs (n, d); 0 is best (Wang & Isola,
+    2020).
+    """
     first = _unit(first)
     second = _unit(second)
     if first.shape != second.shape or not len(first):
@@ -232,7 +252,9 @@ def alignment(first: Array, second: Array) -> float:
 
 
 def uniformity(features: Array) -> float:
-    """Return the log of the mean of exp(-2 |x - y|^2) over pairs of unit-norm rows, -8 to 0 (Wang & Isola, 2020)."""
+    """Return the log of the mean of exp(-2 |x - y|^2) over pairs of unit-norm rows, -8 to 0 (Wang &
+    Isola, 2020).
+    """
     x = _unit(subsample(np.asarray(features), MOST))
     if len(x) < 2:
         raise UserError("Uniformity needs two rows or more.")
@@ -241,7 +263,9 @@ def uniformity(features: Array) -> float:
 
 
 def silhouette(features: Array, labels: Any) -> float | None:
-    """Return the mean silhouette by cosine distance, -1..1; None with fewer than two labels, or as many as rows."""
+    """Return the mean silhouette by cosine distance, -1..1; None with fewer than two labels, or as
+    many as rows.
+    """
     from sklearn.metrics import silhouette_score
 
     labels = subsample(np.asarray(labels).astype(str), MOST)
@@ -254,7 +278,10 @@ def silhouette(features: Array, labels: Any) -> float | None:
 
 
 def tsne(features: Array, *, seed: int = 0) -> Array:
-    """Return a t-SNE of features (n, d) by cosine distance, f32 (n, 2). Raises UserError below 4 rows or 2 columns."""
+    """Return a t-SNE of features (n, d) by cosine distance, f32 (n, 2).
+
+    Raises UserError below 4 rows or 2 columns.
+    """
     from sklearn.manifold import TSNE
     from threadpoolctl import threadpool_limits
 
@@ -277,7 +304,9 @@ def tsne(features: Array, *, seed: int = 0) -> Array:
 def describe(
     features: Array, sensors: Any, objects: Any, touches: Any, *, name: str = "features"
 ) -> Space:
-    """Return all numbers of features (n, d); positive pairs are the rows of one touch by different sensors."""
+    """Return all numbers of features (n, d); positive pairs are the rows of one touch by different
+    sensors.
+    """
     x = np.asarray(features)
     sensors = np.asarray(sensors).astype(str)
     objects = np.asarray(objects).astype(str)

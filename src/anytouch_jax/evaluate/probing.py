@@ -1,10 +1,13 @@
-"""Probes of frozen features: of arrays, a label column, named tasks, or a public benchmark; their results and tables.
+"""Probes of frozen features: of arrays, a label column, named tasks, or a public benchmark; their
+results and tables.
 
-A task selects rows and labels. Frames are never augmented. The protocols are those of `splits`. In tasks, "honest"
-splits whole groups (objects, recordings) again by every seed, and "published" keeps the manifest's split.
+A task selects rows and labels. Frames are never augmented. The protocols are those of `splits`. In
+tasks, "honest" splits whole groups (objects, recordings) again by every seed, and "published" keeps
+the manifest's split.
 
-Probes of arrays take `features` (n, d); `labels` (n,), where None, "" or NaN is no label; `groups` (n,), which no fold
-or bootstrap cuts; and `split` (n,), "train", "val" or "test" for the rows that take part.
+Probes of arrays take `features` (n, d); `labels` (n,), where None, "" or NaN is no label; `groups`
+(n,), which no fold or bootstrap cuts; and `split` (n,), "train", "val" or "test" for the rows that
+take part.
 """
 
 import dataclasses
@@ -75,7 +78,9 @@ class SubsetResult:
 @shown_short
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The test rows, whether each was right, and its group; `fitted`: the linear model and the names of its classes."""
+    """The test rows, whether each was right, and its group; `fitted`: the linear model and the
+    names of its classes.
+    """
 
     rows: Array
     correct: Array
@@ -88,11 +93,12 @@ class Outcome:
 class ProbeResult:
     """The score of a head fitted on all of train, on the test rows. Shares are in 0..1.
 
-    `low`, `high`: 95 % interval of the accuracy or R2 under a bootstrap over the test groups, None with fewer than two.
-    `penalty` (k, epoch) was selected on `chosen_on`. If that is test, the score is an upper estimate. A class that
-    train lacks counts as an error. `baseline` is the most frequent class of train. `refit_mean`, `refit_std`: accuracy
-    of `seeds` heads fitted on bootstraps of the train groups, a little lower. `mae` is in units of the label,
-    `baseline_mae` that of train's mean.
+    `low`, `high`: 95 % interval of the accuracy or R2 under a bootstrap over the test groups, None
+    with fewer than two. `penalty` (k, epoch) was selected on `chosen_on`. If that is test, the
+    score is an upper estimate. A class that train lacks counts as an error. `baseline` is the most
+    frequent class of train. `refit_mean`, `refit_std`: accuracy of `seeds` heads fitted on
+    bootstraps of the train groups, a little lower. `mae` is in units of the label, `baseline_mae`
+    that of train's mean.
     """
 
     probe: str
@@ -141,8 +147,9 @@ def probe_features(
 ) -> ProbeResult:
     """Probe with a head (default: linear) that is selected and fitted on train, and tested on test.
 
-    `measured`: labels are numbers. `seeds` heads of classes are fitted on bootstraps of the train groups too. `subsets`
-    (name -> mask over all rows) report parts of test. Raises UserError as `check_rows`.
+    `measured`: labels are numbers. `seeds` heads of classes are fitted on bootstraps of the train
+    groups too. `subsets` (name -> mask over all rows) report parts of test. Raises UserError as
+    `check_rows`.
     """
     data, rows, notes = splits.check_rows(features, labels, groups, split, measured=measured)
     head = head or ProbeHead()
@@ -191,7 +198,8 @@ def leave_groups_out(
 ) -> ProbeResult:
     """Probe each row with a linear fit on no row of its group, for instance on held-out objects.
 
-    `folds` None: each group alone. The other groups select the penalty, and their commonest class is the baseline.
+    `folds` None: each group alone. The other groups select the penalty, and their commonest class
+    is the baseline.
     """
     data, rows, notes = splits.check_rows(
         features, labels, groups, np.full(len(labels), "train"), tested=False
@@ -220,7 +228,9 @@ def leave_groups_out(
 def _predict(
     data: LabelledFeatures, cut: Split, head: ProbeHead, protocol: Protocol, *, refit: bool = False
 ) -> tuple[Selection, LinearModel | None, Array]:
-    """Return the selected option, its logistic model and its predictions for the test rows; `refit` without a start."""
+    """Return the selected option, its logistic model and its predictions for the test rows; `refit`
+    without a start.
+    """
     selected = splits.select_option(head, data, cut, protocol)
     fitted = selected.fitted
     place = selected.place
@@ -236,7 +246,9 @@ def _predict(
 
 
 def _constant(data: LabelledFeatures, cut: Split) -> Array:
-    """Return the most frequent class (the smallest of equals) or the mean of the fitted rows for each test row."""
+    """Return the most frequent class (the smallest of equals) or the mean of the fitted rows for
+    each test row.
+    """
     y = data.y[cut.fit]
     return np.full(len(cut.test), np.bincount(y).argmax() if len(data.names) else y.mean())
 
@@ -260,7 +272,9 @@ def _result(
     subsets: Subsets | None,
     constant: Array | None = None,
 ) -> ProbeResult:
-    """Return the scores of predictions for the test rows, and of a constant (default: that of train)."""
+    """Return the scores of predictions for the test rows, and of a constant (default: that of
+    train).
+    """
     truth = data.y[rows.test]
     groups = data.groups[rows.test]
     measured = not len(data.names)
@@ -308,7 +322,9 @@ def _result(
 
 
 def probe_json(results: Sequence[ProbeResult]) -> str:
-    """Return the results as a JSON list of objects, without outcomes; a number that does not exist is null."""
+    """Return the results as a JSON list of objects, without outcomes; a number that does not exist
+    is null.
+    """
     records = []
     for result in results:
         others = OF_CLASSES if result.measured else OF_NUMBERS
@@ -326,7 +342,8 @@ def probe_table(
 ) -> str:
     """Return results, or results of `probe_tasks`, as one Markdown table, with the notes below.
 
-    `paper`: the accuracy of AnyTouch in the paper. `details`: also a row for each part of the test rows.
+    `paper`: the accuracy of AnyTouch in the paper. `details`: also a row for each part of the test
+    rows.
     """
     lines = list[dict[str, str]]()
     notes = list[str]()
@@ -435,9 +452,10 @@ def probe_label(
 ) -> list[ProbeResult]:
     """Probe a label column with features of every model, of features files, and of the controls.
 
-    No split cuts a value of column `group`. `leave_out` tests every value of a column held out, instead of the splits.
-    `where` keeps rows whose column exceeds a number. `save` writes the linear head of the only model, calibrated to a
-    `coverage` of its sets and a share of `false_alarms`. `out` writes JSON. `probe_table` prints. Raises UserError.
+    No split cuts a value of column `group`. `leave_out` tests every value of a column held out,
+    instead of the splits. `where` keeps rows whose column exceeds a number. `save` writes the
+    linear head of the only model, calibrated to a `coverage` of its sets and a share of
+    `false_alarms`. `out` writes JSON. `probe_table` prints. Raises UserError.
     """
     if save is not None and len(models) != 1:
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
@@ -530,7 +548,9 @@ def probe_label(
 def calibrated(
     head: LinearHead, x: Array, rows: TaskRows, penalty: float, log: Log, **shares: float
 ) -> LinearHead:
-    """Return the head with its calibration, and log what it says; without one if the data do not allow it."""
+    """Return the head with its calibration, and log what it says; without one if the data do not
+    allow it.
+    """
     fit, val = (np.flatnonzero(rows.split == name) for name in ("train", "val"))
     try:
         labels = rows.labels
@@ -560,7 +580,9 @@ def label_rows(
     frames: int = 1,
     among: Callable[[TaskRows], TaskRows] = lambda rows: rows,
 ) -> tuple[TaskRows, dict[str, Array]]:
-    """Return the rows of `probe_label`, of which `among` chooses some, and masks as of `tasks.described_subsets`."""
+    """Return the rows of `probe_label`, of which `among` chooses some, and masks as of
+    `tasks.described_subsets`.
+    """
     task = tasks.label_task(table, label, group=leave_out or group, where=where, sensor=sensor)
     rows = among(tasks.select(table, task, frames))
     column, name = (
@@ -570,7 +592,9 @@ def label_rows(
 
 
 class _Plan(NamedTuple):
-    """A task with the rows that can be fitted on or tested, their roles and class names, and the length of a clip."""
+    """A task with the rows that can be fitted on or tested, their roles and class names, and the
+    length of a clip.
+    """
 
     task: Task
     rows: TaskRows
@@ -606,15 +630,17 @@ def probe_tasks(
 ) -> dict[str, Any]:
     """Probe named tasks with features of every model, of features files, and of the controls.
 
-    The "results" have a JSON-ready dict for each source of features, task, head and protocol. `metric` is "accuracy" in
-    0..1 or "r2". `mean`, `low` and `high` (95 %) are over seeds and test groups, and `values` has one a seed. `train`
-    and `test` count rows, `groups` the tested groups. `chance` is that of the most frequent class or the mean of train.
-    A regression also has mae, mae_low, mae_high and chance_mae in `unit`. Tasks that cannot be probed are "left_out"
-    with their reason.
+    The "results" have a JSON-ready dict for each source of features, task, head and protocol.
+    `metric` is "accuracy" in 0..1 or "r2". `mean`, `low` and `high` (95 %) are over seeds and test
+    groups, and `values` has one a seed. `train` and `test` count rows, `groups` the tested groups.
+    `chance` is that of the most frequent class or the mean of train. A regression also has mae,
+    mae_low, mae_high and chance_mae in `unit`. Tasks that cannot be probed are "left_out" with
+    their reason.
 
-    `protocol` "published" reports both. `frames` replaces that of each task. `order` shuffles the frames of clips, or
-    repeats the last. `universal`: the universal tokens for all sensors. `keep` gets the test rows of every seed.
-    `sides`: train_sensors, test_sensors, train_units and test_units, names or patterns. Raises UserError.
+    `protocol` "published" reports both. `frames` replaces that of each task. `order` shuffles the
+    frames of clips, or repeats the last. `universal`: the universal tokens for all sensors. `keep`
+    gets the test rows of every seed. `sides`: train_sensors, test_sensors, train_units and
+    test_units, names or patterns. Raises UserError.
     """
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
@@ -706,7 +732,10 @@ def probe_tasks(
 def probe_benchmark(
     models: Models, data: Paths | Manifest, benchmark: str, **options: Any
 ) -> dict[str, Any]:
-    """Probe a public benchmark as its authors do, by both protocols; `options` of `probe_tasks`. Raises UserError."""
+    """Probe a public benchmark as its authors do, by both protocols; `options` of `probe_tasks`.
+
+    Raises UserError.
+    """
     setting = tasks.find_named(tasks.BENCHMARKS, benchmark, "benchmark")
     return probe_tasks(
         models,
@@ -731,7 +760,10 @@ def _plan_tasks(
     log: Log,
     among: Callable[[TaskRows], TaskRows],
 ) -> tuple[list[_Plan], dict[str, str]]:
-    """Return the plans of the tasks that can be probed, and why the others cannot. Raises UserError if none can."""
+    """Return the plans of the tasks that can be probed, and why the others cannot.
+
+    Raises UserError if none can.
+    """
     plans = list[_Plan]()
     left_out = dict[str, str]()
     if names == "all" or list(names) == ["all"]:
@@ -765,7 +797,10 @@ def _plan(
     max_rows: int | None,
     among: Callable[[TaskRows], TaskRows],
 ) -> _Plan:
-    """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them. Raises UserError."""
+    """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them.
+
+    Raises UserError.
+    """
     for name, count in (("max_rows", max_rows), ("frames", frames)):
         if count is not None and count < 1:
             raise UserError(f"{name} must be at least 1, not {count}.")

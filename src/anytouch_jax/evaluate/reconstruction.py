@@ -1,4 +1,6 @@
-"""Reconstruction errors of stage 1 on masked pixels, baselines without a model, and pictures of reconstructions."""
+"""Reconstruction errors of stage 1 on masked pixels, baselines without a model, and pictures of
+reconstructions.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,13 @@ _TITLE = 16
 def pixel_scores(
     params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net, config: Config
 ) -> dict[str, float]:
-    """Return the mean squared errors of normalised pixels (Eq. 1, 2) of the clips that end at rows `ends`.
+    """Return the mean squared errors of normalised pixels (Eq. 1, 2) of the clips that end at rows
+    `ends`.
 
-    "reconstruction" (masked patches) and "next_frame" are those of stage 1. Those that begin with "plain" are of
-    `plain_reconstruction`, and with "untouched" of an untouched gel, if the background is subtracted. Sensors outside
-    the table get the universal tokens. Raises ValueError without rows, and for `norm_pix_loss`.
+    "reconstruction" (masked patches) and "next_frame" are those of stage 1. Those that begin with
+    "plain" are of `plain_reconstruction`, and with "untouched" of an untouched gel, if the
+    background is subtracted. Sensors outside the table get the universal tokens. Raises ValueError
+    without rows, and for `norm_pix_loss`.
     """
     if config.objective.norm_pix_loss or not len(ends):
         raise ValueError("pixels are scored on at least one clip, and not with norm_pix_loss")
@@ -78,7 +82,9 @@ def _errors(
 
 
 def plain_reconstruction(target: Any, hidden: Any, frames: int) -> Any:
-    """Return patches (B, N, T, C): the mean of those not `hidden` (B, N); after `frames` a copy of the last frame."""
+    """Return patches (B, N, T, C): the mean of those not `hidden` (B, N); after `frames` a copy of
+    the last frame.
+    """
     visible = ~hidden[:, :, None, None]
     mean = (target * visible).sum(axis=1, keepdims=True) / visible.sum(axis=1, keepdims=True)
     prediction = jnp.broadcast_to(mean, target.shape)
@@ -90,9 +96,11 @@ def plain_reconstruction(target: Any, hidden: Any, frames: int) -> Any:
 def reconstruction_panels(
     params: Any, clip: Any, sensor: Any, *, net: Net, config: Config, seed: int = 0
 ) -> np.ndarray:
-    """Return an RGB image u8 with a row per sample: original, masked input, reconstruction, next frame, prediction.
+    """Return an RGB image u8 with a row per sample: original, masked input, reconstruction, next
+    frame, prediction.
 
-    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). With `norm_pix_loss` the true mean and spread are put back.
+    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). With `norm_pix_loss` the true mean and spread are
+    put back.
     """
     refuse_forked()
     patch = net.model.patch

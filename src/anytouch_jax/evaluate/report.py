@@ -1,4 +1,6 @@
-"""The report of two runs on a manifest: sections of text, figures and tables in one Markdown file, numbers as JSON."""
+"""The report of two runs on a manifest: sections of text, figures and tables in one Markdown file,
+numbers as JSON.
+"""
 
 import base64
 import html
@@ -67,9 +69,11 @@ def write_report(
     title: str = "Report",
     numbers: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write `folder`/report.html, report.md, report.json (`numbers`) and the figures, and return the path of report.md.
+    """Write `folder`/report.html, report.md, report.json (`numbers`) and the figures, and return
+    the path of report.md.
 
-    Each file is written atomically, report.md last. Raises UserError for a missing figure, OSError for a full disk.
+    Each file is written atomically, report.md last. Raises UserError for a missing figure, OSError
+    for a full disk.
     """
     parts = [f"# {title}"]
     for section in sections:
@@ -77,7 +81,8 @@ def write_report(
         if section.figure is not None:
             if not section.figure.is_file():
                 raise UserError(
-                    f"There is no figure {section.figure} for the report. Draw it first, or leave it out."
+                    f"There is no figure {section.figure} for the report. Draw it first, or leave "
+                    "it out."
                 )
             atomic_write(folder / "figures" / section.figure.name, section.figure.read_bytes())
             parts.append(f"![{section.title}](figures/{section.figure.name})")
@@ -94,7 +99,9 @@ def write_report(
 
 
 def html_page(text: str, folder: Path, title: str) -> str:
-    """Return Markdown as one HTML page, pictures of `folder`/figures inside; its HTML is text, and no script runs."""
+    """Return Markdown as one HTML page, pictures of `folder`/figures inside; its HTML is text, and
+    no script runs.
+    """
     from markdown_it import MarkdownIt
 
     def inside(match: re.Match[str]) -> str:
@@ -105,10 +112,15 @@ def html_page(text: str, folder: Path, title: str) -> str:
     body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
     body = re.sub(r'src="figures/([^"/\\]+)"', inside, body)
     style = (
-        "body{font:16px/1.5 sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}img{max-width:100%}"
-        "table{border-collapse:collapse;display:block;overflow-x:auto}td,th{border:1px solid #ccc;padding:.2em .6em}"
+        "body{font:16px/1.5 sans-serif;max-width:60rem;margin:2rem auto;padding:0 "
+        "1rem}img{max-width:100%}"
+        "table{border-collapse:collapse;display:block;overflow-x:auto}td,th{border:1px solid "
+        "#ccc;padding:.2em .6em}"
     )
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+    policy = (
+        "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
+        "form-action 'none'"
+    )
     head = (
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
         f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
@@ -129,15 +141,18 @@ def demo_report(
 ) -> Path:
     """Write a report of two runs on the split test of a manifest, and return the path of report.md.
 
-    `touches` is the most of test, and half of it of train and of val, each with its deepest frame. A report that fails
-    leaves an earlier one in `out` unchanged. Raises UserError, also for a run of the other stage and for weights files.
+    `touches` is the most of test, and half of it of train and of val, each with its deepest frame.
+    A report that fails leaves an earlier one in `out` unchanged. Raises UserError, also for a run
+    of the other stage and for weights files.
     """
     clock = time.perf_counter()
     table = manifests.read(manifest)
     if (count := len(_chosen(table, "test", touches, seed))) < FEWEST:
         raise UserError(
-            f"The report needs {FEWEST} frames of deepest contact. The split test gives {count} with --touches "
-            f"{touches}, {len(_chosen(table, 'test', len(table), seed))} at most. Give more touches."
+            f"The report needs {FEWEST} frames of deepest contact. The split test gives {count} "
+            "with --touches "
+            f"{touches}, {len(_chosen(table, 'test', len(table), seed))} at most. Give more "
+            "touches."
         )
     runs = {"stage 1": Path(stage1), "stage 2": Path(stage2)}
     first, second = (_encoder_of_stage(run, stage) for stage, run in enumerate(runs.values(), 1))
@@ -170,7 +185,10 @@ def demo_report(
 
 
 def _encoder_of_stage(run: Path, stage: int) -> Encoder:
-    """Return the encoder of a run. Raises UserError for a weights file, which has no losses, and for another stage."""
+    """Return the encoder of a run.
+
+    Raises UserError for a weights file, which has no losses, and for another stage.
+    """
     if run.is_file():
         raise UserError(
             f"--stage{stage} {run} is a weights file. Give the folder of a run of stage {stage}."
@@ -219,9 +237,12 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
             )
             rows.append((name, *counts, ", ".join(sorted(set(sensors[part])))))
     text = (
-        f"Data {table.content_hash[:12]}. Stage 1: preset {first.config.preset}, {first.config.run.steps} steps of "
-        f"{first.config.data.batch_size}. Stage 2: {second.config.run.steps} steps of {second.config.data.batch_size}, "
-        f"recipe {second.config.recipe}, towers {second.config.towers}. All figures below are of split test."
+        f"Data {table.content_hash[:12]}. Stage 1: preset {first.config.preset}, "
+        f"{first.config.run.steps} steps of "
+        f"{first.config.data.batch_size}. Stage 2: {second.config.run.steps} steps of "
+        f"{second.config.data.batch_size}, "
+        f"recipe {second.config.recipe}, towers {second.config.towers}. All figures below are of "
+        "split test."
     )
     backgrounds = (first.config.data.background, second.config.data.background)
     if backgrounds[0] != backgrounds[1]:
@@ -233,7 +254,9 @@ def _facts(table: Manifest, first: Encoder, second: Encoder, lineage: str) -> Se
 
 
 def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[Section]:
-    """Return a section for each grade of alignment: pictures with a touch a row and a sensor a column, and captions."""
+    """Return a section for each grade of alignment: pictures with a touch a row and a sensor a
+    column, and captions.
+    """
     rows = deepest_rows(manifest)
     sections = []
     grades = _grades(manifest, rows, "")
@@ -290,7 +313,9 @@ def _varied_touches(touch: Array, sensor: Array, objects: Array, seed: int) -> l
 
 
 def _picture(manifest: Manifest, row: int | None) -> Array | None:
-    """Return the frame of a row; of a force-field sensor the length of its displacement (three channels), mm."""
+    """Return the frame of a row; of a force-field sensor the length of its displacement (three
+    channels), mm.
+    """
     if row is None:
         return None
     if manifest.value(row, "sensor") not in FIELD_SENSORS:
@@ -308,7 +333,9 @@ def _picture(manifest: Manifest, row: int | None) -> Array | None:
 
 
 def _losses(runs: Mapping[str, Path], folder: Path) -> Section:
-    """Return the loss curves of runs {title: run folder}, and the first and last smoothed value of each term."""
+    """Return the loss curves of runs {title: run folder}, and the first and last smoothed value of
+    each term.
+    """
     path = folder / "figures" / "losses.png"
     rows = []
     plots.loss_curves(path, runs)
@@ -336,7 +363,9 @@ def _losses(runs: Mapping[str, Path], folder: Path) -> Section:
 def reconstructions_section(
     manifest: Manifest, encoder: Encoder, folder: Path
 ) -> tuple[Section, dict[str, Any]]:
-    """Return masked patches and next frames of stage 1 on a test clip of each sensor, and its errors."""
+    """Return masked patches and next frames of stage 1 on a test clip of each sensor, and its
+    errors.
+    """
     config = encoder.config
     params = encoder.params | {"decoder": encoder.part_params("decoder")}
     rows = _with_images(manifest, manifest.rows_of("test"))
@@ -405,7 +434,9 @@ def _pixel_errors(params: Any, manifest: Manifest, ends: Array, encoder: Encoder
 
 @dataclass(frozen=True, eq=False)
 class _Study:
-    """The chosen rows of a manifest with the features of each encoder: class token, and mean of the patch tokens."""
+    """The chosen rows of a manifest with the features of each encoder: class token, and mean of the
+    patch tokens.
+    """
 
     manifest: Manifest
     rows: Array
@@ -450,7 +481,9 @@ def _with_images(table: Manifest, rows: Array) -> Array:
 
 
 def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
-    """Return the deepest rows of at most `touches` whole touches of a split; none of an empty train or val."""
+    """Return the deepest rows of at most `touches` whole touches of a split; none of an empty train
+    or val.
+    """
     if split != "test" and split not in set(table.text_column("split")):
         return np.zeros(0, np.int64)
     rows = deepest_rows(table, _with_images(table, table.rows_of(split)))
@@ -464,7 +497,9 @@ def _chosen(table: Manifest, split: str, touches: int, seed: int) -> Array:
 
 
 def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[plots.Space]]:
-    """Return the section and the numbers of the feature spaces: alignment, uniformity, silhouettes, t-SNE."""
+    """Return the section and the numbers of the feature spaces: alignment, uniformity, silhouettes,
+    t-SNE.
+    """
     rows = study.test(study.rows)
     sensors = study.manifest.text_column("sensor")[rows]
     objects = study.manifest.text_column("object")[rows]
@@ -505,8 +540,10 @@ def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[plots.Spa
         "frames",
     )
     text = (
-        "The same touches by several sensors. Alignment: mean squared distance of one touch by two sensors (0 is "
-        "best). Uniformity: lower is more even. Silhouette (-1 to 1): good alignment makes it low by sensor and high "
+        "The same touches by several sensors. Alignment: mean squared distance of one touch by two "
+        "sensors (0 is "
+        "best). Uniformity: lower is more even. Silhouette (-1 to 1): good alignment makes it low "
+        "by sensor and high "
         "by object."
     )
     return Section(
@@ -515,7 +552,9 @@ def _space(study: _Study, out: Path, seed: int) -> tuple[Section, list[plots.Spa
 
 
 def _retrieval(study: _Study, out: Path, size: int) -> tuple[Section, dict[str, Any]]:
-    """Return retrieval of the test rows for each grade of alignment, with matched and with random galleries."""
+    """Return retrieval of the test rows for each grade of alignment, with matched and with random
+    galleries.
+    """
     table = study.manifest
     rows = study.test(study.rows)
     notes = list(study.notes)
@@ -560,7 +599,9 @@ def retrieval_section(
     notes: Sequence[str],
     folder: Path,
 ) -> tuple[Section, dict[str, dict[str, Change]]]:
-    """Return tables of retrieval {grade: {"matched" or "by chance": results}}, and paired differences to `best`."""
+    """Return tables of retrieval {grade: {"matched" or "by chance": results}}, and paired
+    differences to `best`.
+    """
     rows = []
     ahead = []
     changes = {}
@@ -621,8 +662,10 @@ def retrieval_section(
         else "nothing"
     )
     text = (
-        "A touch by one sensor is retrieved among touches by another. In matched galleries the distractors are the "
-        f"nearest in {covariates}; by chance they are random. Centred: minus the mean of each sensor. In brackets: "
+        "A touch by one sensor is retrieved among touches by another. In matched galleries the "
+        "distractors are the "
+        f"nearest in {covariates}; by chance they are random. Centred: minus the mean of each "
+        "sensor. In brackets: "
         "95 % under a bootstrap over objects."
         + (
             f" Distractors lie at {np.mean(near):.2f} of the mean distance of all touches."
@@ -636,7 +679,9 @@ def retrieval_section(
 
 
 def _matching(study: _Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]:
-    """Return the scores of the matching head of stage 2 on the test rows, for both kinds of negatives."""
+    """Return the scores of the matching head of stage 2 on the test rows, for both kinds of
+    negatives.
+    """
     scores = list[retrieval.MatchScore]()
     notes = list[str]()
     features = study.test(study.classes["stage 2"])
@@ -645,9 +690,12 @@ def _matching(study: _Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]
     except UserError as error:
         notes.append(f"not scored: {error}")
     text = (
-        "Did two touches, by two sensors, come from the same place (Eq. 5)? Half of the pairs are positives. With "
-        "negatives of any sensor, the two sensors alone reveal part of the answer. With negatives of the positive's "
-        "sensor they do not. The rule of the sensors alone is learned on half of the touches and scored on the other. "
+        "Did two touches, by two sensors, come from the same place (Eq. 5)? Half of the pairs are "
+        "positives. With "
+        "negatives of any sensor, the two sensors alone reveal part of the answer. With negatives "
+        "of the positive's "
+        "sensor they do not. The rule of the sensors alone is learned on half of the touches and "
+        "scored on the other. "
         "In brackets: 95 % under a bootstrap over objects."
     )
     names = {"any": "of any sensor", "same_sensor": "of the positive's sensor"}
@@ -670,7 +718,9 @@ def _matching(study: _Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]
 
 
 def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
-    """Return probes of labels on held-out objects; a note names each label that cannot be probed."""
+    """Return probes of labels on held-out objects; a note names each label that cannot be
+    probed.
+    """
     table = study.manifest
     rows = study.rows
     notes = list(study.notes)
@@ -693,7 +743,8 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
         scored = list[ProbeResult]()
         try:
             for name, x in features.items():
-                # Principal components share one scale: unit spread for each would amplify the smallest.
+                # Principal components share one scale: unit spread for each would amplify the
+                # smallest.
                 head = ProbeHead("linear", "common" if name == PIXELS else "column")
                 options: dict[str, Any] = {"measured": measured, "name": name, "seeds": 0}
                 scored.append(
@@ -712,7 +763,10 @@ def _probes(study: _Study, out: Path) -> tuple[Section, dict[str, Any]]:
     path = out / "figures" / "probes.png"
     if bars:
         plots.bars(path, bars, label="accuracy")
-    text = "A linear probe on frozen features (class token and mean of patches), fitted on train, tested on test."
+    text = (
+        "A linear probe on frozen features (class token and mean of patches), fitted on train, "
+        "tested on test."
+    )
     parts = "\n\n".join(
         f"### {label}\n\n{probing.probe_table(scored).strip()}" for label, scored in results.items()
     )

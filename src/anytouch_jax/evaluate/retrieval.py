@@ -1,7 +1,9 @@
-"""Cross-sensor retrieval and matching: recall of the same touch by another sensor, among similar touches.
+"""Cross-sensor retrieval and matching: recall of the same touch by another sensor, among similar
+touches.
 
-For each query touch of sensor A, a gallery of touches of sensor B has that touch once. The distractors are its nearest
-neighbours in position, depth and force. Equal scores share their ranks evenly, so constant features score chance.
+For each query touch of sensor A, a gallery of touches of sensor B has that touch once. The
+distractors are its nearest neighbours in position, depth and force. Equal scores share their ranks
+evenly, so constant features score chance.
 """
 
 from __future__ import annotations
@@ -38,7 +40,10 @@ _CHUNK = 1024  # queries whose scores are in memory at a time
 
 @dataclass(frozen=True, eq=False)
 class QueryScores:
-    """Each query's key, its recall (0..1) at 1 and at 5 as a mean over galleries, and its group. See `difference`."""
+    """Each query's key, its recall (0..1) at 1 and at 5 as a mean over galleries, and its group.
+
+    See `difference`.
+    """
 
     keys: Array
     top1: Array
@@ -50,10 +55,11 @@ class QueryScores:
 class Retrieval:
     """Retrieval by one set of features; shares are in 0..1.
 
-    `top1`, `top5`: recall@1 and recall@5. `low`, `high` (and those of top 5): 95 % interval under a bootstrap over the
-    groups (objects), None with fewer than two. `chance1`, `chance5`: recall of constant features. `matched`: covariates
-    in which distractors are near, empty for random galleries. `nearness`: mean distance of the distractors to the true
-    touch, over that of all candidates. `centred`: the mean feature of each sensor was subtracted.
+    `top1`, `top5`: recall@1 and recall@5. `low`, `high` (and those of top 5): 95 % interval under a
+    bootstrap over the groups (objects), None with fewer than two. `chance1`, `chance5`: recall of
+    constant features. `matched`: covariates in which distractors are near, empty for random
+    galleries. `nearness`: mean distance of the distractors to the true touch, over that of all
+    candidates. `centred`: the mean feature of each sensor was subtracted.
     """
 
     name: str
@@ -89,18 +95,21 @@ def cross_sensor_retrieval(
     metrics: Mapping[str, Metric] | None = None,
     seeds: int = 5,
 ) -> list[Retrieval]:
-    """Return retrieval for each set of features, ordered pair of sensors and kind of centring; pooled results last.
+    """Return retrieval for each set of features, ordered pair of sensors and kind of centring;
+    pooled results last.
 
-    `features` {name: (len(rows), d)} are those of manifest `rows`; the deepest frame of each touch, sensor and unit is
-    used. `match` names label columns, of which those in the manifest are used; None draws random galleries. `metrics`
-    {name: metric}, cosine by default. Raises UserError for a single sensor, no covariate, no common touch, a gallery
-    that is too large, or features that are not finite.
+    `features` {name: (len(rows), d)} are those of manifest `rows`; the deepest frame of each touch,
+    sensor and unit is used. `match` names label columns, of which those in the manifest are used;
+    None draws random galleries. `metrics` {name: metric}, cosine by default. Raises UserError for a
+    single sensor, no covariate, no common touch, a gallery that is too large, or features that are
+    not finite.
     """
     rows = np.asarray(rows)
     for name, values in features.items():
         if len(values) != len(rows):
             raise UserError(
-                f"Features {name!r} have {len(values)} rows. They must have one for each of {len(rows)}."
+                f"Features {name!r} have {len(values)} rows. They must have one for each of "
+                f"{len(rows)}."
             )
     used, place, covariates, notes = _usable(manifest, rows, match)
     names = ("sensor", "unit", "object", "touch")
@@ -115,7 +124,8 @@ def cross_sensor_retrieval(
     rows_of = {str(name): np.flatnonzero(sensors == name) for name in np.unique(sensors)}
     if len(rows_of) < 2:
         raise UserError(
-            f"Cross-sensor retrieval needs touches by two sensors. These are by {', '.join(rows_of)}."
+            "Cross-sensor retrieval needs touches by two sensors. These are by "
+            f"{', '.join(rows_of)}."
         )
     for first, second in permutations(rows_of, 2):
         query = rows_of[first]
@@ -135,7 +145,8 @@ def cross_sensor_retrieval(
         )
     if not drawn:
         raise UserError(
-            "The two sensors share no touch. `touch` must be equal for the same place of the same object."
+            "The two sensors share no touch. `touch` must be equal for the same place of the same "
+            "object."
         )
     results = []
     for name, centred in product(features, centre):
@@ -171,7 +182,10 @@ def cross_sensor_retrieval(
 
 
 def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None, float | None]:
-    """Return recall@1 of `first` minus `second`, and its 95 % interval, paired. Raises UserError for other queries."""
+    """Return recall@1 of `first` minus `second`, and its 95 % interval, paired.
+
+    Raises UserError for other queries.
+    """
     a = first.per_query
     b = second.per_query
     if (
@@ -244,7 +258,8 @@ def _usable(
     if match is not None:
         if not covariates:
             raise UserError(
-                f"The manifest has none of {', '.join(match)} to match the gallery in. Use --by-chance."
+                f"The manifest has none of {', '.join(match)} to match the gallery in. Use "
+                "--by-chance."
             )
         whole = np.isfinite(numbers(manifest, covariates, used)).all(axis=1)
         if not whole.all():
@@ -264,8 +279,9 @@ def _joined(first: Any, second: Any) -> Array:
 class Galleries:
     """Gallery rows of each query, drawn from names and covariates alone.
 
-    `queries` (n,) row numbers. `items` (draws, n, size) gallery rows, the true touch first. `nearness` as in
-    `Retrieval`. `missing` counts queries whose touch no other unit in the gallery has.
+    `queries` (n,) row numbers. `items` (draws, n, size) gallery rows, the true touch first.
+    `nearness` as in `Retrieval`. `missing` counts queries whose touch no other unit in the gallery
+    has.
     """
 
     queries: Array
@@ -286,9 +302,10 @@ def draw_galleries(
 ) -> Galleries:
     """Return galleries that depend on names, covariates and seeds, not on the order of rows.
 
-    Equal names are one touch. `match` (m, k) are covariates of the gallery, scaled to unit spread: the nearest are the
-    distractors. Without it `seeds` random galleries are drawn. Items of the query's own unit are never in its gallery.
-    Raises UserError for too few touches, or no common touch.
+    Equal names are one touch. `match` (m, k) are covariates of the gallery, scaled to unit spread:
+    the nearest are the distractors. Without it `seeds` random galleries are drawn. Items of the
+    query's own unit are never in its gallery. Raises UserError for too few touches, or no common
+    touch.
     """
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
@@ -306,7 +323,8 @@ def draw_galleries(
     for one, two in pairwise(zip(touch, unit, strict=True)):
         if one == two:
             raise UserError(
-                f"The gallery has touch {str(one[0])!r} twice by one unit. Keep one frame of each touch."
+                f"The gallery has touch {str(one[0])!r} twice by one unit. Keep one frame of each "
+                "touch."
             )
     # matched galleries have no randomness
     draws = seeds if match is None else 1
@@ -327,7 +345,8 @@ def draw_galleries(
         if len(rest) < gallery_size - 1:
             raise UserError(
                 f"A gallery of {gallery_size} needs {gallery_size - 1} other touches than "
-                f"{str(query_touch[rank])!r}. There are {len(rest)}. Give more touches, or a smaller --gallery."
+                f"{str(query_touch[rank])!r}. There are {len(rest)}. Give more touches, or a "
+                "smaller --gallery."
             )
         ranks.append(rank)
         several = [
@@ -360,7 +379,9 @@ def _by_name(touches: Any, units: Any) -> tuple[Array, Array, Array]:
 def _draw(
     own: Array, rest: Array, covariates: Array, size: int, rng: np.random.Generator
 ) -> tuple[Array, tuple[float, float]]:
-    """Return one gallery, the true touch first, and the mean distances of its distractors and of all candidates."""
+    """Return one gallery, the true touch first, and the mean distances of its distractors and of
+    all candidates.
+    """
     wanted = own[rng.integers(len(own))]
     lot = rng.random(len(rest))
     distance = np.linalg.norm(covariates[rest] - covariates[[wanted]], axis=1)
@@ -379,20 +400,24 @@ def score_galleries(
     metric: Metric = "cosine",
     centre: bool = False,
 ) -> tuple[Array, Array]:
-    """Return recall@1 and recall@5 (n,) of each query as means over galleries; ties share their ranks evenly.
+    """Return recall@1 and recall@5 (n,) of each query as means over galleries; ties share their
+    ranks evenly.
 
-    `query` (q, d), `gallery` (m, d). `centre` subtracts the mean of each side. UserError for values that do not fit.
+    `query` (q, d), `gallery` (m, d). `centre` subtracts the mean of each side. UserError for values
+    that do not fit.
     """
     q = _finite(query, "query")
     g = _finite(gallery, "gallery")
     if q.shape[1] != g.shape[1]:
         raise UserError(
-            f"query and gallery features have {q.shape[1]} and {g.shape[1]} values. They must be alike."
+            f"query and gallery features have {q.shape[1]} and {g.shape[1]} values. They must be "
+            "alike."
         )
     q = _prepared(q, metric, centre)[drawn.queries]
     g = _prepared(g, metric, centre)
     if metric == "euclidean":
-        # Both sides are moved and scaled by the same amount, so that rounding does not reorder distances.
+        # Both sides are moved and scaled by the same amount, so that rounding does not reorder
+        # distances.
         least = _TIE * max(np.abs(side).max(initial=0.0) for side in (q, g))
         middle = g.mean(axis=0, keepdims=True)
         q, g = (np.where(np.abs(side - middle) > least, side - middle, 0.0) for side in (q, g))
@@ -422,7 +447,9 @@ def score_galleries(
 
 
 def _prepared(values: Array, metric: Metric, centre: bool) -> Array:
-    """Return rows to compare by their products; the rest of a constant after centring is 0, not noise."""
+    """Return rows to compare by their products; the rest of a constant after centring is 0, not
+    noise.
+    """
     least = _TIE * np.abs(values).max(initial=0.0) if centre else 0.0
     if centre:
         values = values - values.mean(axis=0, keepdims=True)
@@ -439,7 +466,8 @@ def _finite(values: Any, kind: str) -> Array:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise UserError(
-            f"The {kind} row {bad[0]} is not finite, nor are {len(bad) - 1} others. Repair or drop them."
+            f"The {kind} row {bad[0]} is not finite, nor are {len(bad) - 1} others. Repair or drop "
+            "them."
         )
     return values
 
@@ -448,9 +476,9 @@ def _finite(values: Any, kind: str) -> Array:
 class MatchScore:
     """How a matcher distinguishes positives from `negatives`; shares are in 0..1, chance is 0.5.
 
-    `accuracy`: share of logits on the right side of 0. `low`, `high`: its 95 % interval under a bootstrap over the
-    anchors' objects, None with fewer than two. `sensors_alone`: accuracy of the best rule that only knows the two
-    sensors.
+    `accuracy`: share of logits on the right side of 0. `low`, `high`: its 95 % interval under a
+    bootstrap over the anchors' objects, None with fewer than two. `sensors_alone`: accuracy of the
+    best rule that only knows the two sensors.
     """
 
     negatives: Negatives
@@ -466,10 +494,12 @@ class MatchScore:
 def score_matching(
     encoder: Encoder, manifest: Manifest, rows: Array, features: Array
 ) -> list[MatchScore]:
-    """Return the scores of the encoder's matching head (Eq. 5) with negatives of any sensor, and of the positive's.
+    """Return the scores of the encoder's matching head (Eq. 5) with negatives of any sensor, and of
+    the positive's.
 
-    With negatives of any sensor, the sensors alone reveal part of the answer. `features` (n, E) are those of manifest
-    `rows` (n,), pooling class. Raises UserError without a matching head, and if two sensors share no touch.
+    With negatives of any sensor, the sensors alone reveal part of the answer. `features` (n, E) are
+    those of manifest `rows` (n,), pooling class. Raises UserError without a matching head, and if
+    two sensors share no touch.
     """
     objects = manifest.text_column("object")[rows]
     scores = []
@@ -497,7 +527,10 @@ def score_matching(
 def draw_triples(
     manifest: Manifest, rows: Array, negatives: Negatives, *, draws: int = DRAWS, seed: int = 0
 ) -> tuple[Array, Array, Array]:
-    """Return places in `rows` of anchors, positives and negatives, i64 (m,), drawn as in training. Raises UserError."""
+    """Return places in `rows` of anchors, positives and negatives, i64 (m,), drawn as in training.
+
+    Raises UserError.
+    """
     names = ("touch", "sensor", "unit", "object", "dataset")
     keys = MatchKeys(*(manifest.codes(name, own=name == "touch") for name in names))
     matches = Matches(rows, keys, same_sensor=negatives == "same_sensor", other_object=True)
@@ -518,7 +551,8 @@ def draw_triples(
 def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
     """Return the accuracy of the best rule on codes i64 (n,) of positives and of negatives.
 
-    It is learned on half of the anchors (`anchor` i64 (n,)) and scored on the others. It guesses for unknown codes.
+    It is learned on half of the anchors (`anchor` i64 (n,)) and scored on the others. It guesses
+    for unknown codes.
     """
     names, place = np.unique(anchor, return_inverse=True)
     half = (np.random.default_rng(0).permutation(len(names)) % 2)[place]
@@ -532,17 +566,22 @@ def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
 
 
 def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
-    """Return numeric columns as f64 (rows, columns), NaN for an empty cell. Raises UserError for text."""
+    """Return numeric columns as f64 (rows, columns), NaN for an empty cell.
+
+    Raises UserError for text.
+    """
     return np.stack([manifest.number_column(name)[rows] for name in names], 1)
 
 
 def deepest_rows(
     manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1
 ) -> Array:
-    """Return one row for each touch, sensor and unit, in order: that of the largest `label.force`, the first of equals.
+    """Return one row for each touch, sensor and unit, in order: that of the largest `label.force`,
+    the first of equals.
 
-    Only `rows` are used, the whole `split` by default; with `frames` > 1 only ends of clips of so many. Without forces
-    the largest `label.depth` is used, without both the middle frame. Raises UserError if no row is left.
+    Only `rows` are used, the whole `split` by default; with `frames` > 1 only ends of clips of so
+    many. Without forces the largest `label.depth` is used, without both the middle frame. Raises
+    UserError if no row is left.
     """
     rows = np.unique(manifest.rows_of(split) if rows is None else np.asarray(rows))
     rows = rows[manifest.present("touch")[rows]]
@@ -552,7 +591,8 @@ def deepest_rows(
             raise UserError(f"no touch ends a clip of {frames} frames; take fewer, or 1")
     if not len(rows):
         raise UserError(
-            "no row has a touch; cross-sensor tasks need the column 'touch', equal for the same place"
+            "no row has a touch; cross-sensor tasks need the column 'touch', equal for the same "
+            "place"
         )
     codes = np.stack(
         [
@@ -567,7 +607,9 @@ def deepest_rows(
 
 
 def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
-    """Return the depth of each row (n,) within its contact, by the best column that its file has."""
+    """Return the depth of each row (n,) within its contact, by the best column that its file
+    has.
+    """
     frame = np.asarray(manifest.column("frame_index"))[rows].astype(np.float64)
     middle = np.array([np.median(frame[contact == number]) for number in range(contact.max() + 1)])
     depth = -np.abs(frame - middle[contact])
@@ -581,14 +623,17 @@ def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
 
 
 def contact_vector(manifest: Manifest, rows: Array) -> Array:
-    """Return area, centroid and force of each contact, as far as the manifest has them, f32 (rows, up to 4).
+    """Return area, centroid and force of each contact, as far as the manifest has them, f32 (rows,
+    up to 4).
 
-    Each has mean 0 and spread 1 within its sensor. Raises UserError if the manifest or a row lacks them.
+    Each has mean 0 and spread 1 within its sensor. Raises UserError if the manifest or a row lacks
+    them.
     """
     names = [name for name in VECTOR if name in manifest.table.column_names]
     if not names:
         raise UserError(
-            f"the manifest has none of the columns {', '.join(VECTOR)}; add one, or leave the control out"
+            f"the manifest has none of the columns {', '.join(VECTOR)}; add one, or leave the "
+            "control out"
         )
     values = numbers(manifest, names, rows)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))

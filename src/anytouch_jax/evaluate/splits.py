@@ -1,7 +1,9 @@
-"""Train/validation/test splits that keep whole groups together, and the selection of an option of a head.
+"""Train/validation/test splits that keep whole groups together, and the selection of an option of a
+head.
 
-Every result names its protocol. By "honest" the penalty (k, epoch) is selected on val, or by cross-validation over
-groups of train, and test is read once. By "published" it is selected on test, as the authors' released code does.
+Every result names its protocol. By "honest" the penalty (k, epoch) is selected on val, or by
+cross-validation over groups of train, and test is read once. By "published" it is selected on test,
+as the authors' released code does.
 """
 
 import fnmatch
@@ -33,7 +35,9 @@ class Split(NamedTuple):
 
 
 class RowRoles(NamedTuple):
-    """Labels `y`, `groups` and masks, all (n,): `test` by the split, `may_fit`, `may_test` by sensor and unit."""
+    """Labels `y`, `groups` and masks, all (n,): `test` by the split, `may_fit`, `may_test` by
+    sensor and unit.
+    """
 
     y: Array
     groups: Array
@@ -52,7 +56,10 @@ class RowRoles(NamedTuple):
 
 
 def assign_roles(task: Task, rows: TaskRows, sides: Sides) -> tuple[RowRoles, Array]:
-    """Return the roles of the rows and the class names. Raises UserError if nothing is left to fit on or to test."""
+    """Return the roles of the rows and the class names.
+
+    Raises UserError if nothing is left to fit on or to test.
+    """
     measured = task.kind == "regression"
     masks = dict.fromkeys(("train", "test"), np.ones(len(rows.labels), bool))
     for side in SIDES:
@@ -76,7 +83,8 @@ def assign_roles(task: Task, rows: TaskRows, sides: Sides) -> tuple[RowRoles, Ar
     for mask, purpose in ((roles.tested, "test"), (roles.may_fit, "train")):
         if not mask.any():
             raise UserError(
-                f"Task {task.name}: no row is left to {purpose}. Check the splits, sensors and units."
+                f"Task {task.name}: no row is left to {purpose}. Check the splits, sensors and "
+                "units."
             )
     if measured and np.ptp(y[roles.tested]) == 0:
         raise UserError(
@@ -84,7 +92,8 @@ def assign_roles(task: Task, rows: TaskRows, sides: Sides) -> tuple[RowRoles, Ar
         )
     if not measured and len(names) < 2:
         raise UserError(
-            f"Task {task.name}: the label is {str(names[0])!r} on every row. A probe needs two classes."
+            f"Task {task.name}: the label is {str(names[0])!r} on every row. A probe needs two "
+            "classes."
         )
     return roles, names
 
@@ -100,7 +109,8 @@ def subsample(rows: Array, most: int | None = None) -> Array:
 def assign_folds(
     groups: Array, y: Array | None, rng: np.random.Generator, count: int = FOLDS
 ) -> Array:
-    """Return the fold i64 (n,) of each row, with whole `groups` (n,) and each class of `y` (n,) spread over the folds.
+    """Return the fold i64 (n,) of each row, with whole `groups` (n,) and each class of `y` (n,)
+    spread over the folds.
 
     Without `y` the groups are shuffled. Raises UserError if all rows are of one group.
     """
@@ -108,7 +118,8 @@ def assign_folds(
     names, first, group_ids = np.unique(groups, return_index=True, return_inverse=True)
     if len(names) < 2:
         raise UserError(
-            f"All rows to fit on are of one group, {str(names[0])!r}. Give two, or rows of split val."
+            f"All rows to fit on are of one group, {str(names[0])!r}. Give two, or rows of split "
+            "val."
         )
     count = min(count, len(names))
     order = np.lexsort(
@@ -122,7 +133,9 @@ def assign_folds(
 def group_folds(
     rows: Array, groups: Array, y: Array | None, count: int
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield (rows to fit on, rows left out) for each fold of `rows`; `groups` and `y` are of all rows."""
+    """Yield (rows to fit on, rows left out) for each fold of `rows`; `groups` and `y` are of all
+    rows.
+    """
     fold = assign_folds(
         groups[rows], None if y is None else y[rows], np.random.default_rng(0), count
     )
@@ -131,7 +144,9 @@ def group_folds(
 
 
 def group_bootstraps(rows: Array, groups: Array, seeds: int) -> Iterator[tuple[Array, Array]]:
-    """Yield (rows drawn at least once, how often each was drawn) for each seed of a bootstrap over groups."""
+    """Yield (rows drawn at least once, how often each was drawn) for each seed of a bootstrap over
+    groups.
+    """
     names, group_ids = np.unique(groups[rows], return_inverse=True)
     for seed in range(seeds):
         times = np.random.default_rng(seed).multinomial(
@@ -144,7 +159,8 @@ def group_bootstraps(rows: Array, groups: Array, seeds: int) -> Iterator[tuple[A
 def split_scheme(roles: RowRoles) -> tuple[Literal["split", "folds"], Array, str]:
     """Return how honest tests are split, the rows bool (n,) that take part, and the reason.
 
-    The manifest's split is kept if it keeps groups apart. Else folds are made, of test rows if train lacks classes.
+    The manifest's split is kept if it keeps groups apart. Else folds are made, of test rows if
+    train lacks classes.
     """
     missing = "row to fit on" if roles.measured else "class of test"
     fitted = roles.y[roles.fitted]
@@ -157,16 +173,20 @@ def split_scheme(roles: RowRoles) -> tuple[Literal["split", "folds"], Array, str
         )
     shared = np.intersect1d(roles.groups[roles.fitted], roles.groups[roles.tested])
     if len(shared):
-        why = f"{len(shared)} groups are in train and test: folds over all rows instead, whole groups left out"
+        why = (
+            f"{len(shared)} groups are in train and test: folds over all rows instead, whole "
+            "groups left out"
+        )
         return "folds", np.ones(len(roles.y), bool), why
     return "split", np.ones(len(roles.y), bool), ""
 
 
 def seeded_splits(roles: RowRoles, seed: int, protocol: Protocol) -> list[Split]:
-    """Return the splits of one seed: one by the manifest's split, or FOLDS that test every row once.
+    """Return the splits of one seed: one by the manifest's split, or FOLDS that test every row
+    once.
 
-    By "honest" a fifth of the groups of train selects. By "published" the manifest's split is used even if it shares
-    groups, and test selects. Raises UserError for too few groups.
+    By "honest" a fifth of the groups of train selects. By "published" the manifest's split is used
+    even if it shares groups, and test selects. Raises UserError for too few groups.
     """
     _check_protocol(protocol)
     rng = np.random.default_rng([11, seed])
@@ -200,7 +220,9 @@ def _check_protocol(protocol: str) -> None:
 
 
 class LabelledFeatures(NamedTuple):
-    """Features `x` (n, d), class numbers or floats `y` (n,), class `names` (empty: y are floats), `groups` (n,)."""
+    """Features `x` (n, d), class numbers or floats `y` (n,), class `names` (empty: y are floats),
+    `groups` (n,).
+    """
 
     x: Array
     y: Array
@@ -213,7 +235,9 @@ class LabelledFeatures(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """The selected option and its place, what it was chosen on, all scores, and their fit (None after many folds)."""
+    """The selected option and its place, what it was chosen on, all scores, and their fit (None
+    after many folds).
+    """
 
     place: int
     option: float
@@ -225,7 +249,9 @@ class Selection(NamedTuple):
 def select_option(
     head: ProbeHead, data: LabelledFeatures, split: Split, protocol: Protocol
 ) -> Selection:
-    """Fit all options of a head on at most SELECT_ROWS rows of `split.fit` and select the best by the protocol."""
+    """Fit all options of a head on at most SELECT_ROWS rows of `split.fit` and select the best by
+    the protocol.
+    """
     _check_protocol(protocol)
     if head.options is not None and len(head.options) == 1:
         return Selection(0, head.options[0], "given")
@@ -262,14 +288,18 @@ def check_rows(
     measured: bool = False,
     tested: bool = True,
 ) -> tuple[LabelledFeatures, Split, tuple[str, ...]]:
-    """Return the arguments of a probe as records, with notes on the rows. Raises UserError if they do not fit."""
+    """Return the arguments of a probe as records, with notes on the rows.
+
+    Raises UserError if they do not fit.
+    """
     x = np.asarray(features, np.float32)
     groups = np.asarray(groups).astype(str)
     split = np.asarray(split).astype(str)
     sizes = {"features": len(x), "labels": len(labels), "groups": len(groups), "split": len(split)}
     if x.ndim != 2 or len(set(sizes.values())) != 1:
         raise UserError(
-            f"A probe needs features (n, d) and n labels, groups and splits, not {x.shape} and {sizes}."
+            f"A probe needs features (n, d) and n labels, groups and splits, not {x.shape} and "
+            f"{sizes}."
         )
     y, names, has_label = _parse_labels(labels, measured)
     rows = Split(
@@ -278,7 +308,8 @@ def check_rows(
     for part, ids in (("train", rows.fit), ("test", rows.test))[: 1 + tested]:
         if not len(ids):
             raise UserError(
-                f"No row of split {part!r} has this label. Choose another label or another manifest."
+                f"No row of split {part!r} has this label. Choose another label or another "
+                "manifest."
             )
     used = np.sort(np.concatenate(rows))
     without = used[np.isin(groups[used], ["", "None", "nan"])]
@@ -289,7 +320,8 @@ def check_rows(
     bad = used[~np.isfinite(x[used]).all(axis=1)]
     if len(bad):
         raise UserError(
-            f"The features of rows {_listed(bad)} are NaN or infinite. Embed them again or leave them out."
+            f"The features of rows {_listed(bad)} are NaN or infinite. Embed them again or leave "
+            "them out."
         )
     learned = np.unique(y[rows.fit])
     if len(learned) < 2:
@@ -303,7 +335,8 @@ def check_rows(
         )
     if tested and not measured and not np.isin(y[rows.test], learned).any():
         raise UserError(
-            "No class of test is in train. Take another label, or let `anytouch probe tasks` split again."
+            "No class of test is in train. Take another label, or let `anytouch probe tasks` split "
+            "again."
         )
     unlabelled = int(np.sum(np.isin(split, ("train", "val", "test")) & ~has_label))
     notes = [f"{unlabelled} rows without this label left out"] if unlabelled else []
@@ -327,7 +360,9 @@ def unlearned_note(tested: Array, learned: Array, names: Array) -> list[str]:
 
 
 def _parse_labels(labels: Any, measured: bool) -> tuple[Array, Array, Array]:
-    """Return class numbers (-1: no label) or floats, the sorted class names, and which rows have a label."""
+    """Return class numbers (-1: no label) or floats, the sorted class names, and which rows have a
+    label.
+    """
     values = np.asarray(labels, object)
     if measured:
         try:

@@ -1,4 +1,6 @@
-"""Statistics of evaluations: bootstrap intervals over groups and seeds, verdicts, Markdown tables, plain JSON."""
+"""Statistics of evaluations: bootstrap intervals over groups and seeds, verdicts, Markdown tables,
+plain JSON.
+"""
 
 import dataclasses
 import functools
@@ -28,12 +30,16 @@ class GroupSums(NamedTuple):
 
 
 def classification_sums(correct: Array, groups: Array) -> GroupSums:
-    """Return the sums that `_mean_of` divides, of values (n,) or of rows that are right or wrong."""
+    """Return the sums that `_mean_of` divides, of values (n,) or of rows that are right or
+    wrong.
+    """
     return GroupSums(groups, np.stack([np.asarray(correct, np.float64), np.ones(len(correct))], 1))
 
 
 def regression_sums(error: Array, truth: Array, groups: Array) -> GroupSums:
-    """Return what `_r2_of` and `_mae_of` divide; `truth` is best centred: the square of an offset hides the spread."""
+    """Return what `_r2_of` and `_mae_of` divide; `truth` is best centred: the square of an offset
+    hides the spread.
+    """
     return GroupSums(
         groups, np.stack([error**2, np.abs(error), truth, truth**2, np.ones(len(error))], 1)
     )
@@ -45,7 +51,9 @@ def _mean_of(sums: Array) -> Array:
 
 
 def _r2_of(sums: Array) -> Array:
-    """Return R2 from sums (..., [squared error, absolute error, truth, squared truth, rows]); NaN for equal labels."""
+    """Return R2 from sums (..., [squared error, absolute error, truth, squared truth, rows]); NaN
+    for equal labels.
+    """
     spread = sums[..., 3] - sums[..., 2] ** 2 / sums[..., 4]
     return np.asarray(1 - sums[..., 0] / np.where(spread > 1e-12 * sums[..., 3], spread, np.nan))
 
@@ -58,7 +66,9 @@ def _mae_of(sums: Array) -> Array:
 def paired_gain(
     real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool
 ) -> dict[str, float | None]:
-    """Return by how much the score of `real` is above that of `other` on the same rows, with its 95 % interval."""
+    """Return by how much the score of `real` is above that of `other` on the same rows, with its 95
+    % interval.
+    """
     metric = _r2_of if measured else _mean_of
     width = real[0].sums.shape[1]
 
@@ -82,7 +92,8 @@ def _bootstrap_interval(
 ) -> tuple[float | None, float | None]:
     """Return the 95 % percentile interval of the mean over runs of `of` (sums -> number).
 
-    Groups, which all runs share, and runs are resampled. (None, None) with fewer than two groups, or no value.
+    Groups, which all runs share, and runs are resampled. (None, None) with fewer than two groups,
+    or no value.
     """
     names = np.unique(np.concatenate([run.groups for run in runs]))
     if len(names) < 2:
@@ -106,7 +117,9 @@ def _bootstrap_interval(
 
 @functools.lru_cache(maxsize=4)  # drawing takes nine tenths of the time of an interval
 def _draws(count: int, stream: int) -> list[Array]:
-    """Return how often each of `count` groups is drawn, u8 (1000, count) at a time, DRAWS in all; streams differ."""
+    """Return how often each of `count` groups is drawn, u8 (1000, count) at a time, DRAWS in all;
+    streams differ.
+    """
     rng = np.random.default_rng(stream)
     shares = np.full(count, 1 / count)
     return [
@@ -115,14 +128,18 @@ def _draws(count: int, stream: int) -> list[Array]:
 
 
 def mean_interval(values: Array, groups: Array) -> tuple[float | None, float | None]:
-    """Return the 95 % percentile interval of the mean of `values` (n,) under a bootstrap over `groups` (n,)."""
+    """Return the 95 % percentile interval of the mean of `values` (n,) under a bootstrap over
+    `groups` (n,).
+    """
     return _bootstrap_interval([classification_sums(values, groups)], _mean_of)
 
 
 def scores(
     runs: Sequence[GroupSums], baselines: Sequence[GroupSums], measured: bool
 ) -> dict[str, Any]:
-    """Return mean, interval, values and chance of accuracy (R2 and MAE if `measured`), a run for each seed."""
+    """Return mean, interval, values and chance of accuracy (R2 and MAE if `measured`), a run for
+    each seed.
+    """
 
     def values(of: Callable[[Array], Array], several: Sequence[GroupSums]) -> list[float]:
         return [float(of(run.sums.sum(0))) for run in several]
@@ -145,7 +162,9 @@ def scores(
 
 
 def plain(value: Any) -> Any:
-    """Return a value for JSON: records as objects without their values per row, numbers that are not finite as null."""
+    """Return a value for JSON: records as objects without their values per row, numbers that are
+    not finite as null.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = dataclasses.fields(value)
         return {
@@ -168,8 +187,8 @@ def plain(value: Any) -> Any:
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]], align: str = "") -> str:
     """Return a Markdown table; use it wherever a page, a report or a command prints one.
 
-    Cells are converted to text; bars, line breaks, HTML and links in them are escaped. `align` has a letter per
-    column, l or r for left or right; without it the reader's program decides.
+    Cells are converted to text; bars, line breaks, HTML and links in them are escaped. `align` has
+    a letter per column, l or r for left or right; without it the reader's program decides.
 
     >>> print(markdown_table(("sensor", "recall@1"), [("digit", 0.5)], "lr"))
     | sensor | recall@1 |
@@ -185,13 +204,17 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]], align: 
 
 
 def without_html(value: Any) -> str:
-    """Return one line of Markdown without HTML, links and attributes of elements, whatever the value says."""
+    """Return one line of Markdown without HTML, links and attributes of elements, whatever the
+    value says.
+    """
     text = re.sub(r"&(?=#?\w+;)", "&amp;", " ".join(str(value).split()))
     return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(").replace("{", "&#123;")
 
 
 def as_text(value: Any) -> str:
-    """Return one line of Markdown that a reader sees as the value is written: for names and captions of a user."""
+    """Return one line of Markdown that a reader sees as the value is written: for names and
+    captions of a user.
+    """
     return re.sub(
         r"[\\`*\[\]~]|(?<![^\W_])_|_(?![^\W_])",
         r"\\\g<0>",
@@ -204,18 +227,24 @@ def verdict(name: str, gain: Mapping[str, float | None], task: str = "") -> str:
     points, low, high = (100 * (gain[key] or 0.0) for key in ("difference", "low", "high"))
     of = f"{task}: " if task else ""
     if gain["low"] is None:
-        return f"{of}{name} is {points:+.0f} points from raw pixels, by too few test recordings to be sure."
+        return (
+            f"{of}{name} is {points:+.0f} points from raw pixels, by too few test recordings to be "
+            "sure."
+        )
     interval = f"({low:.0f} to {high:.0f})"
     if low > 0:
         return f"{of}{name} is {points:.0f} points above raw pixels {interval}."
     return (
-        f"{of}{name} is no better than raw pixels: {points:+.0f} points {interval}. Try --pooling both, more "
+        f"{of}{name} is no better than raw pixels: {points:+.0f} points {interval}. Try --pooling "
+        "both, more "
         "recordings, or another encoder, and look at the untouched gel with `anytouch view`."
     )
 
 
 def label_verdicts(results: Sequence[Any]) -> list[str]:
-    """Return a sentence on each source of features of `probe_label` against raw pixels, by its first head."""
+    """Return a sentence on each source of features of `probe_label` against raw pixels, by its
+    first head.
+    """
     first: dict[str, Any] = {}
     for result in results:
         first.setdefault(result.probe.partition(": ")[0], result)

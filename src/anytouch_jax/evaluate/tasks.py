@@ -1,6 +1,8 @@
-"""Probing tasks: which rows of a manifest, which label, which groups never stand on both sides of a split.
+"""Probing tasks: which rows of a manifest, which label, which groups never stand on both sides of a
+split.
 
-Probes read every frame unflipped, as a flip changes a direction label. Pre-training flips touches (`data.flip`).
+Probes read every frame unflipped, as a flip changes a direction label. Pre-training flips touches
+(`data.flip`).
 """
 
 from __future__ import annotations
@@ -35,13 +37,14 @@ GROUPS = ("grasp_group", "object", "touch")
 class Task:
     """A question to ask of frozen features.
 
-    `label`: a column of the manifest. `classes`: the only values that take part. `above`: the label is a number, and
-    the class is whether it is larger. `groups`: columns of which the first with a value names the group of a row, else
-    its sequence. The group "recording" is the sequence without its last part. `frames`: 1, or the length of a clip that
-    ends at the row. `which` rows: the deepest frame of a recording ("press"), all that touch ("contact"), or the frame
-    that slips most ("moving"). `fingers`: rows of a touch by two units. `phase` "after" the grasp (Feel). `where`:
-    (column, text) must be equal, (column, number) must be exceeded. `test_list`: test rows are those whose
-    `downstream_test` names this list.
+    `label`: a column of the manifest. `classes`: the only values that take part. `above`: the label
+    is a number, and the class is whether it is larger. `groups`: columns of which the first with a
+    value names the group of a row, else its sequence. The group "recording" is the sequence without
+    its last part. `frames`: 1, or the length of a clip that ends at the row. `which` rows: the
+    deepest frame of a recording ("press"), all that touch ("contact"), or the frame that slips most
+    ("moving"). `fingers`: rows of a touch by two units. `phase` "after" the grasp (Feel). `where`:
+    (column, text) must be equal, (column, number) must be exceeded. `test_list`: test rows are
+    those whose `downstream_test` names this list.
     """
 
     name: str
@@ -89,7 +92,9 @@ TASKS = {
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A public benchmark of the paper with the authors' settings; `paper`: the accuracy of AnyTouch there."""
+    """A public benchmark of the paper with the authors' settings; `paper`: the accuracy of AnyTouch
+    there.
+    """
 
     task: Task
     pooling: Pooling
@@ -116,9 +121,10 @@ def _benchmark(
     )
 
 
-# Paper, appendix "Downstream Datasets" and Tables 1 to 3; released code, run_probe_{TAG,Feel,OF1,OF2}.sh, main_probe.py
-# and downstream_dataset.py. A batch is of two devices together. Features are computed once, so training pictures are
-# not augmented: the release flips and jitters them, except for ObjectFolder 2.0.
+# Paper, appendix "Downstream Datasets" and Tables 1 to 3; released code,
+# run_probe_{TAG,Feel,OF1,OF2}.sh, main_probe.py and downstream_dataset.py. A batch is of two
+# devices together. Features are computed once, so training pictures are not augmented: the release
+# flips and jitters them, except for ObjectFolder 2.0.
 _TAG: dict[str, Any] = {"batch": 128, "rate": 2e-4, "decay": 0.05, "groups": ("recording",)}
 _OF: dict[str, Any] = {"label": "label.material", "rate": 1e-3, "decay": 0.01, "universal": True}
 BENCHMARKS = {
@@ -163,8 +169,10 @@ BENCHMARKS = {
 
 
 class TaskRows(NamedTuple):
-    """The rows of a task: `rows` i64 (n, fingers) of the manifest, and for each its label (text, or f64 of a
-    regression), group, split (train, val, test), sensor and unit. `notes` say which rows are left out."""
+    """The rows of a task: `rows` i64 (n, fingers) of the manifest, and for each its label (text, or
+    f64 of a regression), group, split (train, val, test), sensor and unit. `notes` say which rows
+    are left out.
+    """
 
     rows: Array
     labels: Array
@@ -205,9 +213,11 @@ def label_task(
     where: tuple[str, float] | None = None,
     sensor: str | None = None,
 ) -> Task:
-    """Return the task of any label column ("label." may be left out), on all rows that pass the filters.
+    """Return the task of any label column ("label." may be left out), on all rows that pass the
+    filters.
 
-    `group` defaults to the first of GROUPS with a value that is not the label. UserError for an unknown name.
+    `group` defaults to the first of GROUPS with a value that is not the label. UserError for an
+    unknown name.
     """
     conditions: list[tuple[str, str | float]] = (
         [(find_column(table, where[0]), where[1])] if where else []
@@ -244,7 +254,9 @@ def find_column(table: Manifest, name: str) -> str:
 
 
 def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> dict[str, Array]:
-    """Return masks over `rows` (n,): values of `column` with a photograph or caption in train, and others, or {}."""
+    """Return masks over `rows` (n,): values of `column` with a photograph or caption in train, and
+    others, or {}.
+    """
     values = table.text_column(column)
     described = (table.present("image_path") | table.present("text")) & (
         table.text_column("split") == "train"
@@ -256,9 +268,11 @@ def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> d
 
 
 def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
-    """Return the rows of a task in the manifest's order; `frames` above the task's selects rows that end such a clip.
+    """Return the rows of a task in the manifest's order; `frames` above the task's selects rows
+    that end such a clip.
 
-    A still (`frames` 1) of a task on clips takes the same rows as the clips do. Raises UserError without the label.
+    A still (`frames` 1) of a task on clips takes the same rows as the clips do. Raises UserError
+    without the label.
     """
     task = replace(task, label=_label_column(table, task))
     if not _has_values(table, task.label):
@@ -267,7 +281,8 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
             or "none"
         )
         raise UserError(
-            f"Task {task.name}: no row has a value in column {task.label!r}. The labels are {known}."
+            f"Task {task.name}: no row has a value in column {task.label!r}. The labels are "
+            f"{known}."
         )
     labels = _labels(table, task)
     split = table.text_column("split")
@@ -302,12 +317,14 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
             " and two fingers" if task.fingers else "" if task.which == "all" else " and contact"
         )
         raise UserError(
-            f"Task {task.name}: no row of split train, val or test has a label in {task.label!r}{lacking}. "
+            f"Task {task.name}: no row of split train, val or test has a label in "
+            f"{task.label!r}{lacking}. "
             "Check the filters and the splits."
         )
     if labels.dtype.kind == "U":
         notes += tuple(
-            f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or Unicode form. They are "
+            f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or "
+            "Unicode form. They are "
             "probed as different classes."
             for alike in spellings(labels[first].tolist())
         )
@@ -318,12 +335,16 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
 
 
 def label_text(value: Any, source: str = "The label") -> str:
-    """Return a class label as text, "" for None, NaN and texts such as "n/a". Raises UserError for a quantity."""
+    """Return a class label as text, "" for None, NaN and texts such as "n/a".
+
+    Raises UserError for a quantity.
+    """
     if value is None or value != value:
         return ""
     if not isinstance(value, float | np.floating):
         text = str(value).strip()
-        # "none" is a class of the simulator (no slide, no twist); "None" is what Python prints for a missing value.
+        # "none" is a class of the simulator (no slide, no twist); "None" is what Python prints for
+        # a missing value.
         if text == "None" or (text != "none" and text.lower() in EMPTY):
             return ""
         return str(value)
@@ -381,14 +402,19 @@ def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
 
 
 def best_rows(rows: Array, groups: Array, *keys: Array) -> Array:
-    """Return the row of each group (n,) with the largest first key (n,), then the next key, then the earliest."""
+    """Return the row of each group (n,) with the largest first key (n,), then the next key, then
+    the earliest.
+    """
     order = np.lexsort((rows, *(-key for key in reversed(keys)), groups))
     return rows[order[np.unique(groups[order], return_index=True)[1]]]
 
 
 def _touching(table: Manifest) -> Array:
-    """Return whether each frame is contact, bool (rows,), by force, flag or score; all are in a file without these."""
-    # Force comes first: a flag or a score depends on the picture, and would leave out soft objects for some sensors.
+    """Return whether each frame is contact, bool (rows,), by force, flag or score; all are in a
+    file without these.
+    """
+    # Force comes first: a flag or a score depends on the picture, and would leave out soft objects
+    # for some sensors.
     force, contact_score = (
         table.number_column(f"label.{name}") for name in ("force", "contact_score")
     )
@@ -404,7 +430,9 @@ def _touching(table: Manifest) -> Array:
 
 
 def _groups(table: Manifest, columns: Sequence[str]) -> Array:
-    """Return the group of each row: the first column with a value, else the sequence; keys differ between manifests."""
+    """Return the group of each row: the first column with a value, else the sequence; keys differ
+    between manifests.
+    """
     sequence = table.text_column("sequence")
     file = np.array(
         [f" of file {number}" if len(table.files) > 1 else "" for number in table.source], dtype=str
@@ -431,7 +459,9 @@ def _grasp_column(table: Manifest) -> str:
 
 
 def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Array, tuple[str, ...]]:
-    """Return rows (n, 2) of the two units of each grasp, by the units' names; the labelled row of each; and notes."""
+    """Return rows (n, 2) of the two units of each grasp, by the units' names; the labelled row of
+    each; and notes.
+    """
     name = _grasp_column(table)
     rows = rows[table.present(name)[rows] & table.present("unit")[rows]]
     grasp = table.codes(name, own=True)[rows]

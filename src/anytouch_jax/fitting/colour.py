@@ -1,8 +1,9 @@
-"""The colour change of a gel by its slope: from presses of a ball of known size, or from any presses.
+"""The colour change of a gel by its slope: from presses of a ball of known size, or from any
+presses.
 
-A ball's slopes are known up to its place and depth, and these are found together with the colours: linear least squares
-and a search take turns. Without a ball three things are known. The slopes of one surface fit together (no curl), gels
-are touched from all sides, and dents are dents.
+A ball's slopes are known up to its place and depth, and these are found together with the colours:
+linear least squares and a search take turns. Without a ball three things are known. The slopes of
+one surface fit together (no curl), gels are touched from all sides, and dents are dents.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ Array = np.ndarray
 _Found = tuple[float, Array]  # a loss, and what has it
 # powers of (u, v) that a coefficient drifts by
 PLACES = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-# Largest tilt, and largest features of the halo, that change a colour: of open light, and of paint that is soon dark.
+# Largest tilt, and largest features of the halo, that change a colour: of open light, and of paint
+# that is soon dark.
 _LIMITS = (0.95, (9.0, 9.0, 1.5)), (0.3, (0.03, 0.03, 0.06))
 DEPTHS = np.linspace(0.05, 1.6, 24)  # mm
 _REACH = np.array([[-np.inf, -np.inf, DEPTHS[0]], [np.inf, np.inf, DEPTHS[-1]]])  # of a pose
@@ -31,7 +33,8 @@ _REACH = np.array([[-np.inf, -np.inf, DEPTHS[0]], [np.inf, np.inf, DEPTHS[-1]]])
 _GRID = 96
 _SIDE = 14.0
 SKIN = 0.13  # mm: detail that the coating and the lens pass
-# mm, of the soft shadow and of the gel: the best is chosen. The gel's decides the depth, and so the change by depth.
+# mm, of the soft shadow and of the gel: the best is chosen. The gel's decides the depth, and so the
+# change by depth.
 HALOS = (0.35, 1.0, 1.6)
 THICKNESSES = (1.8, 2.3, 2.8, 3.3, 3.9, 4.6)
 THIN = 5  # the search looks at every so many pixels
@@ -39,16 +42,22 @@ PLAIN = 9  # powers of the normal with which the presses are placed
 # mm of place and depth
 ROUNDS = (0.8, 0.2), (0.4, 0.1), (0.2, 0.1), (0.1, 0.05), (0.1, 0.05), (0.05, 0.03)
 FEATURES = len(POWERS) * len(PLACES)
-# Root mean square of the slope of the gel, weighted by its square, and of its depth in mm where the change is above a
-# quarter of the strongest. They give the right strength on average over simulated units, and set the scale without a
-# ball. Of 30 statistics of the slope this one differs least from unit to unit.
+# Root mean square of the slope of the gel, weighted by its square, and of its depth in mm where the
+# change is above a quarter of the strongest. They give the right strength on average over simulated
+# units, and set the scale without a ball. Of 30 statistics of the slope this one differs least from
+# unit to unit.
 USUAL_TILT = 0.30
 USUAL_DEPTH = 0.27
-UNSURE = "Without a ball the strength is a usual one, which differs by {} (deviation over known sensors): edit contrast"
+UNSURE = (
+    "Without a ball the strength is a usual one, which differs by {} (deviation over known "
+    "sensors): edit contrast"
+)
 
 
 class Colour(NamedTuple):
-    """A fitted look with mm of its halo and gel, the share of the change that it explains, and how it was found."""
+    """A fitted look with mm of its halo and gel, the share of the change that it explains, and how
+    it was found.
+    """
 
     look: Photometry
     halo: float
@@ -67,7 +76,9 @@ class Grid(NamedTuple):
 
 
 def grid_of(shape: tuple[int, int], width_mm: float) -> Grid:
-    """Return the places of the pixels (H, W) of a picture that shows `width_mm`, with square pixels."""
+    """Return the places of the pixels (H, W) of a picture that shows `width_mm`, with square
+    pixels.
+    """
     height, width = shape
     pixel = width_mm / width
     x, y = np.meshgrid(
@@ -77,7 +88,8 @@ def grid_of(shape: tuple[int, int], width_mm: float) -> Grid:
 
 
 class _Profiles(NamedTuple):
-    """Dents of a ball by depth (K,) and distance (R,) mm: slope, and depth and slope of the blurred dent (K, R).
+    """Dents of a ball by depth (K,) and distance (R,) mm: slope, and depth and slope of the blurred
+    dent (K, R).
 
     `steepest` and `widest` are those of `Photometry`.
     """
@@ -128,7 +140,9 @@ def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
 
 
 def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]:
-    """Return the arguments of `design` for a ball at `pose` x, y, depth mm and the places (N,) of a grid."""
+    """Return the arguments of `design` for a ball at `pose` x, y, depth mm and the places (N,) of a
+    grid.
+    """
     dx = grid.x - pose[0]
     dy = grid.y - pose[1]
     away = np.hypot(dx, dy)
@@ -148,7 +162,9 @@ def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]
 
 
 def design(nx: Array, ny: Array, u: Array, v: Array, halo: Array, *, plain: bool = False) -> Array:
-    """Return the rows (N, 129) of the least squares problem of a `Photometry`; `plain` ones are (N, 22)."""
+    """Return the rows (N, 129) of the least squares problem of a `Photometry`; `plain` ones are (N,
+    22).
+    """
     normal = np.stack([nx**i * ny**j for i, j in (POWERS[:PLAIN] if plain else POWERS)], 1)
     if plain:
         drift = [each * at for each in (nx, ny) for at in (u, v, u * u, u * v, v * v)]
@@ -166,7 +182,8 @@ def _ridge(gram: Array, target: Array, penalties: Array) -> Array:
     return np.asarray(np.linalg.solve(scaled, target / scale[:, None]) / scale[:, None])
 
 
-# What few presses do not show is small: high powers, drift over the picture, and a halo that copies the slopes.
+# What few presses do not show is small: high powers, drift over the picture, and a halo that copies
+# the slopes.
 _PENALTY = np.concatenate(
     [
         np.ravel(
@@ -190,7 +207,10 @@ def assemble(
 
 
 def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> Colour:
-    """Fit colour changes f32 (N, H, W, 3) of presses of a ball. Raises UserError if no ball of that size fits."""
+    """Fit colour changes f32 (N, H, W, 3) of presses of a ball.
+
+    Raises UserError if no ball of that size fits.
+    """
     part = Grid(*(values.ravel() for values in grid_of(change.shape[1:3], width_mm)))
     known = _profiles(ball_mm)
     # A pixel that is not clear has change 0 and features 0.
@@ -202,7 +222,8 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
     some = seen[:, ::THIN]
     best = (THICKNESSES[2], HALOS[1], 0)
     poses = np.stack([_first_pose(one, part, known[best]) for one in flat])
-    # Shadow and limits for one thickness; then thickness and shadow together, which replace each other; then limits.
+    # Shadow and limits for one thickness; then thickness and shadow together, which replace each
+    # other; then limits.
     for same, rounds in (
         (slice(1), ROUNDS[:4]),
         (slice(2, 3), ROUNDS[3:5]),
@@ -214,7 +235,8 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
         poses = tries[best][1]
     if float(np.median(poses[:, 2])) >= 0.95 * min(ball_mm / 2, DEPTHS[-1]):
         raise UserError(
-            f"the dents are wider than those of a ball of {ball_mm:g} mm; check --width-mm and --ball-mm"
+            f"the dents are wider than those of a ball of {ball_mm:g} mm; check --width-mm and "
+            "--ball-mm"
         )
     loss, coefficients = _colours(flat, seen, part, known[best], poses, plain=False)
     source = f"{len(change)} presses of a ball of {ball_mm:g} mm"
@@ -230,9 +252,12 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
 def _placed(
     flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any
 ) -> _Found:
-    """Return the loss of `_colours`, and better poses (N, 3): the colours and the poses are found in turn."""
+    """Return the loss of `_colours`, and better poses (N, 3): the colours and the poses are found
+    in turn.
+    """
     for step, deep in rounds:
-        # Deeper dents with fainter colours look nearly alike, so all depths are also tried together.
+        # Deeper dents with fainter colours look nearly alike, so all depths are also tried
+        # together.
         tries = [poses * (1, 1, factor) for factor in (0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.25)]
         losses, solutions = zip(
             *(_colours(flat, seen, part, profiles, one) for one in tries), strict=True
@@ -252,7 +277,9 @@ def _placed(
 def _colours(
     flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, plain: bool = True
 ) -> _Found:
-    """Return minus the squares of the change that the best colours explain, and these colours (22 or 129, 3)."""
+    """Return minus the squares of the change that the best colours explain, and these colours (22
+    or 129, 3).
+    """
     rows = [
         w * design(*_features(part, profiles, pose), plain=plain)
         for pose, w in zip(poses, seen, strict=True)
@@ -264,7 +291,9 @@ def _colours(
 
 
 def _first_pose(change: Array, grid: Grid, profiles: _Profiles) -> Array:
-    """Return a first place and depth: the middle of the strongest changes, and the depth whose slopes reach as far."""
+    """Return a first place and depth: the middle of the strongest changes, and the depth whose
+    slopes reach as far.
+    """
     strength = np.abs(change).max(1)
     strong = strength > 0.4 * np.percentile(strength, 99.5)
     x = float(np.median(grid.x[strong]))
@@ -305,7 +334,9 @@ def _search(
 
 
 def fit_presses(change: Array, clear: Array) -> Colour:
-    """Fit colour changes f32 (N, H, W, 3) of presses of unknown objects: their slopes without a curl, see above."""
+    """Fit colour changes f32 (N, H, W, 3) of presses of unknown objects: their slopes without a
+    curl, see above.
+    """
     smooth = np.stack([cv2.GaussianBlur(one, (0, 0), 1.0) for one in change])
     grid = grid_of(change.shape[1:3], 2.0)
     strength = np.abs(smooth).max(-1)
@@ -319,7 +350,10 @@ def fit_presses(change: Array, clear: Array) -> Colour:
         coefficients[FEATURES + 6] = (
             axes[:, -1] * np.sign(main.mean()) * np.sqrt((main**2).mean()) / USUAL_DEPTH
         )
-        source = f"{len(change)} presses of unknown objects, of a gel that changes by depth. {UNSURE.format('30 %')}"
+        source = (
+            f"{len(change)} presses of unknown objects, of a gel that changes by depth. "
+            f"{UNSURE.format('30 %')}"
+        )
         return Colour(assemble(coefficients), 0.35, float(values[2] / values.sum()), source)
     values, axes = np.linalg.eigh(np.cov(smooth[clear].T, ddof=0))
     # (N, H, W, 2), uncorrelated: slopes up to a turn
@@ -335,7 +369,8 @@ def fit_presses(change: Array, clear: Array) -> Colour:
     slopes = white @ best[1].T
     if _depth_of(slopes)[touched].mean() < 0:
         slopes = -slopes
-    # The colours drift over the picture: those of the nearest surface, and the slopes by these colours, in turn.
+    # The colours drift over the picture: those of the nearest surface, and the slopes by these
+    # colours, in turn.
     place = np.stack([np.ones_like(grid.u), grid.u, grid.v], -1)
     for _ in range(4):
         fitting = np.stack(np.gradient(_depth_of(slopes), axis=(2, 1)), -1)
@@ -356,7 +391,9 @@ def fit_presses(change: Array, clear: Array) -> Colour:
 
 
 def _depth_of(slopes: Array) -> Array:
-    """Return the surface (N, H, W) whose slopes (N, H, W, 2) along x and y are nearest, 0 on average at the border."""
+    """Return the surface (N, H, W) whose slopes (N, H, W, 2) along x and y are nearest, 0 on
+    average at the border.
+    """
     height, width = slopes.shape[1:3]
     ky, kx = np.meshgrid(np.fft.fftfreq(2 * height), np.fft.fftfreq(2 * width), indexing="ij")
     padded = [np.pad(slopes[..., i], ((0, 0), (0, height), (0, width))) for i in range(2)]

@@ -1,7 +1,7 @@
 """From a few pictures of a sensor to a folder NAME.sensor that the simulator takes.
 
-`see` finds what the pictures show by themselves: the untouched gel, presses, dots and noise. `fit_sensor` adds the
-colours by slope, and writes the folder. Lengths of pictures are in pixels.
+`see` finds what the pictures show by themselves: the untouched gel, presses, dots and noise.
+`fit_sensor` adds the colours by slope, and writes the folder. Lengths of pictures are in pixels.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ NOT_FLAT = ("allsight", "tactip", "taclink", "digit360", "digit_360", "omnitact"
 
 
 class Seen(NamedTuple):
-    """Pictures of one unit u8 (N, h, w, 3), its untouched gel, and the colour change f32 (N, H, W, 3) of the presses.
+    """Pictures of one unit u8 (N, h, w, 3), its untouched gel, and the colour change f32 (N, H, W,
+    3) of the presses.
 
     `clear` bool (N, H, W) is where no dots hide the change, and no colour is at its limit.
     """
@@ -58,11 +59,15 @@ class Seen(NamedTuple):
 
 
 def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
-    """Return what pictures RGB u8 (h, w, 3) of one unit show. Raises UserError for pictures that cannot be fitted."""
+    """Return what pictures RGB u8 (h, w, 3) of one unit show.
+
+    Raises UserError for pictures that cannot be fitted.
+    """
     frames = [reduced(picture) for picture in pictures]
     if len(frames) < FEWEST:
         raise UserError(
-            f"{len(frames)} pictures are too few to fit a sensor; take {FEWEST} or more, 20 are good"
+            f"{len(frames)} pictures are too few to fit a sensor; take {FEWEST} or more, 20 are "
+            "good"
         )
     if len(shapes := {frame.shape for frame in frames}) > 1:
         raise UserError(
@@ -78,7 +83,8 @@ def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
         source = "given"
         if abs(gel.shape[1] / gel.shape[0] / (frames[0].shape[1] / frames[0].shape[0]) - 1) > 0.02:
             raise UserError(
-                "the background has other proportions than the pictures; take it with the same camera"
+                "the background has other proportions than the pictures; take it with the same "
+                "camera"
             )
         gel = cv2.resize(gel, frames[0].shape[1::-1], interpolation=cv2.INTER_AREA)
     _check_flat(gel)
@@ -90,7 +96,8 @@ def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
         )
     if background is None and median_gel(small) is None:
         raise UserError(
-            "every picture shows a press at the same place; name the untouched gel with --background"
+            "every picture shows a press at the same place; name the untouched gel with "
+            "--background"
         )
     dots = find_dots(gel)
     noise, spread = _noise(np.stack(frames), gel, dots)
@@ -99,7 +106,9 @@ def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
 
 
 def _check_one_unit(frames: Sequence[Array]) -> None:
-    """Raise UserError if a part of the pictures differs from the rest in most places, and not from each other."""
+    """Raise UserError if a part of the pictures differs from the rest in most places, and not from
+    each other.
+    """
     small = np.stack(
         [
             cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -112,7 +121,8 @@ def _check_one_unit(frames: Sequence[Array]) -> None:
     enough = len(rest) >= max(2, ANOTHER * len(frames))
     if enough and near[np.ix_(rest, rest)].sum(1).max() >= max(2, 0.5 * len(rest)):
         raise UserError(
-            f"{len(rest)} of {len(frames)} pictures differ from the others in most places, as if taken with another "
+            f"{len(rest)} of {len(frames)} pictures differ from the others in most places, as if "
+            "taken with another "
             "unit or in other light; fit each unit by itself"
         )
 
@@ -131,7 +141,8 @@ def _check_flat(gel: Array) -> None:
         < gel[3 * height : -3 * height].mean() / 3
     ):
         raise UserError(
-            "the picture is round, so the sensor is not flat; a flat gel that fills the picture can be fitted"
+            "the picture is round, so the sensor is not flat; a flat gel that fills the picture "
+            "can be fitted"
         )
 
 
@@ -145,7 +156,9 @@ class Fitted(NamedTuple):
 
 
 def check_name(name: str) -> None:
-    """Raise UserError for a name that another sensor has, or that belongs to a sensor which cannot be fitted."""
+    """Raise UserError for a name that another sensor has, or that belongs to a sensor which cannot
+    be fitted.
+    """
     word = name.lower().replace("-", "_").replace(" ", "_")
     if word in FIELD_SENSORS:
         raise UserError(
@@ -171,9 +184,11 @@ def fit_sensor(
     background: np.ndarray | None = None,
     ball_mm: float | None = None,
 ) -> Fitted:
-    """Fit pictures RGB u8 (h, w, 3) of one unit, whose width shows `width_mm`, and write the folder `out`.
+    """Fit pictures RGB u8 (h, w, 3) of one unit, whose width shows `width_mm`, and write the folder
+    `out`.
 
-    All presses are of a ball of `ball_mm`, if that is given. Raises UserError for pictures that cannot be fitted.
+    All presses are of a ball of `ball_mm`, if that is given. Raises UserError for pictures that
+    cannot be fitted.
     """
     check_name(name)
     if Path(out).suffix != OWN_SENSOR:
@@ -182,7 +197,8 @@ def fit_sensor(
     height_mm = width_mm * height / width
     if not all(MM.low <= side <= MM.high for side in (width_mm, height_mm)):
         raise UserError(
-            f"a picture of {width} x {height} pixels that is {width_mm:g} mm wide shows {width_mm:g} x {height_mm:.3g} "
+            f"a picture of {width} x {height} pixels that is {width_mm:g} mm wide shows "
+            f"{width_mm:g} x {height_mm:.3g} "
             f"mm; the sides of a gel are {MM.words}. Check --width-mm."
         )
     if ball_mm is not None and not 1 <= ball_mm <= 40:
@@ -229,7 +245,9 @@ def fit_sensor(
 
 
 def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
-    """Return the deviation of a pixel from picture to picture where nothing presses, and its relative spread."""
+    """Return the deviation of a pixel from picture to picture where nothing presses, and its
+    relative spread.
+    """
     fine = []
     calm = []
     for frame in frames:
@@ -256,7 +274,9 @@ def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
 
 
 def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Array, Array]:
-    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, without light and dots, and where they show."""
+    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, without light and dots, and
+    where they show.
+    """
     height, width = gel.shape[:2]
     size = (round(width * WORK / max(height, width)), round(height * WORK / max(height, width)))
     changes = []
@@ -283,7 +303,9 @@ def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Ar
 
 
 def without_dots(seen: Seen) -> Array:
-    """Return the untouched gel u8 (h, w, 3) of at most BASE pixels a side, with paint in the place of dots."""
+    """Return the untouched gel u8 (h, w, 3) of at most BASE pixels a side, with paint in the place
+    of dots.
+    """
     gel: Any = seen.gel
     if seen.dots is not None:
         gel = cv2.inpaint(gel, seen.dots.mask.astype(np.uint8), 3, cv2.INPAINT_TELEA)

@@ -1,7 +1,7 @@
 """Tokens for your own sensor, trained on simulated touches of it.
 
-Each touch is felt by your sensor and by a known one. The features of yours are drawn to those that the frozen encoder
-has of the known one, among the features of other touches. No touch repeats.
+Each touch is felt by your sensor and by a known one. The features of yours are drawn to those that
+the frozen encoder has of the known one, among the features of other touches. No touch repeats.
 """
 
 from __future__ import annotations
@@ -59,12 +59,14 @@ def adapt_by_simulation(
     known: Sequence[str] = CAMERAS,
     log: Log = print,
 ) -> Adapted | None:
-    """Return the model of `run` with tokens for the sensor of a folder NAME.sensor, trained for `minutes`.
+    """Return the model of `run` with tokens for the sensor of a folder NAME.sensor, trained for
+    `minutes`.
 
-    `known` are the simulated sensors that take part. With `deep` the first blocks are trained too, and the features of
-    known sensors are held where they are. `before` and `after` are the shares of held-out touches that are found among
-    some 200 by a known sensor, with universal tokens and with the new ones. After Ctrl-C the result is None: the next
-    call continues from the file `state`. Raises UserError, and CheckError if the new tokens find fewer.
+    `known` are the simulated sensors that take part. With `deep` the first blocks are trained too,
+    and the features of known sensors are held where they are. `before` and `after` are the shares
+    of held-out touches that are found among some 200 by a known sensor, with universal tokens and
+    with the new ones. After Ctrl-C the result is None: the next call continues from the file
+    `state`. Raises UserError, and CheckError if the new tokens find fewer.
     """
     numbers = read_numbers(sensor)
     loaded, params = read_model(run)
@@ -180,7 +182,8 @@ def adapt_by_simulation(
         after = score(train)
     if after < before:
         raise CheckError(
-            f"the new tokens find {after:.1%} of held-out simulated touches by a known sensor, and the universal ones "
+            f"the new tokens find {after:.1%} of held-out simulated touches by a known sensor, and "
+            "the universal ones "
             f"{before:.1%}: nothing is saved. Look at look.png of {sensor}, or give more --minutes."
         )
     source = {
@@ -203,7 +206,9 @@ def adapt_by_simulation(
 
 
 def _found(held: list[SimulatedTouches], features: Callable[..., Any], train: State) -> float:
-    """Return the share of held-out touches by your sensor that are nearest to the same touch by a known one."""
+    """Return the share of held-out touches by your sensor that are nearest to the same touch by a
+    known one.
+    """
     parts = [features(train, touches) for touches in held]
     own, other = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
     by_known = np.concatenate([np.asarray(touches.sensor[:, 0]) > 0 for touches in held])
@@ -222,9 +227,12 @@ def _train(
     identity: str,
     log: Log,
 ) -> tuple[Kept, tuple[float, ...], bool]:
-    """Train for about `seconds`, from the state in `file` if there is one. False is an interruption, with a state.
+    """Train for about `seconds`, from the state in `file` if there is one.
 
-    The speed of the first steps decides the number of steps, so a continued training equals an undisturbed one.
+    False is an interruption, with a state.
+
+    The speed of the first steps decides the number of steps, so a continued training equals an
+    undisturbed one.
     """
     total = 0
     history = list[float]()

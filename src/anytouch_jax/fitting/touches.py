@@ -1,4 +1,6 @@
-"""Simulated touches of your own sensor next to the known ones: for its picture, and for its tokens."""
+"""Simulated touches of your own sensor next to the known ones: for its picture, and for its
+tokens.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ def own_world(
     known: Sequence[str] = CAMERAS,
     ball_mm: float | None = None,
 ) -> World:
-    """Return the world of your sensor (family 0) and the `known` ones, with objects of a split of training.
+    """Return the world of your sensor (family 0) and the `known` ones, with objects of a split of
+    training.
 
     All objects are balls of `ball_mm`, if that is given.
     """
@@ -64,10 +67,11 @@ def compare(
     ball_mm: float | None = None,
     seed: int = 0,
 ) -> float:
-    """Write a picture of real frames u8 (N, h, w, 3) above simulated ones, and return what a classifier still sees.
+    """Write a picture of real frames u8 (N, h, w, 3) above simulated ones, and return what a
+    classifier still sees.
 
-    Both are presses of a ball of `ball_mm`, if that is given. The result is the share of held-out pictures that a
-    linear classifier names rightly as real or simulated: 0.5 is chance.
+    Both are presses of a ball of `ball_mm`, if that is given. The result is the share of held-out
+    pictures that a linear classifier names rightly as real or simulated: 0.5 is chance.
     """
     world = own_world(sensor, "train", ball_mm=ball_mm)
     count = min(len(frames), 2 * COUNT)
@@ -102,7 +106,9 @@ def _picture(real: Array, made: Array) -> Array:
 
 
 def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
-    """Return the share of held-out differences f32 (h, w, 3) that a ridge classifier on statistics gets right."""
+    """Return the share of held-out differences f32 (h, w, 3) that a ridge classifier on statistics
+    gets right.
+    """
     rows = np.stack([_statistics(one) for one in (*real, *made)])
     kind = np.repeat([1.0, -1.0], [len(real), len(made)])
     order = np.random.default_rng(seed).permutation(len(rows))
@@ -121,7 +127,9 @@ def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
 
 
 def _statistics(change: Array) -> Array:
-    """Return means, deviations, tails and detail at three scales of a difference f32 (h, w, 3), and its colours."""
+    """Return means, deviations, tails and detail at three scales of a difference f32 (h, w, 3), and
+    its colours.
+    """
     parts: list[Any] = [change.mean((0, 1)), *np.percentile(change, (2, 10, 90, 98), axis=(0, 1))]
     for blur in (0.0, 1.5, 4.0):
         one = cv2.GaussianBlur(change, (0, 0), blur) if blur else change

@@ -1,1 +1,4 @@
-"""The networks. `functional.build` is the way in; nothing outside this folder meets a Flax module."""
+"""The networks.
+
+`functional.build` is the way in; nothing outside this folder meets a Flax module.
+"""

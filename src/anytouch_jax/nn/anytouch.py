@@ -22,7 +22,9 @@ Features = TypeVar("Features")  # an array, or a tuple of arrays
 
 
 def _matcher(model: ModelConfig) -> Mlp | Dense | None:
-    """Return the head of Eq. 5, float32 at least: an MLP (paper), one linear layer (release), or None (cosine)."""
+    """Return the head of Eq. 5, float32 at least: an MLP (paper), one linear layer (release), or
+    None (cosine).
+    """
     model = replace(model, dtype="float32") if model.dtype == "bfloat16" else model
     if model.match_head == "mlp":
         return Mlp(model.embed, model.embed, model, gelu, outputs=1)
@@ -63,7 +65,9 @@ class AnyTouch(nnx.Module):
     def encode_poolings(
         self, clip: Array, sensor: Array, join: str = "mean"
     ) -> tuple[Array, Array]:
-        """Return in one pass `encode_touch`, and the mean over projected patch tokens (the release's "global")."""
+        """Return in one pass `encode_touch`, and the mean over projected patch tokens (the
+        release's "global").
+        """
 
         def both(clip: Array, sensor: Array) -> tuple[Array, Array]:
             hidden = self.touch.hidden(clip, sensor)
@@ -90,7 +94,9 @@ class AnyTouch(nnx.Module):
         return jax.tree.map(lambda z: joins[join](z.reshape(b, s, z.shape[-1])), values)
 
     def encode_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """Return the projected sequence (B, 1 + S + K, E) of [class, sensor tokens, patches]: the decoder's input."""
+        """Return the projected sequence (B, 1 + S + K, E) of [class, sensor tokens, patches]: the
+        decoder's input.
+        """
         return self.touch.projection(self.touch.hidden(clip, sensor, keep_ids))
 
     def reconstruct(
@@ -102,7 +108,9 @@ class AnyTouch(nnx.Module):
         frames: int,
         decoder_sensor: Array | None = None,
     ) -> Array:
-        """Return pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B, T, H, W, 3)."""
+        """Return pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B,
+        T, H, W, 3).
+        """
         latent = self.encode_tokens(clip, sensor, keep_ids)
         own = None
         if hasattr(self.decoder, "sensor_projection"):
@@ -125,7 +133,9 @@ class AnyTouch(nnx.Module):
         return self.touch.embedding(hidden[:, 0]), mean, self.fields(states, clip, aspect)
 
     def match(self, z_first: Array, z_second: Array) -> Array:
-        """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5), from their element-wise product."""
+        """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5), from their
+        element-wise product.
+        """
         if self.matcher is None:
             raise ValueError("this network has no matching head (model.match_head is none)")
         product = z_first * z_second

@@ -1,4 +1,6 @@
-"""Multi-head attention in three equal forms: by XLA, by cuDNN, or mapped over cache-sized groups of heads."""
+"""Multi-head attention in three equal forms: by XLA, by cuDNN, or mapped over cache-sized groups of
+heads.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +26,12 @@ def attention(
     causal: bool = False,
     mask: Array | None = None,
 ) -> Array:
-    """Return softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool marks keys to read.
+    """Return softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool
+    marks keys to read.
 
-    `implementation` is "xla", "cudnn", "mapped" or "auto". "auto" is mapped on a single CPU device, else XLA. A causal
-    or masked call is never mapped (text is short), nor one with few queries. cuDNN needs 16 bits, an even Q and no
-    mask. XLA does the rest.
+    `implementation` is "xla", "cudnn", "mapped" or "auto". "auto" is mapped on a single CPU device,
+    else XLA. A causal or masked call is never mapped (text is short), nor one with few queries.
+    cuDNN needs 16 bits, an even Q and no mask. XLA does the rest.
     """
     free = mask is None and not causal and q.shape == k.shape
     if implementation == "auto":
@@ -44,7 +47,9 @@ def attention(
 
 
 def usable(model: ModelConfig) -> ModelConfig:
-    """Return `model` with a form of attention that this machine has, for weights trained by cuDNN."""
+    """Return `model` with a form of attention that this machine has, for weights trained by
+    cuDNN.
+    """
     there = model.attention != "cudnn" or jax.default_backend() == "gpu"
     if there:
         return model
@@ -53,10 +58,12 @@ def usable(model: ModelConfig) -> ModelConfig:
 
 @jax.custom_vjp
 def mapped(q: Array, k: Array, v: Array) -> Array:
-    """Return attention (B, S, H, D) over a few heads at a time, softmax recomputed backward from its saved log-sum.
+    """Return attention (B, S, H, D) over a few heads at a time, softmax recomputed backward from
+    its saved log-sum.
 
-    All B * H tables of S x S logits at once are written to memory and read back a dozen times. A few at a time never
-    leave the cache (Rabe and Staats, 2021; Dao et al., 2022). On two CPU cores 2 to 4 times as fast.
+    All B * H tables of S x S logits at once are written to memory and read back a dozen times. A
+    few at a time never leave the cache (Rabe and Staats, 2021; Dao et al., 2022). On two CPU cores
+    2 to 4 times as fast.
     """
     return _forward(q, k, v)[0]
 
@@ -112,7 +119,10 @@ def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:
 
 
 def _differentiate(part: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-    """Return gradients (G, S, D) of query, key and value of a group. `own` (G, S, 1) is gradient times output."""
+    """Return gradients (G, S, D) of query, key and value of a group.
+
+    `own` (G, S, 1) is gradient times output.
+    """
     q, k, v, log_sum, own, gradient = part
     scale = q.shape[-1] ** -0.5
     weights = jnp.exp(_product("gqd,gkd->gqk", q * scale, k) - log_sum[..., None])

@@ -1,4 +1,6 @@
-"""Image and text towers of CLIP (Radford et al., 2021), for stage 2, and LoRA of the image tower."""
+"""Image and text towers of CLIP (Radford et al., 2021), for stage 2, and LoRA of the image
+tower.
+"""
 
 from __future__ import annotations
 
@@ -73,14 +75,18 @@ class TextEncoder(nnx.Module):
         self.remat = model.remat
 
     def hidden(self, ids: Array, mask: Array | None = None) -> Array:
-        """Return normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on readable tokens."""
+        """Return normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on
+        readable tokens.
+        """
         x = (rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]).astype(
             self.dtype
         )
         return self.final_norm(run_blocks(self.blocks, x, remat=self.remat, causal=True, mask=mask))
 
     def pooled(self, ids: Array, mask: Array | None = None) -> Array:
-        """Return the hidden state (L, W) of the end token: the largest id, or the first occurrence of `end_token`."""
+        """Return the hidden state (L, W) of the end token: the largest id, or the first occurrence
+        of `end_token`.
+        """
         at = jnp.argmax(ids if self.end_token is None else ids == self.end_token, axis=1)
         return jnp.take_along_axis(self.hidden(ids, mask), at[:, None, None], axis=1)[:, 0]
 
@@ -98,10 +104,11 @@ class Lora(nnx.Module):
 
 
 def merge_lora(params: Params, alpha: float) -> Params:
-    """Return `params` with W + alpha / r * A B for the image tower's q, k, v and output kernels W (Hu et al., 2022).
+    """Return `params` with W + alpha / r * A B for the image tower's q, k, v and output kernels W
+    (Hu et al., 2022).
 
-    Without a "lora" entry the tree is unchanged. The update is linear, so adding it to the kernel gives the output and
-    the gradient of applying it to the activations.
+    Without a "lora" entry the tree is unchanged. The update is linear, so adding it to the kernel
+    gives the output and the gradient of applying it to the activations.
     """
     if "lora" not in params:
         return params

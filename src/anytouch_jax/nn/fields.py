@@ -1,7 +1,8 @@
-"""Decoder of fields: depth, shear, contact and force from the states of the touch encoder and from its pixels.
+"""Decoder of fields: depth, shear, contact and force from the states of the touch encoder and from
+its pixels.
 
-Every output is free of scale: lengths are shares of the picture's width, stresses shares of the gel's modulus. So a
-network that was trained on units of any zoom reads a sensor of any size.
+Every output is free of scale: lengths are shares of the picture's width, stresses shares of the
+gel's modulus. So a network that was trained on units of any zoom reads a sensor of any size.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from anytouch_jax.ops.fields import FORCE, LENGTH, STATES, STRESS, TORQUE, Field
 
 
 def windows(x: Array, side: int, stride: int = 2) -> Array:
-    """Every `stride`th window of `side` x `side` pixels (odd) of x (B, H, W, C), zeros around it: (B, ceil(H / stride),
-    ceil(W / stride), side * side * C), in the order (row, col, channel)."""
+    """Every `stride`th window of `side` x `side` pixels (odd) of x (B, H, W, C), zeros around it:
+    (B, ceil(H / stride), ceil(W / stride), side * side * C), in the order (row, col, channel).
+    """
     around = side // 2
     x = jnp.pad(x, ((0, 0), (around, around), (around, around), (0, 0)))
     ends = [size - side + 1 for size in x.shape[1:3]]
@@ -32,7 +34,9 @@ def windows(x: Array, side: int, stride: int = 2) -> Array:
 
 
 def convolved(x: Array, kernel: Array, side: int, stride: int, dtype: DTypeLike) -> Array:
-    """Convolve x (B, H, W, C) with a square kernel (side * side * C, outputs), rows in the order of `windows`."""
+    """Convolve x (B, H, W, C) with a square kernel (side * side * C, outputs), rows in the order of
+    `windows`.
+    """
     if (
         jax.default_backend() != "cpu"
     ):  # without tuning, cuDNN's gradient of so few channels takes a second
@@ -51,7 +55,9 @@ def convolved(x: Array, kernel: Array, side: int, stride: int, dtype: DTypeLike)
 
 
 class Convolution(nnx.Module):
-    """A square convolution (B, H, W, C) with zeros around it, after a norm over the channels if `norm`."""
+    """A square convolution (B, H, W, C) with zeros around it, after a norm over the channels if
+    `norm`.
+    """
 
     def __init__(
         self,
@@ -79,7 +85,8 @@ class Convolution(nnx.Module):
 
 
 class FieldDecoder(nnx.Module):
-    """Patch tokens of several blocks, and a convolutional path from the pixels for sharp edges (after DPT).
+    """Patch tokens of several blocks, and a convolutional path from the pixels for sharp edges
+    (after DPT).
 
     A deeper path on a grid of an eighth sees how slopes add up over the contact (after U-Net).
     """
@@ -109,7 +116,8 @@ class FieldDecoder(nnx.Module):
         self.grid = model.image_size // model.patch
 
     def __call__(self, states: Array, clip: Array, aspect: Array) -> FieldOutput:
-        """Decode `states` (B, 1 + S + N, STATES * D) of normalised `clip` (B, T, H, W, 3), fields of its last frame.
+        """Decode `states` (B, 1 + S + N, STATES * D) of normalised `clip` (B, T, H, W, 3), fields
+        of its last frame.
 
         `aspect` (B,) is the logarithm of the height over the width that the picture shows.
         """

@@ -1,4 +1,7 @@
-"""Networks as pure functions of their parameters: `build(config) -> Net`. Flax modules stay behind this file."""
+"""Networks as pure functions of their parameters: `build(config) -> Net`.
+
+Flax modules stay behind this file.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +34,16 @@ Params = dict[str, Any]
 class Net:
     """The network of a model configuration, as functions of a plain nested dict of arrays.
 
-    A method of a part that the model lacks raises AttributeError. Call methods inside `jax.jit`: outside of it each
-    operation is compiled for itself.
+    A method of a part that the model lacks raises AttributeError. Call methods inside `jax.jit`:
+    outside of it each operation is compiled for itself.
     """
 
     model: ModelConfig
 
     def init(self, key: Array) -> Params:
-        """Return fresh float32 parameters, drawn on the host from a PRNG key: equal on every device and version."""
+        """Return fresh float32 parameters, drawn on the host from a PRNG key: equal on every device
+        and version.
+        """
         return _drawn(self.abstract(), self.model, key)
 
     def abstract(self) -> Params:
@@ -46,7 +51,8 @@ class Net:
         return nnx.to_pure_dict(_skeleton(AnyTouch, self.model)[1])
 
     def bind(self, params: Params) -> AnyTouch:
-        """Return the module with these parameters, for parts without a method here (`net.bind(params).touch`).
+        """Return the module with these parameters, for parts without a method here
+        (`net.bind(params).touch`).
 
         A "lora" entry is merged into the image tower.
         """
@@ -61,24 +67,30 @@ class Net:
         join: str = "mean",
         keep_ids: Array | None = None,
     ) -> Array:
-        """Return touch embeddings (B, E) of normalised clips (B, T, H, W, 3), from the class token; not unit-norm.
+        """Return touch embeddings (B, E) of normalised clips (B, T, H, W, 3), from the class token;
+        not unit-norm.
 
-        With `keep_ids` (B, K) only these patches are encoded, of stills (T = 1) and of clips of `frames` frames. A
-        longer clip is cut into segments whose features are averaged (join="mean"), summed ("sum") or concatenated
-        ("concat": (B, segments * E)) (App. "Discussion on frame number").
+        With `keep_ids` (B, K) only these patches are encoded, of stills (T = 1) and of clips of
+        `frames` frames. A longer clip is cut into segments whose features are averaged
+        (join="mean"), summed ("sum") or concatenated ("concat": (B, segments * E)) (App.
+        "Discussion on frame number").
         """
         return self.bind(params).encode_touch(clip, sensor, join, keep_ids)
 
     def encode_poolings(
         self, params: Params, clip: Array, sensor: Array, join: str = "mean"
     ) -> tuple[Array, Array]:
-        """Return both poolings (B, E) in one pass: the class token and the mean over patch tokens."""
+        """Return both poolings (B, E) in one pass: the class token and the mean over patch
+        tokens.
+        """
         return self.bind(params).encode_poolings(clip, sensor, join)
 
     def encode_tokens(
         self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None
     ) -> Array:
-        """Return the projected sequence (B, 1 + S + K, E) of class, sensor and patch tokens: the decoder's input."""
+        """Return the projected sequence (B, 1 + S + K, E) of class, sensor and patch tokens: the
+        decoder's input.
+        """
         return self.bind(params).encode_tokens(clip, sensor, keep_ids)
 
     def reconstruct(
@@ -91,13 +103,16 @@ class Net:
         frames: int,
         decoder_sensor: Array | None = None,
     ) -> Array:
-        """Return pixels (B, N, frames, P*P*3) of every position from the visible patches `keep_ids` (B, K)."""
+        """Return pixels (B, N, frames, P*P*3) of every position from the visible patches `keep_ids`
+        (B, K).
+        """
         return self.bind(params).reconstruct(
             clip, sensor, keep_ids, restore_ids, frames, decoder_sensor
         )
 
     def measure(self, params: Params, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
-        """Return depth, shear, contact and force of normalised clips (B, T, H, W, 3), see `nn.fields`.
+        """Return depth, shear, contact and force of normalised clips (B, T, H, W, 3), see
+        `nn.fields`.
 
         `aspect` (B,) is the logarithm of the height over the width that the picture shows.
         """
@@ -136,7 +151,10 @@ def build(model: ModelConfig) -> Net:
 
 @dataclass(frozen=True)
 class Part:
-    """Any other module as functions of its parameters. `kind(options)` makes it; `options.model` is a ModelConfig."""
+    """Any other module as functions of its parameters.
+
+    `kind(options)` makes it; `options.model` is a ModelConfig.
+    """
 
     kind: Callable[[Any], Any]
     options: Any
@@ -155,7 +173,9 @@ class Part:
 
 
 def _skeleton(kind: Callable[[Any], Any], options: Any) -> tuple[Any, Any]:
-    """Return graph and abstract state of a module, whose parameters have the widest float of the context."""
+    """Return graph and abstract state of a module, whose parameters have the widest float of the
+    context.
+    """
     return _cached_skeleton(kind, options, jax.dtypes.canonicalize_dtype(float))
 
 

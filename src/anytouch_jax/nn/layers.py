@@ -1,4 +1,6 @@
-"""Matrix products, attention, MLP, pre-norm block and a scanned stack of blocks, shared by all towers."""
+"""Matrix products, attention, MLP, pre-norm block and a scanned stack of blocks, shared by all
+towers.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +24,20 @@ Turn = Callable[[Array], Array]
 
 
 def stored(dtype: DTypeLike) -> jnp.dtype:
-    """Return the type of arrays between the products of a model of `dtype`: float32 for 16 bits on a CPU.
+    """Return the type of arrays between the products of a model of `dtype`: float32 for 16 bits on
+    a CPU.
 
-    A CPU has 16-bit products (AMX) and nothing else of 16 bits: XLA would widen every sum, norm and copy, and each
-    write into a slice would widen the whole array.
+    A CPU has 16-bit products (AMX) and nothing else of 16 bits: XLA would widen every sum, norm and
+    copy, and each write into a slice would widen the whole array.
     """
     narrow = jnp.dtype(dtype).itemsize == 2 and jax.default_backend() == "cpu"
     return jnp.dtype(jnp.float32 if narrow else dtype)
 
 
 def product(x: Array, kernel: Array, dtype: DTypeLike) -> Array:
-    """Return x (rows, inputs) @ kernel (inputs, outputs), both rounded to `dtype`, as `stored(dtype)`."""
+    """Return x (rows, inputs) @ kernel (inputs, outputs), both rounded to `dtype`, as
+    `stored(dtype)`.
+    """
     if stored(dtype) != dtype:
         return checkpoint_name(
             _narrow(x.astype(stored(dtype)), kernel, jnp.dtype(dtype)), "product"
@@ -40,7 +45,8 @@ def product(x: Array, kernel: Array, dtype: DTypeLike) -> Array:
     return x.astype(dtype) @ kernel.astype(dtype)
 
 
-# A policy of jax.checkpoint: keep matrix products, with those of this module, and recompute the rest.
+# A policy of jax.checkpoint: keep matrix products, with those of this module, and recompute the
+# rest.
 products_saveable = jax.checkpoint_policies.save_from_both_policies(
     jax.checkpoint_policies.dots_with_no_batch_dims_saveable,
     jax.checkpoint_policies.save_only_these_names("product"),
@@ -50,7 +56,8 @@ products_saveable = jax.checkpoint_policies.save_from_both_policies(
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _narrow(x: Array, kernel: Array, dtype: DTypeLike) -> Array:
     """Return a product of 16-bit operands summed in float32, and its gradients the same way."""
-    # XLA's CPU back end has one fast form: a float32 result, the first operand contracted over its last axis.
+    # XLA's CPU back end has one fast form: a float32 result, the first operand contracted over its
+    # last axis.
     return _wide(x.astype(dtype), kernel.astype(dtype), 0)
 
 
@@ -74,7 +81,10 @@ def _wide(a: Array, b: Array, axis: int) -> Array:
 
 
 def _turned(x: Array) -> Array:
-    """Return x^T as a copy. The branch keeps XLA from folding it into the product. NaN stays NaN."""
+    """Return x^T as a copy.
+
+    The branch keeps XLA from folding it into the product. NaN stays NaN.
+    """
     if not x.size:
         return x.T
     return lax.cond(
@@ -86,8 +96,8 @@ def _turned(x: Array) -> Array:
 def gelu(x: Array) -> Array:
     """Exact GELU, x * Phi(x), as CLIP and ViT use it (jax.nn.gelu defaults to the tanh form).
 
-    The derivative is written by hand: tracing jax's erfc form costs 2.5 times as much on a CPU. In float32 at least:
-    1 + erf in 16 bits has nothing left of the negative tail.
+    The derivative is written by hand: tracing jax's erfc form costs 2.5 times as much on a CPU. In
+    float32 at least: 1 + erf in 16 bits has nothing left of the negative tail.
     """
     wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
     return (wide * _normal_cdf(wide)).astype(x.dtype)
@@ -119,12 +129,17 @@ ACTIVATIONS: dict[str, Activation] = {"gelu": gelu, "quick_gelu": quick_gelu}
 
 
 def table(*shape: int) -> nnx.Param:
-    """Return a learned array of tokens or positions. `functional.Net.init` draws its first values."""
+    """Return a learned array of tokens or positions.
+
+    `functional.Net.init` draws its first values.
+    """
     return nnx.Param(jnp.zeros(shape))
 
 
 def rows_of(values: Array, ids: Array) -> Array:
-    """Return rows of a table (R, ...) by ids of any shape. An id outside it gives NaN, which the step reports.
+    """Return rows of a table (R, ...) by ids of any shape.
+
+    An id outside it gives NaN, which the step reports.
 
     JAX alone would take the nearest row, or count from the end.
     """
@@ -132,7 +147,9 @@ def rows_of(values: Array, ids: Array) -> Array:
 
 
 class Dense(nnx.Module):
-    """A linear layer (..., inputs) -> (..., outputs): float32 parameters, arithmetic in the model's dtype."""
+    """A linear layer (..., inputs) -> (..., outputs): float32 parameters, arithmetic in the model's
+    dtype.
+    """
 
     def __init__(self, inputs: int, outputs: int, model: ModelConfig, *, bias: bool = True) -> None:
         self.kernel = table(inputs, outputs)
@@ -141,7 +158,8 @@ class Dense(nnx.Module):
 
     def __call__(self, x: Array, outputs: int | None = None) -> Array:
         """Return all outputs, or compute only the first `outputs` of them."""
-        # As a matrix: of two contracted axes XLA's CPU back end writes a transposed copy before the gradient's product.
+        # As a matrix: of two contracted axes XLA's CPU back end writes a transposed copy before the
+        # gradient's product.
         y = product(x.reshape(-1, x.shape[-1]), self.kernel[...][:, :outputs], self.dtype)
         y = y if self.bias is None else y + self.bias[...][None, :outputs].astype(y.dtype)
         return y.reshape(*x.shape[:-1], y.shape[-1])
@@ -201,8 +219,8 @@ class Mlp(nnx.Module):
         return self.down(self.act(self.up(x)))
 
 
-# The backward pass keeps matrix products, and recomputes norms, activations and sums. On two CPU cores a step takes 15
-# to 25 % less time and two fifths less memory.
+# The backward pass keeps matrix products, and recomputes norms, activations and sums. On two CPU
+# cores a step takes 15 to 25 % less time and two fifths less memory.
 lean = nnx.remat(prevent_cse=False, policy=products_saveable)
 
 
@@ -223,7 +241,10 @@ class Block(nnx.Module):
         return self._after(x, self.attention.attend(q, k, v, causal=causal, mask=mask))
 
     def first(self, x: Array) -> Array:
-        """Return `__call__` for the first token of each row, (B, D). Other tokens need only keys and values."""
+        """Return `__call__` for the first token of each row, (B, D).
+
+        Other tokens need only keys and values.
+        """
         one = x[:, :1]
         heads = self.attention.attend(*self._before(x, one), causal=False, mask=None)
         return self._after(one, heads)[:, 0]
@@ -255,7 +276,8 @@ def run_blocks(
     mask: Array | None = None,
     turn: Turn | None = None,
 ) -> Array:
-    """Send `x` (B, S, D) through stacked blocks by lax.scan, so that compile time does not grow with depth.
+    """Send `x` (B, S, D) through stacked blocks by lax.scan, so that compile time does not grow
+    with depth.
 
     `turn` changes queries and keys (B, S, H, D / H) in each block, by their places.
     """
@@ -268,7 +290,10 @@ def run_blocks(
 
 
 def read_blocks(blocks: Block, x: Array, *, remat: bool) -> Array:
-    """Return `run_blocks` for the first token of each row, (B, D). The last block skips the other tokens."""
+    """Return `run_blocks` for the first token of each row, (B, D).
+
+    The last block skips the other tokens.
+    """
 
     def end(x: Array, block: Block) -> Array:
         return block.first(x)
@@ -280,8 +305,9 @@ def read_blocks(blocks: Block, x: Array, *, remat: bool) -> Array:
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _but_last(blocks: Block, x: Array, remat: bool) -> Array:
     """Send `x` through all blocks but the last one."""
-    # Each takes its values out of the stack where it runs: blocks cut off before a scan are copied, which costs more
-    # than the last block does for a batch of one. A gradient through it would be added up whole, block by block.
+    # Each takes its values out of the stack where it runs: blocks cut off before a scan are copied,
+    # which costs more than the last block does for a batch of one. A gradient through it would be
+    # added up whole, block by block.
 
     def body(x: Array, number: Array) -> tuple[Array, None]:
         block = jax.tree.map(
@@ -292,7 +318,8 @@ def _but_last(blocks: Block, x: Array, remat: bool) -> Array:
     # an export's batch is a symbol
     steps = _depth(blocks) - 1
     is_one = isinstance(x.shape[0], int) and x.shape[0] == 1
-    # One touch by few blocks: with constant parameters nothing is taken out of the stack, and it takes a tenth less.
+    # One touch by few blocks: with constant parameters nothing is taken out of the stack, and it
+    # takes a tenth less.
     return jax.lax.scan(body, x, jnp.arange(steps), unroll=steps if is_one and steps < 12 else 1)[0]
 
 

@@ -29,7 +29,8 @@ from anytouch_jax.ops import tokens
 class TouchPatch(nnx.Module):
     """Patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias.
 
-    It is shared by all sensors, or each row of the sensor table has its own, (rows, frames, P*P*3, D).
+    It is shared by all sensors, or each row of the sensor table has its own, (rows, frames, P*P*3,
+    D).
     """
 
     def __init__(self, model: ModelConfig) -> None:
@@ -39,7 +40,10 @@ class TouchPatch(nnx.Module):
         self.dtype = jnp.dtype(model.dtype)
 
     def __call__(self, patches: Array, sensor: Array) -> Array:
-        """Project (B, K, T, P*P*3) to (B, K, D). A still is a clip of equal frames (Sec. 3.1): kernels are summed."""
+        """Project (B, K, T, P*P*3) to (B, K, D).
+
+        A still is a clip of equal frames (Sec. 3.1): kernels are summed.
+        """
         kernel = self.kernel[...]
         if patches.shape[2] == 1:
             kernel = reduce(jnp.add, jnp.moveaxis(kernel, -3, 0))[..., None, :, :]
@@ -73,7 +77,10 @@ class TouchEncoder(nnx.Module):
         self.remat = model.remat
 
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """Return the input sequence (B, 1 + S + K, D), before the first norm. Hidden patches are never projected."""
+        """Return the input sequence (B, 1 + S + K, D), before the first norm.
+
+        Hidden patches are never projected.
+        """
         patches = tokens.patchify(clip, self.patch_size)
         position = jnp.broadcast_to(
             self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape)
@@ -103,9 +110,11 @@ class TouchEncoder(nnx.Module):
         return run_blocks(self.blocks, x, remat=self.remat)
 
     def states(self, clip: Array, sensor: Array, count: int) -> Array:
-        """Return `count` hidden states, evenly spaced from the first block's input to the last block's output.
+        """Return `count` hidden states, evenly spaced from the first block's input to the last
+        block's output.
 
-        They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT, Ranftl et al. 2021).
+        They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT,
+        Ranftl et al. 2021).
         """
         x = self._first(clip, sensor)
         states = []
@@ -122,17 +131,23 @@ class TouchEncoder(nnx.Module):
         return jnp.concatenate(states, axis=-1)
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """Return the touch embedding (B, E) of all patches or of `keep_ids` (B, K), not normalised."""
+        """Return the touch embedding (B, E) of all patches or of `keep_ids` (B, K), not
+        normalised.
+        """
         x = self._first(clip, sensor, keep_ids)
         return self.embedding(read_blocks(self.blocks, x, remat=self.remat))
 
     def embedding(self, token: Array) -> Array:
-        """Return the touch embedding (B, E) from the last hidden state of the class token (B, D)."""
+        """Return the touch embedding (B, E) from the last hidden state of the class token (B,
+        D).
+        """
         return self.projection(self.post_norm(token))
 
 
 class TouchDecoder(nnx.Module):
-    """Light ViT that predicts every position from the visible ones, with a head for stills and one for clips."""
+    """Light ViT that predicts every position from the visible ones, with a head for stills and one
+    for clips.
+    """
 
     def __init__(self, model: ModelConfig) -> None:
         width = model.decoder.width
@@ -152,7 +167,10 @@ class TouchDecoder(nnx.Module):
     def __call__(
         self, latent: Array, restore_ids: Array, frames: int, sensor_tokens: Array | None = None
     ) -> Array:
-        """Return pixels (B, N, frames, P*P*3) of (B, 1 + S + K, E). `sensor_tokens` (B, S, D) replace encoded ones."""
+        """Return pixels (B, N, frames, P*P*3) of (B, 1 + S + K, E).
+
+        `sensor_tokens` (B, S, D) replace encoded ones.
+        """
         x = self.embed(latent)
         position = self.position[...].astype(x.dtype)
         start = x[:, :1] + position[None, :1]
@@ -170,7 +188,10 @@ class TouchDecoder(nnx.Module):
         return self.pixels(x, frames)
 
     def pixels(self, x: Array, frames: int) -> Array:
-        """Return (B, N, frames, P*P*3) of (B, N, Dd). Only the frames that the loss reads are computed."""
+        """Return (B, N, frames, P*P*3) of (B, N, Dd).
+
+        Only the frames that the loss reads are computed.
+        """
         if frames == 1:
             return self.still_head(x)[:, :, None]
         size = self.still_head.kernel.shape[1]

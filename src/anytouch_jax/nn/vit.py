@@ -1,4 +1,6 @@
-"""Plain vision transformers, in the forms of other tactile encoders and of DINOv2, DINOv3, SigLIP, MAE and DeiT."""
+"""Plain vision transformers, in the forms of other tactile encoders and of DINOv2, DINOv3, SigLIP,
+MAE and DeiT.
+"""
 
 from __future__ import annotations
 
@@ -35,11 +37,13 @@ Resample = Literal["none", "bicubic", "shifted", "antialias"]
 
 @dataclass(frozen=True)
 class VitConfig:
-    """The form of a plain ViT: what `model` (widths, patch, frames, sensors, epsilon, arithmetic) does not say.
+    """The form of a plain ViT: what `model` (widths, patch, frames, sensors, epsilon, arithmetic)
+    does not say.
 
-    The sequence is [class, registers, sensor tokens, patches, calibration patches]. The patches are in the order (time,
-    row, column). `grid` is (time, rows, columns) of the stored positions. `resample` fits them to other images. It is
-    torch's bicubic filter, the same with the scale (new + 0.1) / old of DINOv2's authors, or with antialiasing.
+    The sequence is [class, registers, sensor tokens, patches, calibration patches]. The patches are
+    in the order (time, row, column). `grid` is (time, rows, columns) of the stored positions.
+    `resample` fits them to other images. It is torch's bicubic filter, the same with the scale (new
+    + 0.1) / old of DINOv2's authors, or with antialiasing.
     """
 
     model: ModelConfig
@@ -70,7 +74,9 @@ class VitConfig:
 
 
 class VitOutput(NamedTuple):
-    """Tokens (B, S, D) without those of calibration: before the trunk, after the last block, normed, projected."""
+    """Tokens (B, S, D) without those of calibration: before the trunk, after the last block,
+    normed, projected.
+    """
 
     encoded: Array
     hidden: Array
@@ -89,7 +95,9 @@ class LayerScale(nnx.Module):
 
 
 class ScaledBlock(Block):
-    """A block whose two branches are scaled (Touvron et al., 2021, "Going deeper with image transformers")."""
+    """A block whose two branches are scaled (Touvron et al., 2021, "Going deeper with image
+    transformers").
+    """
 
     def __init__(self, stack, model, eps, act) -> None:  # type: ignore[no-untyped-def]
         super().__init__(stack, model, eps, act)
@@ -180,7 +188,8 @@ class Vit(nnx.Module):
     def __call__(self, clip: Array, sensor: Array, calibration: Array | None = None) -> VitOutput:
         """Return the tokens of prepared clips (B, T, H, W, 3) of sensor rows (B,).
 
-        `calibration` (C, H, W, 3) are the prepared calibration images. T is a multiple of the tubelet.
+        `calibration` (C, H, W, 3) are the prepared calibration images. T is a multiple of the
+        tubelet.
         """
         form, remat = self.form, self.form.model.remat
         x = self.patch(clip)
@@ -221,7 +230,9 @@ class Vit(nnx.Module):
         return VitOutput(encoded, hidden, normed, normed if last is None else last(normed))
 
     def _angles(self, grid: tuple[int, ...]) -> Array:
-        """Return the angles f32 (N, D / H / 2) of patches: 2 pi by their places in -1..1, over the periods."""
+        """Return the angles f32 (N, D / H / 2) of patches: 2 pi by their places in -1..1, over the
+        periods.
+        """
         assert self.periods is not None
         axes = [(np.arange(side, dtype=np.float32) + 0.5) / side * 2 - 1 for side in grid[1:]]
         places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2, 1)
@@ -230,7 +241,9 @@ class Vit(nnx.Module):
         )
 
     def _positions(self, grid: tuple[int, ...]) -> Array:
-        """Return positions of a grid (time, rows, columns), after that of the class token if they are stored."""
+        """Return positions of a grid (time, rows, columns), after that of the class token if they
+        are stored.
+        """
         if (
             self.frequency is not None
         ):  # per axis [sines, cosines] of whole coordinates, cut at the width
@@ -267,7 +280,9 @@ class Vit(nnx.Module):
 
 
 def _turned(x: Array, angles: Array) -> Array:
-    """Return queries or keys (B, S, H, D) of which the last N tokens are turned by angles (N, D / 2)."""
+    """Return queries or keys (B, S, H, D) of which the last N tokens are turned by angles (N, D /
+    2).
+    """
     first, patches = jnp.split(x, [x.shape[1] - len(angles)], axis=1)
     cos, sin = (wave(angles)[None, :, None].astype(x.dtype) for wave in (jnp.cos, jnp.sin))
     one, two = jnp.split(patches, 2, axis=-1)

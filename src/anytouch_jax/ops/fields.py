@@ -16,11 +16,14 @@ TORQUE = 0.002
 
 
 class FieldOutput(NamedTuple):
-    """Fields (B, h, w) at half the picture's resolution. `*_log` are logarithms of Laplace deviations.
+    """Fields (B, h, w) at half the picture's resolution.
 
-    `depth`, `shear` (..., 2) along x and y of the picture, `pressure` over the gel's modulus. `contact` are logits.
-    `force` (B, 3): tangential x and y and normal, over modulus times width squared. `torque` (B,) over modulus times
-    width cubed. `slip` (B,) logits of the share of the contact that slides.
+    `*_log` are logarithms of Laplace deviations.
+
+    `depth`, `shear` (..., 2) along x and y of the picture, `pressure` over the gel's modulus.
+    `contact` are logits. `force` (B, 3): tangential x and y and normal, over modulus times width
+    squared. `torque` (B,) over modulus times width cubed. `slip` (B,) logits of the share of the
+    contact that slides.
     """
 
     depth: Array

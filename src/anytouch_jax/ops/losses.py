@@ -1,6 +1,9 @@
-"""Losses of the paper as pure functions. All arithmetic is in float32 or wider, whatever the inputs are.
+"""Losses of the paper as pure functions.
 
-B batch, N positions, T frames, C values of a patch, E embedding width. Arrays may be numpy's, lists or numbers.
+All arithmetic is in float32 or wider, whatever the inputs are.
+
+B batch, N positions, T frames, C values of a patch, E embedding width. Arrays may be numpy's, lists
+or numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +21,10 @@ MOST_SCALE = 100.0  # 1 / tau, as CLIP (Radford et al., 2021, Sec. 2.5)
 
 
 def _wide(*values: ArrayLike) -> list[Array]:
-    """Return arrays of one float type: float64 if a value has it, else float32. A Python number has no type."""
+    """Return arrays of one float type: float64 if a value has it, else float32.
+
+    A Python number has no type.
+    """
     arrays = [jnp.asarray(value) for value in values]
     pairs = zip(values, arrays, strict=True)
     is_double = any(x.dtype == jnp.float64 and not isinstance(value, float) for value, x in pairs)
@@ -34,7 +40,8 @@ def mean(values: Array, count: Array | int | None = None) -> Array:
 def row_sums(x: Array) -> Array:
     """Return the sums (..., 1) of x (..., N) over its last axis.
 
-    On a CPU it is a product with ones. XLA fuses what makes `x` into a product, but writes `x` to memory for a sum.
+    On a CPU it is a product with ones. XLA fuses what makes `x` into a product, but writes `x` to
+    memory for a sum.
     """
     if jax.default_backend() != "cpu":
         return jnp.sum(x, axis=-1, keepdims=True)
@@ -53,10 +60,11 @@ def _equal_shapes(**arrays: Array) -> None:
 
 
 def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
-    """Divide vectors (..., E) by their Euclidean length, or by `eps` if that is larger, as PyTorch's `normalize`.
+    """Divide vectors (..., E) by their Euclidean length, or by `eps` if that is larger, as
+    PyTorch's `normalize`.
 
-    A power of two, which changes no digit, brings `x` to order one before it is squared: a length of 1e-7 or 1e20 is
-    right too. The gradient at zero is 1 / eps.
+    A power of two, which changes no digit, brings `x` to order one before it is squared: a length
+    of 1e-7 or 1e20 is right too. The gradient at zero is 1 / eps.
     """
     (x,) = _wide(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=eps))
@@ -67,7 +75,9 @@ def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
 
 
 def normalise_patches(patches: ArrayLike) -> Array:
-    """Bring each patch (..., C) to zero mean and unit *unbiased* variance (MAE's `norm_pix_loss`, golden Q6)."""
+    """Bring each patch (..., C) to zero mean and unit *unbiased* variance (MAE's `norm_pix_loss`,
+    golden Q6).
+    """
     (patches,) = _wide(patches)
     centred = patches - jnp.mean(patches, axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1, keepdims=True) / max(patches.shape[-1] - 1, 1)
@@ -77,12 +87,14 @@ def normalise_patches(patches: ArrayLike) -> Array:
 def reconstruction_loss(
     pred: ArrayLike, target: ArrayLike, hidden: ArrayLike, *, next_frame: bool
 ) -> tuple[Array, Metrics]:
-    """Return the loss of masked reconstruction and next-frame prediction (Eq. 1, 2), summed as in Eq. 8.
+    """Return the loss of masked reconstruction and next-frame prediction (Eq. 1, 2), summed as in
+    Eq. 8.
 
-    `pred`, `target` (B, N, T, C); `hidden` (B, N) True on masked positions. With `next_frame` the last of the T
-    frames is the future one: it counts on every position, the others on the hidden positions only. What does not count
-    may be garbage. Returns the sum and {"reconstruction", "next_frame"}. A batch with nothing hidden has a
-    reconstruction loss of 0. Raises ValueError for shapes that do not fit, and for a next frame without another.
+    `pred`, `target` (B, N, T, C); `hidden` (B, N) True on masked positions. With `next_frame` the
+    last of the T frames is the future one: it counts on every position, the others on the hidden
+    positions only. What does not count may be garbage. Returns the sum and {"reconstruction",
+    "next_frame"}. A batch with nothing hidden has a reconstruction loss of 0. Raises ValueError for
+    shapes that do not fit, and for a next frame without another.
     """
     (pred, target) = _wide(pred, target)
     hidden = jnp.asarray(hidden, bool)
@@ -113,13 +125,15 @@ def info_nce(
     groups: int = 1,
     place: ArrayLike | None = None,
 ) -> Array:
-    """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3), a scalar.
+    """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3),
+    a scalar.
 
-    `scale` is 1 / tau, and counts as 100 beyond 100. A row is present where `present` is not 0. Absent rows are neither
-    anchors nor negatives and may hold garbage; fewer than one pair gives 0. With `groups` > 1 the batch is cut in that
-    many shares, as by the devices of the release. Negatives come from a row's share, and the mean is over all shares.
-    Rows of one `place` i32 (B,) are no negatives of each other. Raises ValueError for shapes that do not fit, and for
-    groups of unequal size.
+    `scale` is 1 / tau, and counts as 100 beyond 100. A row is present where `present` is not 0.
+    Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair gives 0.
+    With `groups` > 1 the batch is cut in that many shares, as by the devices of the release.
+    Negatives come from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,)
+    are no negatives of each other. Raises ValueError for shapes that do not fit, and for groups of
+    unequal size.
     """
     (a, b, scale) = _wide(a, b, scale)
     present = jnp.asarray(present, bool)
@@ -136,7 +150,8 @@ def info_nce(
     scale = scale * jax.lax.stop_gradient(jnp.where(scale > MOST_SCALE, MOST_SCALE / scale, 1.0))
     present = present.reshape(groups, rows // groups)
     a, b = (jnp.where(present[..., None], x.reshape(*present.shape, width), 0.0) for x in (a, b))
-    # The factor is up to 100: the reduced precision that accelerators use by default would show in the loss.
+    # The factor is up to 100: the reduced precision that accelerators use by default would show in
+    # the loss.
     logits = scale * jnp.einsum("gie,gje->gij", a, b, precision=jax.lax.Precision.HIGHEST)
     rivals = present[:, None, :]
     if place is not None:
@@ -152,9 +167,11 @@ def info_nce(
 
 
 def centered(x: ArrayLike, present: ArrayLike) -> Array:
-    """Return unit vectors (B, E): `x` minus its mean over the rows that are `present` (B,) bool; others are 0.
+    """Return unit vectors (B, E): `x` minus its mean over the rows that are `present` (B,) bool;
+    others are 0.
 
-    Not in the paper. A vector within 0.001 of the mean stays shorter than 1: such a spread is rounding.
+    Not in the paper. A vector within 0.001 of the mean stays shorter than 1: such a spread is
+    rounding.
     """
     (x,) = _wide(x)
     present = jnp.asarray(present, bool)[:, None]
@@ -177,11 +194,12 @@ def alignment_loss(
 ) -> tuple[Array, Metrics]:
     """Return the loss of joint alignment of touch, vision and text with missing modalities (Eq. 4).
 
-    `touch`, `image`, `text` (B, E) of unit length; `has_image`, `has_text` (B,) bool; `weights` are the factors of
-    the pairs (touch-vision, touch-text, vision-text) on the sum of both directions. A modality that is None is
-    absent from the whole batch. `center` subtracts each modality's batch mean first. Untrained towers share one large
-    direction, and without this the loss falls by growing it until all embeddings are equal. Returns the loss, its six
-    terms and the number of pairs of each kind. Raises ValueError for shapes that do not fit.
+    `touch`, `image`, `text` (B, E) of unit length; `has_image`, `has_text` (B,) bool; `weights` are
+    the factors of the pairs (touch-vision, touch-text, vision-text) on the sum of both directions.
+    A modality that is None is absent from the whole batch. `center` subtracts each modality's batch
+    mean first. Untrained towers share one large direction, and without this the loss falls by
+    growing it until all embeddings are equal. Returns the loss, its six terms and the number of
+    pairs of each kind. Raises ValueError for shapes that do not fit.
     """
     everyone = jnp.ones(len(jnp.asarray(touch)), bool)
     given = {"touch": (touch, None), "vision": (image, has_image), "text": (text, has_text)}
@@ -194,7 +212,8 @@ def alignment_loss(
         z = {name: (centered(x, has), has) for name, (x, has) in z.items()}
     if len(weights) != 3:
         raise ValueError(
-            f"weights are three factors, of touch-vision, touch-text and vision-text, not {len(weights)}"
+            "weights are three factors, of touch-vision, touch-text and vision-text, not "
+            f"{len(weights)}"
         )
     scale, *weights = _wide(scale, *weights)
     total = jnp.zeros((), _wide(touch)[0].dtype)
@@ -227,9 +246,10 @@ def contrast_loss(
 ) -> tuple[Array, Array]:
     """InfoNCE matching between the two unit-norm touches (B, E) of each pair. Not in the paper.
 
-    All other places of the batch are negatives, up to 2 B - 2 for each pair instead of one. `place` i32 (B,) is equal
-    for pairs of one place; None means that no two are. Returns the mean of both directions, and the share of `first`
-    whose nearest `second` is of its place. Raises ValueError as `info_nce`.
+    All other places of the batch are negatives, up to 2 B - 2 for each pair instead of one. `place`
+    i32 (B,) is equal for pairs of one place; None means that no two are. Returns the mean of both
+    directions, and the share of `first` whose nearest `second` is of its place. Raises ValueError
+    as `info_nce`.
     """
     first, second, scale = _wide(first, second, scale)
     everyone = jnp.ones(len(first), bool)
@@ -242,7 +262,8 @@ def contrast_loss(
 
 
 def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array:
-    """Return the binary cross-entropy of matching from logits (B,), each kind averaged over the batch (Eq. 6).
+    """Return the binary cross-entropy of matching from logits (B,), each kind averaged over the
+    batch (Eq. 6).
 
     Without pairs it is 0.
     """
@@ -251,7 +272,8 @@ def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array
 
 
 def laplace_loss(error: ArrayLike, log_scale: ArrayLike) -> Array:
-    """Return the negative log likelihood of errors under Laplace deviations exp(`log_scale`), element-wise.
+    """Return the negative log likelihood of errors under Laplace deviations exp(`log_scale`),
+    element-wise.
 
     The logarithm is bent smoothly into -5..5, so that no deviation vanishes or explodes.
     """

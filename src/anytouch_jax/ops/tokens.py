@@ -1,7 +1,8 @@
-"""Images and clips as token sequences: patches, position tables, segments, sensor tokens (Sec. 3.1, 3.5), masking.
+"""Images and clips as token sequences: patches, position tables, segments, sensor tokens (Sec. 3.1,
+3.5), masking.
 
-B batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, K kept ones, D width. Masking is random
-(Sec. 3.2; He et al., 2022). Arrays may be numpy's, lists or numbers.
+B batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, K kept ones, D width.
+Masking is random (Sec. 3.2; He et al., 2022). Arrays may be numpy's, lists or numbers.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from jax.typing import ArrayLike
 
 
 def patchify(clip: ArrayLike, patch: int) -> Array:
-    """Cut `clip` (B, T, H, W, C) into patch vectors (B, N, T, P*P*C), each in the order (row, col, colour).
+    """Cut `clip` (B, T, H, W, C) into patch vectors (B, N, T, P*P*C), each in the order (row, col,
+    colour).
 
     Raises ValueError for another shape, and when H or W is no multiple of `patch`.
     """
@@ -50,14 +52,16 @@ def _shape(x: Array, name: str, axes: str) -> tuple[int, ...]:
 
 
 def sincos_table(width: int, grid: int) -> Array:
-    """Fixed 2-D sine-cosine positions (1 + grid^2, width); row 0, the class token's, is zero (MAE, golden I).
+    """Fixed 2-D sine-cosine positions (1 + grid^2, width); row 0, the class token's, is zero (MAE,
+    golden I).
 
     The first half of the channels encodes the column, the second the row, each as [sin | cos].
     Raises ValueError when `width` is no multiple of 4, or `grid` is negative.
     """
     if width < 4 or width % 4 or grid < 0:
         raise ValueError(
-            f"a sine-cosine table needs a width that is a multiple of 4, not {width}, and a grid of 0 or more"
+            f"a sine-cosine table needs a width that is a multiple of 4, not {width}, and a grid "
+            "of 0 or more"
         )
     frequency = 10000.0 ** (-jnp.arange(width // 4) / (width // 4))
     angle = jnp.arange(grid, dtype=frequency.dtype)[:, None] * frequency[None, :]
@@ -70,24 +74,28 @@ def sincos_table(width: int, grid: int) -> Array:
 
 
 def segments(clip: ArrayLike, frames: int) -> Array:
-    """Cut a long clip (B, T, ...) into S = ceil(T / frames) segments (B, S, frames, ...) (App. "frame number").
+    """Cut a long clip (B, T, ...) into S = ceil(T / frames) segments (B, S, frames, ...) (App.
 
-    The last segment ends with the last frame, so it overlaps its neighbour when T is no multiple of `frames`.
-    Raises ValueError when T is smaller than `frames`, or `frames` below 1.
+    "frame number").
+
+    The last segment ends with the last frame, so it overlaps its neighbour when T is no multiple of
+    `frames`. Raises ValueError when T is smaller than `frames`, or `frames` below 1.
     """
     total = (clip := jnp.asarray(clip)).shape[1]
     if frames < 1:
         raise ValueError(f"a segment has 1 frame or more, not {frames}")
     if total < frames:
         raise ValueError(
-            f"a clip of {total} frames is shorter than a segment of {frames}; use a still or a longer clip"
+            f"a clip of {total} frames is shorter than a segment of {frames}; use a still or a "
+            "longer clip"
         )
     starts = [min(start, total - frames) for start in range(0, total, frames)]
     return jnp.stack([clip[:, start : start + frames] for start in starts], axis=1)
 
 
 def universal_probability(progress: ArrayLike, start: float, end: float) -> Array:
-    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0 to 0.75).
+    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0
+    to 0.75).
 
     Before 0 and after 1 it stays where it is.
     """
@@ -97,7 +105,8 @@ def universal_probability(progress: ArrayLike, start: float, end: float) -> Arra
 def draw_tokens(
     sensor: ArrayLike, uniform: ArrayLike, probability: ArrayLike, universal_row: int
 ) -> Array:
-    """Replace a sensor's row by the universal one where `uniform` < p_u: i ~ Bernoulli(p_u) (Eq. 7).
+    """Replace a sensor's row by the universal one where `uniform` < p_u: i ~ Bernoulli(p_u) (Eq.
+    7).
 
     `sensor` i32 (B,), `uniform` (B,) in [0, 1). Returns rows i32 (B,) of the sensor-token table.
     """
@@ -106,13 +115,15 @@ def draw_tokens(
 
 
 def count_visible(positions: int, ratio: float) -> int:
-    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the release.
+    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the
+    release.
 
     Raises ValueError for a negative number, and for a ratio outside 0 to 1.
     """
     if positions < 0 or not 0 <= ratio <= 1:
         raise ValueError(
-            f"a share between 0 and 1 of 0 or more positions stays visible, not {ratio} of {positions}"
+            f"a share between 0 and 1 of 0 or more positions stays visible, not {ratio} of "
+            f"{positions}"
         )
     return int(positions * ratio)
 
@@ -120,9 +131,10 @@ def count_visible(positions: int, ratio: float) -> int:
 def random_mask(noise: ArrayLike, keep: int) -> tuple[Array, Array, Array]:
     """Keep the `keep` positions of smallest noise, each sample by its own row of `noise` (B, N).
 
-    Returns keep_ids (B, K) in ascending order of noise, restore_ids (B, N), and hidden (B, N). Position n is element
-    restore_ids[n] of [visible, hidden]. `hidden` is True where a position was removed (Omega_M of Eq. 1). Raises
-    ValueError for a number of positions to keep that is not 0 to N.
+    Returns keep_ids (B, K) in ascending order of noise, restore_ids (B, N), and hidden (B, N).
+    Position n is element restore_ids[n] of [visible, hidden]. `hidden` is True where a position was
+    removed (Omega_M of Eq. 1). Raises ValueError for a number of positions to keep that is not 0 to
+    N.
     """
     _, count = _shape(noise := jnp.asarray(noise), "noise", "B N")
     if not 0 <= keep <= count:
@@ -133,7 +145,9 @@ def random_mask(noise: ArrayLike, keep: int) -> tuple[Array, Array, Array]:
 
 
 def keep(x: ArrayLike, keep_ids: ArrayLike) -> Array:
-    """Return the positions `keep_ids` i32 (B, K) of `x` (B, N, ...), as (B, K, ...) (He et al., 2022)."""
+    """Return the positions `keep_ids` i32 (B, K) of `x` (B, N, ...), as (B, K, ...) (He et al.,
+    2022).
+    """
     x = jnp.asarray(x)
     keep_ids = jnp.asarray(keep_ids)
     ids = keep_ids.reshape(keep_ids.shape + (1,) * (x.ndim - 2))
@@ -141,7 +155,8 @@ def keep(x: ArrayLike, keep_ids: ArrayLike) -> Array:
 
 
 def restore(visible: ArrayLike, mask_token: ArrayLike, restore_ids: ArrayLike) -> Array:
-    """Put `visible` (B, K, D) back to its positions and the mask token (D,) everywhere else: (B, N, D).
+    """Put `visible` (B, K, D) back to its positions and the mask token (D,) everywhere else: (B, N,
+    D).
 
     Raises ValueError for more visible positions than there are.
     """

@@ -1,7 +1,8 @@
 """Simulated data sets on disk: images, fields, photographs and a manifest.
 
-A group's files are written first, then its table in `parts/`. When all parts exist they become `manifest.parquet` in
-one rename. A folder without it is unfinished, and the same command continues it.
+A group's files are written first, then its table in `parts/`. When all parts exist they become
+`manifest.parquet` in one rename. A folder without it is unfinished, and the same command continues
+it.
 """
 
 import dataclasses
@@ -47,7 +48,8 @@ def simulate(
 ) -> Path:
     """Simulate `scenes` into the folder `out`, or continue there, and return the manifest's path.
 
-    A seed gives the same bytes on the same machine. Raises UserError if `out` has other contents or cannot be written.
+    A seed gives the same bytes on the same machine. Raises UserError if `out` has other contents or
+    cannot be written.
     """
     # pyarrow reads a leading ~ and a colon in its own way
     out = Path(out).expanduser().resolve()
@@ -67,7 +69,8 @@ def simulate(
         raise UserError(f"{error.filename or out} is a file; give a folder") from None
     except OSError as error:
         raise UserError(
-            f"{error.filename or out}: {error.strerror or error}; finished touches are kept, repeat to continue"
+            f"{error.filename or out}: {error.strerror or error}; finished touches are kept, "
+            "repeat to continue"
         ) from None
 
 
@@ -92,7 +95,8 @@ def _simulate(
     done = sum(len(group) for group, file in zip(groups, files, strict=True) if file in finished)
     progress(done, scenes.touches)
     recorder = Recorder(scenes, things, GROUP)
-    # Two sensors at a time: the small operations of a program leave a core idle, and compilation takes one core.
+    # Two sensors at a time: the small operations of a program leave a core idle, and compilation
+    # takes one core.
     with ThreadPoolExecutor(threads) as pool, ThreadPoolExecutor(min(2, threads)) as solving:
         for group, file in zip(groups, files, strict=True):
             if file in finished:
@@ -138,7 +142,8 @@ def _claim(scenes: Scenes, out: Path) -> None:
         if not changes:
             return
         raise UserError(
-            f"{out} holds a data set with {'; '.join(changes)}: give another folder, or the same options"
+            f"{out} holds a data set with {'; '.join(changes)}: give another folder, or the same "
+            "options"
         )
     if out.is_dir() and any(path.name != f"{SETTINGS}.tmp" for path in out.iterdir()):
         raise UserError(f"{out} is not empty and holds no simulated data set: give another folder")
@@ -246,7 +251,10 @@ def _write_table(rows: list[Row], file: Path) -> None:
 
 
 def _is_readable(part: Path) -> bool:
-    """Return whether a part exists and can be read. A power cut may leave a name without its bytes."""
+    """Return whether a part exists and can be read.
+
+    A power cut may leave a name without its bytes.
+    """
     try:
         return part.exists() and pq.read_metadata(part).num_rows > 0
     except (pa.ArrowException, OSError):

@@ -1,6 +1,7 @@
 """Random draws of the simulator: one description of a distribution serves numpy and JAX.
 
-A distribution is a function of an `Rng`: a numpy generator, or `Draws` from a JAX key inside a compiled program.
+A distribution is a function of an `Rng`: a numpy generator, or `Draws` from a JAX key inside a
+compiled program.
 """
 
 import math
@@ -18,8 +19,8 @@ from scipy.stats import gamma as gamma_distribution
 class Draws:
     """Draws from a JAX key, by those methods of `numpy.random.Generator` that the simulator uses.
 
-    All values are parts of one block of uniform and one of normal numbers: a program with a random call for each value
-    takes minutes to compile. Raises ValueError after `most` values of a kind.
+    All values are parts of one block of uniform and one of normal numbers: a program with a random
+    call for each value takes minutes to compile. Raises ValueError after `most` values of a kind.
     """
 
     def __init__(self, key: jax.Array, most: int = 64) -> None:
@@ -65,7 +66,10 @@ class Draws:
         return self.uniform()
 
     def integers(self, low: int, high: int | None = None) -> jax.Array:
-        """Return an integer from low to high - 1, or from 0 to low - 1. At most 2**23 values are distinct."""
+        """Return an integer from low to high - 1, or from 0 to low - 1.
+
+        At most 2**23 values are distinct.
+        """
         low, high = (0, low) if high is None else (low, high)
         return jnp.minimum(low + (self.uniform() * (high - low)).astype(jnp.int32), high - 1)
 

@@ -1,8 +1,9 @@
 """Endless touch: simulated touches as a pure function of a key, for training without a data set.
 
-A `World` holds what is drawn once: height maps, materials and the families of sensors. `sample_touches` draws touches
-from it inside a compiled program, with the distributions of `scene` and `sensors`. All camera sensors share one
-program: they are solved on one square grid and shown at one size, as `encoder.preprocess` shows a real picture.
+A `World` holds what is drawn once: height maps, materials and the families of sensors.
+`sample_touches` draws touches from it inside a compiled program, with the distributions of `scene`
+and `sensors`. All camera sensors share one program: they are solved on one square grid and shown at
+one size, as `encoder.preprocess` shows a real picture.
 """
 
 from __future__ import annotations
@@ -90,10 +91,10 @@ class World(NamedTuple):
 class Sampling:
     """What to sample: clips of `frames` frames of `size` pixels, by `takes` sensors for each touch.
 
-    `coarse` is the share of touches at which every sensor touches as by hand. `free` is the share of takes without
-    contact, `vision` the share of touches at a photographed place. `wild` is the share of takes
-    by a sensor that mixes two families, with other lights and markers. The `fields` of `recorder.simulate_clip` are of
-    the last frame, at `field_size` pixels.
+    `coarse` is the share of touches at which every sensor touches as by hand. `free` is the share
+    of takes without contact, `vision` the share of touches at a photographed place. `wild` is the
+    share of takes by a sensor that mixes two families, with other lights and markers. The `fields`
+    of `recorder.simulate_clip` are of the last frame, at `field_size` pixels.
     """
 
     frames: int = 1
@@ -125,7 +126,10 @@ class SimulatedTouches(NamedTuple):
 
 
 class DrawnTouches(NamedTuple):
-    """What is simulated for touches of B places by M takes each. `sensor`, `object` and `photo` are as above."""
+    """What is simulated for touches of B places by M takes each.
+
+    `sensor`, `object` and `photo` are as above.
+    """
 
     sensor: Any
     object: Any
@@ -162,7 +166,9 @@ def family(sensor: Sensor) -> SensorFamily:
 
 
 def untouched(sensor: Sensor) -> np.ndarray:
-    """Return the untouched gels of a sensor as f32 (MOST_BASES, 40, 40, 3) in 0..1, black where there are fewer."""
+    """Return the untouched gels of a sensor as f32 (MOST_BASES, 40, 40, 3) in 0..1, black where
+    there are fewer.
+    """
     real = bases(sensor)[:MOST_BASES]
     gels = np.zeros((MOST_BASES, _BASE, _BASE, 3), np.float32)
     rows, columns = (np.rint(np.linspace(0, n - 1, _BASE)).astype(int) for n in real.shape[1:3])
@@ -195,9 +201,11 @@ def as_sensor(numbers: SensorFamily) -> Sensor:
 def objects_of(
     scenes: Scenes, split: Literal["train", "val", "test"] = "train", *, variants: int = 1
 ) -> tuple[Object, ...]:
-    """Return the objects of a split of `scenes`, and `variants` - 1 more of each kind, with other sizes and phases.
+    """Return the objects of a split of `scenes`, and `variants` - 1 more of each kind, with other
+    sizes and phases.
 
-    So kinds that are held out never occur in another split. Raises UserError for a split without objects.
+    So kinds that are held out never occur in another split. Raises UserError for a split without
+    objects.
     """
     things, splits = objects_and_splits(scenes)
     own = [thing for thing, name in zip(things, splits, strict=True) if name == split]
@@ -223,7 +231,10 @@ def objects_of(
 def make_world(
     things: Sequence[Object], sensors: Sequence[str] = CAMERAS, *, places: int = 1, seed: int = 0
 ) -> World:
-    """Return the world of these objects and sensors, as numpy arrays. `places` of each object can be photographed."""
+    """Return the world of these objects and sensors, as numpy arrays.
+
+    `places` of each object can be photographed.
+    """
     reliefs = over_cores(
         partial(shapes.relief, pixels=RELIEF, pitch=SPACING), [thing.shape for thing in things]
     )
@@ -246,7 +257,9 @@ def make_world(
 
 
 def over_cores(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Return `work` of every item, by threads: numpy and OpenCV leave the interpreter free for most of the time."""
+    """Return `work` of every item, by threads: numpy and OpenCV leave the interpreter free for most
+    of the time.
+    """
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(work, items))
 
@@ -256,7 +269,8 @@ def sample_touches(
 ) -> SimulatedTouches:
     """Return `count` touches drawn from `key`. `sampling` and `count` are static under jit.
 
-    The second take is by the family `gallery`, if given. A key gives the same touches on one machine.
+    The second take is by the family `gallery`, if given. A key gives the same touches on one
+    machine.
     """
     return simulate_drawn(draw_touches(key, world, sampling, count, gallery), sampling)
 
@@ -293,7 +307,9 @@ def draw_touches(
 def _simulate_take(
     clip: ClipInput, numbers: SensorFamily, pitch: Array, sampling: Sampling
 ) -> ClipOutput:
-    """Return the simulated clip of one take by a sensor of these numbers, on a grid of `pitch` mm."""
+    """Return the simulated clip of one take by a sensor of these numbers, on a grid of `pitch`
+    mm.
+    """
     side = (sampling.field_size, sampling.field_size)
     view = View((GRID, GRID), pitch, (sampling.size, sampling.size), numbers.photometry, True, side)
     return simulate_clip(
@@ -374,7 +390,9 @@ def _draw(key: Array, world: World, sampling: Sampling, gallery: Array | None) -
 
 
 def _cropped(rng: Draws) -> Array:
-    """Return the share (2,) of the field's height and width that is shown: a camera may cut one side."""
+    """Return the share (2,) of the field's height and width that is shown: a camera may cut one
+    side.
+    """
     share = jnp.where(rng.uniform() < 0.5, rng.uniform(0.7, 1.0), 1.0)
     return (
         jnp.where(rng.uniform() < 0.5, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])) * (share - 1)
@@ -383,7 +401,9 @@ def _cropped(rng: Draws) -> Array:
 
 
 def wild(one: SensorFamily, other: SensorFamily, rng: Draws) -> SensorFamily:
-    """Return a family between two, with lights of other colours, and dots of another size, distance and ink."""
+    """Return a family between two, with lights of other colours, and dots of another size, distance
+    and ink.
+    """
     share = rng.uniform()
     mixed: SensorFamily = jax.tree.map(lambda a, b: share * a + (1 - share) * b, one, other)
     # lights that change places, or a side

@@ -1,7 +1,9 @@
-"""Interpolation of maps: matrices that resample, differentiate and blur along one axis, and cubic lookup at points.
+"""Interpolation of maps: matrices that resample, differentiate and blur along one axis, and cubic
+lookup at points.
 
-On a grid of some hundred points a matrix product beats gathers and short convolutions on a CPU, and one product can
-resample, blur and differentiate at once. Maps are (rows, columns). M @ map acts on rows, map @ M.T on columns.
+On a grid of some hundred points a matrix product beats gathers and short convolutions on a CPU, and
+one product can resample, blur and differentiate at once. Maps are (rows, columns). M @ map acts on
+rows, map @ M.T on columns.
 """
 
 import jax
@@ -11,10 +13,12 @@ import numpy.typing as npt
 
 
 def spline(positions: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    """Return matrices (n, count) of the cubic B-spline of `count` samples: value, and derivative per sample step.
+    """Return matrices (n, count) of the cubic B-spline of `count` samples: value, and derivative
+    per sample step.
 
-    `positions` (n,) are in samples, 0 in the middle of the first one. The last sample is repeated outside. The spline
-    does not interpolate. It smooths by 0.58 samples, as a skin does, and never overshoots.
+    `positions` (n,) are in samples, 0 in the middle of the first one. The last sample is repeated
+    outside. The spline does not interpolate. It smooths by 0.58 samples, as a skin does, and never
+    overshoots.
     """
     positions = jnp.clip(positions, 0.0, count - 1.0)
     knots = jnp.arange(-2.0, count + 2.0)
@@ -36,14 +40,20 @@ def _fold(matrix: jax.Array) -> jax.Array:
 
 
 def blur(count: int, sigma: float | jax.Array) -> jax.Array:
-    """Return a Gaussian blur (count, count) of `sigma` > 0 samples, which may be traced. Rows sum to one."""
+    """Return a Gaussian blur (count, count) of `sigma` > 0 samples, which may be traced.
+
+    Rows sum to one.
+    """
     place = jnp.arange(count, dtype=jnp.float32)
     kernel = jnp.exp(-0.5 * ((place[:, None] - place[None, :]) / sigma) ** 2)
     return kernel / kernel.sum(1, keepdims=True)
 
 
 def average(count: int, cells: int) -> npt.NDArray[np.float32]:
-    """Return the means (cells, count) over `cells` equal parts of `count` samples. Samples on a border are divided."""
+    """Return the means (cells, count) over `cells` equal parts of `count` samples.
+
+    Samples on a border are divided.
+    """
     left = np.arange(cells)[:, None] * count / cells
     overlap = np.minimum(left + count / cells, np.arange(count) + 1) - np.maximum(
         left, np.arange(count)
@@ -52,10 +62,12 @@ def average(count: int, cells: int) -> npt.NDArray[np.float32]:
 
 
 def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Return values of a centred `raster` (H, W) with `pitch` mm between pixels at `x`, `y` mm of equal shape.
+    """Return values of a centred `raster` (H, W) with `pitch` mm between pixels at `x`, `y` mm of
+    equal shape.
 
-    It is cubic (Catmull-Rom): exact at pixels, with continuous slopes between them. Outside of the raster and at NaN it
-    is the lowest value on the border. A point costs sixteen reads. A raster of half floats is read as float32.
+    It is cubic (Catmull-Rom): exact at pixels, with continuous slopes between them. Outside of the
+    raster and at NaN it is the lowest value on the border. A point costs sixteen reads. A raster of
+    half floats is read as float32.
     """
     rows, columns = raster.shape
     dtype = jnp.promote_types(raster.dtype, jnp.float32)

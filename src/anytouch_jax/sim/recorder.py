@@ -1,4 +1,6 @@
-"""Simulation of single touches and of recordings: surface under the gel, contact, shear and image, in one program."""
+"""Simulation of single touches and of recordings: surface under the gel, contact, shear and image,
+in one program.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -38,9 +40,10 @@ LEAST = 64  # with fidelity fast the grid has half the image's pixels, or as man
 class ClipInput(NamedTuple):
     """The inputs of a simulated clip with T frames. Every array may have a leading batch axis.
 
-    `relief` (RELIEF, RELIEF) mm is the object's height map with SPACING mm between pixels, and `place` (2,) mm the
-    touched place on it. `start`, `motion`, `depth` and `tilt` are as in `scene.Recording`. `modulus` is the object's
-    in kPa, `friction` that on the gel, `unit` the sensor unit, `drift` its light's, `seed` u32 the image noise's.
+    `relief` (RELIEF, RELIEF) mm is the object's height map with SPACING mm between pixels, and
+    `place` (2,) mm the touched place on it. `start`, `motion`, `depth` and `tilt` are as in
+    `scene.Recording`. `modulus` is the object's in kPa, `friction` that on the gel, `unit` the
+    sensor unit, `drift` its light's, `seed` u32 the image noise's.
     """
 
     relief: Any
@@ -61,18 +64,23 @@ class ClipOutput(NamedTuple):
 
     image: Any  # u8 (T, h, w, 3), or None for a field sensor
     background: Any  # u8 (h, w, 3), or None for a field sensor
-    # f32 (T, 20, 20, 6) mm and N of a field sensor, or (T, h, w, channels) of requested fields, or None
+    # f32 (T, 20, 20, 6) mm and N of a field sensor, or (T, h, w, channels) of requested fields, or
+    # None
     field: Any
-    # f32 (T,) each: normal force N, force_x and force_y N along the image, torque N mm about the centre of pressure,
-    # depth mm of the deepest point, area mm2, x and y mm of the pressure in the image, slip (share of the contact that
-    # slides). With fidelity exact also whether the solver converged.
+    # f32 (T,) each: normal force N, force_x and force_y N along the image, torque N mm about the
+    # centre of pressure, depth mm of the deepest point, area mm2, x and y mm of the pressure in the
+    # image, slip (share of the contact that slides). With fidelity exact also whether the solver
+    # converged.
     labels: dict[str, Any]
 
 
 def solve_grid(
     sensor: Sensor, size: int = 0, fidelity: Fidelity = "exact"
 ) -> tuple[tuple[int, int], float]:
-    """Return (rows, columns) of the solve grid over a sensor's field, and its pitch in mm. Its pixels are square."""
+    """Return (rows, columns) of the solve grid over a sensor's field, and its pitch in mm.
+
+    Its pixels are square.
+    """
     pitch = min(sensor.field) / (
         min(max(LEAST, size // 2), GRID) if fidelity == "fast" and size else GRID
     )
@@ -81,9 +89,12 @@ def solve_grid(
 
 
 def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
-    """Return heights (T, h, w) mm of the object under the gel's points `x`, `y` mm. The first contact is at 0.
+    """Return heights (T, h, w) mm of the object under the gel's points `x`, `y` mm.
 
-    The object turns and slides about the middle of the gel. Its tilt is that of the sensor in the hand.
+    The first contact is at 0.
+
+    The object turns and slides about the middle of the gel. Its tilt is that of the sensor in the
+    hand.
     """
     x, y = gel_to_object(clip.unit, x, y)
     frames = len(clip.motion)
@@ -96,8 +107,9 @@ def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
         z = interpolation.sample(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
         return z + clip.tilt[0] * x + clip.tilt[1] * y
 
-    # It has several users, and XLA would repeat the sixteen reads of a point for each of them, clips five times
-    # slower. It cannot look into a loop, but it removes one of a single step: so a still is two halves.
+    # It has several users, and XLA would repeat the sixteen reads of a point for each of them,
+    # clips five times slower. It cannot look into a loop, but it removes one of a single step: so a
+    # still is two halves.
     parts = (
         jnp.repeat(clip.motion, 2, 0),
         *(jnp.tile(at.reshape(halves), (frames, 1, 1)) for at in (x, y)),
@@ -107,16 +119,20 @@ def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
 
 
 def gel_motion(clip: ClipInput) -> Array:
-    """Return the motion (T, 3) mm, mm, rad of the object between frames in the gel's frame, first since the touch."""
+    """Return the motion (T, 3) mm, mm, rad of the object between frames in the gel's frame, first
+    since the touch.
+    """
     steps = jnp.diff(clip.motion, axis=0, prepend=jnp.zeros((1, 3)))
     return jnp.stack([*rotated(steps[:, 0], steps[:, 1], clip.unit.rotation), steps[:, 2]], 1)
 
 
 class View(NamedTuple):
-    """How a sensor is solved and shown: the grid (rows, columns), its `pitch` mm, and the image (height, width).
+    """How a sensor is solved and shown: the grid (rows, columns), its `pitch` mm, and the image
+    (height, width).
 
-    `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields` is the (height,
-    width) of the fields of the last frame. If it is None, all frames have fields, in the size of the image.
+    `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields`
+    is the (height, width) of the fields of the last frame. If it is None, all frames have fields,
+    in the size of the image.
     """
 
     grid: tuple[int, int]
@@ -136,10 +152,12 @@ def simulate_clip(
     fields: tuple[str, ...] = (),
     view: View | None = None,
 ) -> ClipOutput:
-    """Simulate one clip by `sensor`: contact of every frame, shear with its history, images and labels.
+    """Simulate one clip by `sensor`: contact of every frame, shear with its history, images and
+    labels.
 
-    `size` is the short side of the image in pixels, 0 for the sensor's resolution. `view` replaces the grid and the
-    image that follow from `size`. With it, the numbers of `sensor` may be traced, so that one program serves many.
+    `size` is the short side of the image in pixels, 0 for the sensor's resolution. `view` replaces
+    the grid and the image that follow from `size`. With it, the numbers of `sensor` may be traced,
+    so that one program serves many.
     """
     view = (
         View(*solve_grid(sensor, size, fidelity), optics.picture_size(sensor, size))
@@ -200,7 +218,9 @@ def _sheared(
     pitch: float,
     fidelity: Fidelity,
 ) -> shear.Shear:
-    """Return the tangential state of every frame, computed from the previous one, its motion on the coarse grid."""
+    """Return the tangential state of every frame, computed from the previous one, its motion on the
+    coarse grid.
+    """
 
     slide = partial(
         shear.shear_step,
@@ -244,7 +264,9 @@ def _labels(
 
 
 def _depth(clip: ClipInput, relief: Array) -> Array:
-    """Return the depth mm (T,) of the highest point under the gel, from `relief` (T, h, w): not that of the hand."""
+    """Return the depth mm (T,) of the highest point under the gel, from `relief` (T, h, w): not
+    that of the hand.
+    """
     return jnp.maximum(clip.depth + jnp.max(relief, axis=(1, 2)), 0)
 
 
@@ -254,7 +276,9 @@ def _fields(
     sheared: shear.Shear,
     onto_picture: Callable[..., Array],
 ) -> Array | None:
-    """Return the fields `names` at the image's pixels as channels: displacement mm, pressure kPa, shear (2) mm."""
+    """Return the fields `names` at the image's pixels as channels: displacement mm, pressure kPa,
+    shear (2) mm.
+    """
     compute = {
         "displacement": lambda: onto_picture(contact.displacement[..., None]),
         "pressure": lambda: jnp.maximum(
@@ -273,13 +297,16 @@ MAX_PIXELS = 24_000_000  # pixels of a batch; some dozen float32 planes of them 
 
 
 class Recorder:
-    """Simulates recordings in batches of one size, so that each sensor is compiled once; a thread for each sensor."""
+    """Simulates recordings in batches of one size, so that each sensor is compiled once; a thread
+    for each sensor.
+    """
 
     def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
         self._scenes = scenes
         self._objects = objects
         self._batch = batch
-        # Pixels of a recording: an image is at most twice as long as wide, and a sensor's at most 480 pixels high.
+        # Pixels of a recording: an image is at most twice as long as wide, and a sensor's at most
+        # 480 pixels high.
         pixels = 2 * scenes.frames * (scenes.size or 480) ** 2
         self._at_once = max(1, min(batch, MAX_PIXELS // pixels))
         self._relief = lru_cache(512)(
@@ -288,7 +315,10 @@ class Recorder:
         self._programs: dict[str, Any] = {}
 
     def record(self, recordings: Sequence[Recording]) -> list[ClipOutput]:
-        """Return the clips of at most `batch` recordings of one sensor, as numpy. Raises ValueError for more."""
+        """Return the clips of at most `batch` recordings of one sensor, as numpy.
+
+        Raises ValueError for more.
+        """
         refuse_forked()
         count = len(recordings)
         if not 0 < count <= self._batch or len({r.sensor for r in recordings}) > 1:
@@ -347,10 +377,12 @@ def stack_trees(trees: Sequence[Tree]) -> Tree:
 
 
 class SimulatedTouch(NamedTuple):
-    """Pictures u8 (B, h, w, 3), the gel's `background`, and fields of B touches at the picture's pixels.
+    """Pictures u8 (B, h, w, 3), the gel's `background`, and fields of B touches at the picture's
+    pixels.
 
-    `depth` (B, h, w) is the gel's displacement in mm. `shear` (B, h, w, 2) is in mm along x and y of the picture.
-    `pressure` (B, h, w) is in kPa, `force` (B, 3) in N along x, y and into the gel, `torque` (B,) in N mm.
+    `depth` (B, h, w) is the gel's displacement in mm. `shear` (B, h, w, 2) is in mm along x and y
+    of the picture. `pressure` (B, h, w) is in kPa, `force` (B, 3) in N along x, y and into the gel,
+    `torque` (B,) in N mm.
     """
 
     image: Any
@@ -376,11 +408,13 @@ def simulate_touch(
 ) -> SimulatedTouch:
     """Press a surface into the gel of a sensor, and return what the camera sees and the gel feels.
 
-    `height_map` (H, W) is in mm, with 0.1 mm between pixels, its highest part nearest to the gel. `pose` (B, 4) is the
-    touched place x and y in mm from the map's centre, the turn in rad, and the depth in mm. `drag` (B, 3) mm, mm and
-    rad moves the object over the gel under the whole pressure. `modulus` kPa and `friction` are the object's. `unit` is
-    a device (`sensors.draw_unit`), by default the nominal one without markers. With fidelity "fast" all but the
-    pictures can be differentiated with respect to pose and drag. Use it under jit. Raises UserError without a camera.
+    `height_map` (H, W) is in mm, with 0.1 mm between pixels, its highest part nearest to the gel.
+    `pose` (B, 4) is the touched place x and y in mm from the map's centre, the turn in rad, and the
+    depth in mm. `drag` (B, 3) mm, mm and rad moves the object over the gel under the whole
+    pressure. `modulus` kPa and `friction` are the object's. `unit` is a device
+    (`sensors.draw_unit`), by default the nominal one without markers. With fidelity "fast" all but
+    the pictures can be differentiated with respect to pose and drag. Use it under jit. Raises
+    UserError without a camera.
     """
     kind = find_sensor(sensor)
     if kind.kind != "image":
@@ -390,7 +424,8 @@ def simulate_touch(
     relief = jnp.asarray(height_map, jnp.float32)
     if relief.ndim != 2 or pose.shape[1] != 4:
         raise UserError(
-            f"a height map is (H, W) mm with {SPACING} mm between pixels and a pose (B, 4), not {relief.shape} and "
+            f"a height map is (H, W) mm with {SPACING} mm between pixels and a pose (B, 4), not "
+            f"{relief.shape} and "
             f"{pose.shape}"
         )
     moves = jnp.broadcast_to(jnp.atleast_2d(jnp.asarray(drag, jnp.float32)), (len(pose), 3))

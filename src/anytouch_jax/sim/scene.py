@@ -1,6 +1,7 @@
 """Touch scenes: objects, places, motions and sensor units, drawn from a seed by numpy.
 
-A touch is a place on an object. A recording is one sensor's clip of it: a part of press, hold, slide or twist, release.
+A touch is a place on an object. A recording is one sensor's clip of it: a part of press, hold,
+slide or twist, release.
 """
 
 from __future__ import annotations
@@ -39,12 +40,14 @@ _UNIT = 6
 
 @dataclass(frozen=True)
 class Scenes:
-    """What to simulate: `touches` places on `objects` objects, each recorded by every sensor for `frames` frames.
+    """What to simulate: `touches` places on `objects` objects, each recorded by every sensor for
+    `frames` frames.
 
-    With grade "fine" all sensors share place, depth and motion, so frames correspond one to one. With "coarse" every
-    sensor has its own tilt, twist, offset, speed and motion, as by hand, and only the place is shared. Data sets with
-    the same seed, number of objects and held-out share have the same objects and splits. They share no touch if their
-    numbers, from `first` on, do not overlap. Raises UserError for a scene that cannot be simulated.
+    With grade "fine" all sensors share place, depth and motion, so frames correspond one to one.
+    With "coarse" every sensor has its own tilt, twist, offset, speed and motion, as by hand, and
+    only the place is shared. Data sets with the same seed, number of objects and held-out share
+    have the same objects and splits. They share no touch if their numbers, from `first` on, do not
+    overlap. Raises UserError for a scene that cannot be simulated.
     """
 
     touches: Count[int] = 400
@@ -57,13 +60,13 @@ class Scenes:
     depth: tuple[float, float] = (0.3, 1.0)  # mm, range of the deepest press
     vision: Share = 0.7  # share of recordings with a photograph
     text: Share = 0.7  # share of recordings with a caption
-    # Share of test objects, held out by whole (primitive, texture) pairs. Half this share of the rest is for val, if
-    # enough objects are left. With fewer than 12 objects all are for training.
+    # Share of test objects, held out by whole (primitive, texture) pairs. Half this share of the
+    # rest is for val, if enough objects are left. With fewer than 12 objects all are for training.
     held_out: Below1 = 0.25
     fields: tuple[str, ...] = ()  # of FIELDS, written next to the images
     size: int = 224  # pixels of the short side; 0 is each sensor's own resolution
-    # "each" draws a sensor unit for every recording. "one" uses one unit of each sensor, mounted straight, as on the
-    # paper's calibrated platform.
+    # "each" draws a sensor unit for every recording. "one" uses one unit of each sensor, mounted
+    # straight, as on the paper's calibrated platform.
     units: Literal["each", "one"] = "each"
     first: NotNegative[int] = 0  # number of the first touch
 
@@ -82,7 +85,8 @@ class Scenes:
         check(self)
         if self.size and not 16 <= self.size <= _MAX_SIZE:
             raise UserError(
-                f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not {self.size}"
+                f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not "
+                f"{self.size}"
             )
         if self.fields and all(one.kind == "field" for one in kinds):
             raise UserError(
@@ -97,12 +101,15 @@ class Scenes:
         thinnest = thin.gel.thickness * (THINNEST if self.units == "each" else 1.0)
         if high >= thinnest:
             raise UserError(
-                f"depth {high:g} mm may go through the gel of {thin.name}: stay below {thinnest:g} mm"
+                f"depth {high:g} mm may go through the gel of {thin.name}: stay below {thinnest:g} "
+                "mm"
             )
 
 
 class Touch(NamedTuple):
-    """A place to touch: the object's number, its split, place (2,) mm and `yaw` rad of the sensor, and the motion."""
+    """A place to touch: the object's number, its split, place (2,) mm and `yaw` rad of the sensor,
+    and the motion.
+    """
 
     number: int
     object: int
@@ -113,10 +120,13 @@ class Touch(NamedTuple):
 
 
 class Gesture(NamedTuple):
-    """A motion of the sensor: deepest `depth` mm, total `slide` (2,) mm and `twist` rad. `motion` numbers MOTIONS.
+    """A motion of the sensor: deepest `depth` mm, total `slide` (2,) mm and `twist` rad.
 
-    `phases` (7,) are the shares of lift, press, pause, move, pause, release and lift. A clip shows `shown` of the
-    gesture around `middle`. At `lift` the sensor is off for a moment and comes back moved by `regrasp` (3,).
+    `motion` numbers MOTIONS.
+
+    `phases` (7,) are the shares of lift, press, pause, move, pause, release and lift. A clip shows
+    `shown` of the gesture around `middle`. At `lift` the sensor is off for a moment and comes back
+    moved by `regrasp` (3,).
     """
 
     depth: Any
@@ -133,9 +143,10 @@ class Gesture(NamedTuple):
 class Recording(NamedTuple):
     """One sensor's clip of a touch, by one sensor unit.
 
-    `start` (3,) mm, mm, rad is the touched place in the gel's frame and the object's turn. `motion` (T, 3) mm, mm, rad
-    moves it from there, about the middle of the gel. `depth` (T,) is in mm, negative without contact. `tilt` (2,) is in
-    rise per mm. `drift` (T, 3, 3) is that of the light, `seed` that of the image noise.
+    `start` (3,) mm, mm, rad is the touched place in the gel's frame and the object's turn. `motion`
+    (T, 3) mm, mm, rad moves it from there, about the middle of the gel. `depth` (T,) is in mm,
+    negative without contact. `tilt` (2,) is in rise per mm. `drift` (T, 3, 3) is that of the light,
+    `seed` that of the image noise.
     """
 
     touch: Touch
@@ -153,7 +164,10 @@ class Recording(NamedTuple):
 
 
 def objects_and_splits(scenes: Scenes) -> tuple[tuple[Object, ...], tuple[str, ...]]:
-    """Return the objects of a data set and their splits, which share no (primitive, texture) pair. Raises UserError."""
+    """Return the objects of a data set and their splits, which share no (primitive, texture) pair.
+
+    Raises UserError.
+    """
     objects = catalogue(scenes.seed, scenes.objects)
     if scenes.held_out <= 0 or scenes.objects < 12:  # too few to hold out whole pairs
         return objects, ("train",) * len(objects)
@@ -174,7 +188,10 @@ def objects_and_splits(scenes: Scenes) -> tuple[tuple[Object, ...], tuple[str, .
 
 
 def draw_touch(scenes: Scenes, number: int, splits: Sequence[str]) -> Touch:
-    """Return touch `number`. Objects take turns in a seeded order. Places are within 3 mm of the middle."""
+    """Return touch `number`.
+
+    Objects take turns in a seeded order. Places are within 3 mm of the middle.
+    """
     rng = np.random.default_rng([scenes.seed, _TOUCH, number])
     turn, place = divmod(number, len(splits))
     thing = int(
@@ -221,7 +238,9 @@ def draw_gesture(depths: tuple[float, float], rng: Rng, like: Gesture | None = N
 def draw_by_hand(
     depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: Any
 ) -> tuple[Gesture, Any, Any, Any]:
-    """Return another sensor's gesture, yaw, offset (2,) mm and tilt (2,) at a touch of grade coarse."""
+    """Return another sensor's gesture, yaw, offset (2,) mm and tilt (2,) at a touch of grade
+    coarse.
+    """
     gesture = draw_gesture(depths, rng, gesture)
     yaw = yaw + math.radians(12) * rng.standard_normal()
     return (
@@ -264,7 +283,10 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
 
 
 def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
-    """Return motion (T, 3) since the touch, and depth (T,), negative without contact. A still is the deepest press."""
+    """Return motion (T, 3) since the touch, and depth (T,), negative without contact.
+
+    A still is the deepest press.
+    """
     if frames == 1:
         return np.zeros((1, 3)), np.array([gesture.depth])
     times = gesture.middle + gesture.shown * np.linspace(-0.5, 0.5, frames)
@@ -272,7 +294,10 @@ def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
 
 
 def moved(gesture: Gesture, times: Any, gap: Any, xp: ModuleType) -> tuple[Any, Any]:
-    """Return motion (T, 3) and depth (T,) as `trajectory` at `times` (T,). A lift lasts `gap` to both sides."""
+    """Return motion (T, 3) and depth (T,) as `trajectory` at `times` (T,).
+
+    A lift lasts `gap` to both sides.
+    """
     ends = xp.cumsum(gesture.phases)
 
     def smooth(phase: int) -> Any:
@@ -291,7 +316,9 @@ MOVES = (0.1, math.radians(1))  # mm and rad that the gel must be moved to be la
 
 
 def directions(recording: Recording) -> dict[str, str]:
-    """Return labels of the motion in contact as the image shows it: `label.motion`, `label.twist` and `label.slide`."""
+    """Return labels of the motion in contact as the image shows it: `label.motion`, `label.twist`
+    and `label.slide`.
+    """
     unit = recording.unit
     touching = recording.depth > 0
     steps = np.diff(trajectory(len(touching), recording.gesture._replace(lift=-1.0))[0], axis=0)

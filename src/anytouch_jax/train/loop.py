@@ -1,4 +1,7 @@
-"""The training loop: compile, feed, log, save, continue. Its side effects are here and in `progress.py`."""
+"""The training loop: compile, feed, log, save, continue.
+
+Its side effects are here and in `progress.py`.
+"""
 
 import contextlib
 import functools
@@ -30,7 +33,8 @@ Example = tuple[Any, Callable[[], Any]]  # the shapes of a batch, and a function
 # the metrics of a step that its ballot adds
 _SIGNAL = "signal"
 _SKIPPED = "skipped_samples"
-# batches(start, stop) -> (step, batch, numbers of the loader for the log) for each step of the range
+# batches(start, stop) -> (step, batch, numbers of the loader for the log) for each step of the
+# range
 Item = tuple[int, Any, Mapping[str, Any]]
 Batches = Callable[[int, int], Iterator[Item]]
 Report = Callable[[int, Tree, Any], None]
@@ -39,7 +43,9 @@ Report = Callable[[int, Tree, Any], None]
 @shown_short
 @dataclass(frozen=True)
 class FitResult:
-    """The result of a run or a part of one: the state after `step` steps and the last line of metrics."""
+    """The result of a run or a part of one: the state after `step` steps and the last line of
+    metrics.
+    """
 
     state: TrainState
     step: int
@@ -71,16 +77,18 @@ def fit(
     until: float | None = None,
     examples: Sequence[Example] = (),
 ) -> FitResult:
-    """Train `config.run.steps` steps in a run folder, or continue from its latest complete checkpoint.
+    """Train `config.run.steps` steps in a run folder, or continue from its latest complete
+    checkpoint.
 
-    `params` are the first parameters; when a run continues, only their shapes matter. `loss_fn` and `trained` are those
-    of `make_step`. `stop_after` ends the run after that many steps in all, without changing the schedule.
-    `on_report(step, params, batch)` draws figures and must not keep the arrays. `curve` shows the loss on a terminal.
-    `until` ends the run at that time of `time.monotonic`, which the schedule then follows. `examples` are a batch of
-    each structure, its shapes and a function that makes it, whose steps are compiled side by side. SIGTERM and Ctrl-C,
-    in one of several processes, finish the step, save and return. Raises UserError for settings that changed since the
-    start, too many skipped steps in a row, a full disk, an unreadable checkpoint, and a folder that some process cannot
-    see.
+    `params` are the first parameters; when a run continues, only their shapes matter. `loss_fn` and
+    `trained` are those of `make_step`. `stop_after` ends the run after that many steps in all,
+    without changing the schedule. `on_report(step, params, batch)` draws figures and must not keep
+    the arrays. `curve` shows the loss on a terminal. `until` ends the run at that time of
+    `time.monotonic`, which the schedule then follows. `examples` are a batch of each structure, its
+    shapes and a function that makes it, whose steps are compiled side by side. SIGTERM and Ctrl-C,
+    in one of several processes, finish the step, save and return. Raises UserError for settings
+    that changed since the start, too many skipped steps in a row, a full disk, an unreadable
+    checkpoint, and a folder that some process cannot see.
     """
     refuse_forked()
     run_dir = Path(run_dir)
@@ -204,14 +212,18 @@ class _Loop:
             self.report(done, state, placed)
         if signalled:
             self.log(
-                f"stopped by {signalled.name} after step {done} and saved, the same command continues from here"
+                f"stopped by {signalled.name} after step {done} and saved, the same command "
+                "continues from here"
             )
         return FitResult(state, done, self.row, self.traces, start, signalled)
 
     def ahead(
         self, step_fn: Any, state: TrainState, key: jax.Array, examples: Sequence[Example]
     ) -> Callable[..., Any]:
-        """Return the step, compiled for the batch of each example side by side. Others compile when they come."""
+        """Return the step, compiled for the batch of each example side by side.
+
+        Others compile when they come.
+        """
 
         def form(batch: Any) -> Any:
             return jax.tree.structure(batch), tuple(
@@ -236,7 +248,9 @@ class _Loop:
         return lambda state, batch, *rest: programs.get(form(batch), step_fn)(state, batch, *rest)
 
     def progress(self) -> tuple[np.float32, ...]:
-        """Return the share of the time that has passed, nothing in a run of a given number of steps."""
+        """Return the share of the time that has passed, nothing in a run of a given number of
+        steps.
+        """
         if self.until is None:
             return ()
         if self.begun is None:
@@ -248,7 +262,9 @@ class _Loop:
         )
 
     def awaited(self, batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
-        """Yield the batches of steps `start` to `stop` in order, count the time without one, and close their source."""
+        """Yield the batches of steps `start` to `stop` in order, count the time without one, and
+        close their source.
+        """
         source = batches(start, stop)
         expected = start
         requested = time.perf_counter()
@@ -273,7 +289,9 @@ class _Loop:
     def compile(
         self, state: TrainState, loss_fn: LossFn, trained: TrainedFn | None
     ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
-        """Return the jitted step, which keeps the sharding of the state and is traced once a batch structure."""
+        """Return the jitted step, which keeps the sharding of the state and is traced once a batch
+        structure.
+        """
         loss_fn = meshes.gathering(loss_fn, self.mesh)
         tx = optimizer(self.config)
         options = self.config.optim
@@ -298,7 +316,9 @@ class _Loop:
         )
 
     def log_metrics(self) -> None:
-        """Fetch and write the metrics of the pending step; stop the run when too many were skipped in a row."""
+        """Fetch and write the metrics of the pending step; stop the run when too many were skipped
+        in a row.
+        """
         if self.pending is None:
             return
         (step, metrics, info) = self.pending
@@ -319,15 +339,19 @@ class _Loop:
         self.advance(self.row)
         if self.record.in_a_row > self.config.run.max_skipped:
             raise UserError(
-                f"{self.record.in_a_row} steps in a row, up to step {step}, had a loss or a gradient that is not "
-                "finite and were skipped. In another run folder, lower --optim.learning-rate, set --optim.grad-clip, "
+                f"{self.record.in_a_row} steps in a row, up to step {step}, had a loss or a "
+                "gradient that is not "
+                "finite and were skipped. In another run folder, lower --optim.learning-rate, set "
+                "--optim.grad-clip, "
                 "or look for NaN in the data."
             )
 
     def save(self, done: int, state: TrainState, since: int) -> int:
-        """Write a checkpoint in the background, after the metrics of its `since` steps, and return `done`.
+        """Write a checkpoint in the background, after the metrics of its `since` steps, and return
+        `done`.
 
-        Its loss is the mean over these steps, marked `partial` for few steps: it could be the best by chance.
+        Its loss is the mean over these steps, marked `partial` for few steps: it could be the best
+        by chance.
         """
         self.log_metrics()
         self.record.sync()
@@ -359,7 +383,9 @@ class _Loop:
 def _first_state(
     config: Config, params: Tree, checkpoints: Checkpoints, mesh: Mesh
 ) -> tuple[TrainState, int]:
-    """Return the state of the latest complete checkpoint and its step, or a new state, sharded over the mesh."""
+    """Return the state of the latest complete checkpoint and its step, or a new state, sharded over
+    the mesh.
+    """
     init = functools.partial(init_state, config=config)
     shapes = jax.eval_shape(init, params)
     places = meshes.state_sharding(shapes, mesh)

@@ -1,4 +1,6 @@
-"""Devices and processes of a run: the mesh, sharding over it, joining, one decision a step, and a lost process."""
+"""Devices and processes of a run: the mesh, sharding over it, joining, one decision a step, and a
+lost process.
+"""
 
 import contextlib
 import os
@@ -26,14 +28,18 @@ BATCH_AXES = ("data", "fsdp")
 HEARTBEAT = 60  # seconds until a silent process counts as lost
 PATIENCE = 10  # seconds for the other processes to meet the same mistake
 _CONTINUE = "run the same command again to continue from the last complete checkpoint"
-# How many processes there are: set by the user, by srun, by mpirun. All else is left to jax's own detection.
+# How many processes there are: set by the user, by srun, by mpirun. All else is left to jax's own
+# detection.
 _COUNTS = ("JAX_NUM_PROCESSES", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
 def make_mesh(
     data: int | None = None, fsdp: int = 1, devices: Sequence[jax.Device] | None = None
 ) -> Mesh:
-    """Return a mesh with axes (data, fsdp). `data` None takes all devices. Raises ConfigError if there are too few."""
+    """Return a mesh with axes (data, fsdp).
+
+    `data` None takes all devices. Raises ConfigError if there are too few.
+    """
     devices = list(jax.devices() if devices is None else devices)
     if fsdp < 1 or (data is None and len(devices) % fsdp):
         raise ConfigError(f"--run.fsdp {fsdp} must be a divisor of the {len(devices)} devices")
@@ -60,7 +66,8 @@ def replicated(mesh: Mesh) -> NamedSharding:
 def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> Tree:
     """Return a sharding for each array of a state: its largest divisible axis over "fsdp".
 
-    Vectors, arrays of fewer than `small` elements, and those without a divisible axis are copied to each device.
+    Vectors, arrays of fewer than `small` elements, and those without a divisible axis are copied to
+    each device.
     """
     parts = mesh.shape["fsdp"]
 
@@ -74,8 +81,12 @@ def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> T
 
 
 def put_state(tree: Tree, places: Tree) -> Tree:
-    """Copy a host's tree, the same in every process, to the devices. No array is shared: a step donates its state."""
-    # Through the host: `device_put` shares an array that is on one of several devices, whatever `may_alias` is.
+    """Copy a host's tree, the same in every process, to the devices.
+
+    No array is shared: a step donates its state.
+    """
+    # Through the host: `device_put` shares an array that is on one of several devices, whatever
+    # `may_alias` is.
     host = jax.tree.map(np.asarray, tree)
     if jax.process_count() == 1:
         return jax.device_put(host, places, may_alias=False)
@@ -86,7 +97,8 @@ def put_state(tree: Tree, places: Tree) -> Tree:
 
 
 def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
-    """Return `loss_fn(params, ...)` that gathers sharded parameters just before their use (ZeRO, Rajbhandari 2020).
+    """Return `loss_fn(params, ...)` that gathers sharded parameters just before their use (ZeRO,
+    Rajbhandari 2020).
 
     XLA alone would shard activations along the axis of a parameter, and send twice the bytes.
     """
@@ -100,7 +112,8 @@ def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
 
 
 def donated() -> tuple[int, ...]:
-    """Return the arguments of a step that are donated, for `jax.jit(donate_argnums=...)`: the state, on an accelerator.
+    """Return the arguments of a step that are donated, for `jax.jit(donate_argnums=...)`: the
+    state, on an accelerator.
 
     On a CPU none is: XLA would copy every parameter and moment (`experiments/results/tried.md`).
     """
@@ -110,14 +123,18 @@ def donated() -> tuple[int, ...]:
 
 
 def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
-    """Send a host batch to the devices, a share of the rows of each process. Raises ConfigError for a remainder."""
+    """Send a host batch to the devices, a share of the rows of each process.
+
+    Raises ConfigError for a remainder.
+    """
     devices = sharding.num_devices
     processes = jax.process_count()
     for leaf in jax.tree.leaves(batch):
         rows = leaf.shape[0] * processes
         if rows % devices:
             raise ConfigError(
-                f"{rows} rows cannot be divided among {devices} devices. Choose a multiple with --batch."
+                f"{rows} rows cannot be divided among {devices} devices. Choose a multiple with "
+                "--batch."
             )
     if processes == 1:
         return jax.device_put(batch, sharding)
@@ -127,7 +144,10 @@ def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
 
 
 def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
-    """Keep compiled programs on disk for 60 days, in `cache_folder`. Return the folder, None if it cannot be made."""
+    """Keep compiled programs on disk for 60 days, in `cache_folder`.
+
+    Return the folder, None if it cannot be made.
+    """
     folder = cache_folder() if folder is None else Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -160,9 +180,10 @@ def process_count(environ: Mapping[str, str] = os.environ) -> int:
 def joined(environ: Mapping[str, str] = os.environ) -> Iterator[_Process | None]:
     """Join the other processes of a run while the block runs. A single process gets None.
 
-    `jax.distributed.initialize` detects the launcher. By hand and on Kubernetes, set JAX_COORDINATOR_ADDRESS (host:port
-    of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID. Enter it before anything asks jax for a device. When the block
-    fails, this process exits at once: with 2 after a UserError, 130 after Ctrl-C, else 1.
+    `jax.distributed.initialize` detects the launcher. By hand and on Kubernetes, set
+    JAX_COORDINATOR_ADDRESS (host:port of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID. Enter it
+    before anything asks jax for a device. When the block fails, this process exits at once: with 2
+    after a UserError, 130 after Ctrl-C, else 1.
     """
     if process_count(environ) < 2:
         yield None
@@ -206,8 +227,10 @@ def _initialize(environ: Mapping[str, str]) -> _Process:
         )
     except (RuntimeError, ValueError, KeyError) as error:
         raise UserError(
-            f"cannot join the other processes ({_first_line(error)}). Set JAX_COORDINATOR_ADDRESS to host:port of "
-            "process 0, JAX_NUM_PROCESSES and JAX_PROCESS_ID, start all processes, and open that port."
+            f"cannot join the other processes ({_first_line(error)}). Set JAX_COORDINATOR_ADDRESS "
+            "to host:port of "
+            "process 0, JAX_NUM_PROCESSES and JAX_PROCESS_ID, start all processes, and open that "
+            "port."
         ) from None
     return _Process(jax.process_count(), jax.process_index())
 
@@ -245,7 +268,9 @@ def _first_line(error: BaseException) -> str:
 
 
 class Ballot:
-    """One vote of each process at each step, read a step later: the signal it received, and the samples it skipped."""
+    """One vote of each process at each step, read a step later: the signal it received, and the
+    samples it skipped.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         self._sharding = batch_sharding(mesh)
@@ -264,7 +289,10 @@ class Ballot:
 
 
 def gather(tree: Tree) -> Tree:
-    """Return a tree of arrays as numpy, sharded over several processes or not. Every process must call it."""
+    """Return a tree of arrays as numpy, sharded over several processes or not.
+
+    Every process must call it.
+    """
     if jax.process_count() == 1:
         return tree
     return multihost_utils.process_allgather(tree, tiled=True)
@@ -278,7 +306,10 @@ def broadcast(number: int) -> int:
 
 
 def check_shared(folder: Path) -> None:
-    """Check that every process can see a folder that process 0 made. Raises UserError in every process."""
+    """Check that every process can see a folder that process 0 made.
+
+    Raises UserError in every process.
+    """
     if jax.process_count() == 1:
         return
     multihost_utils.sync_global_devices(f"{folder} is made")
@@ -286,5 +317,6 @@ def check_shared(folder: Path) -> None:
     if not visible.all():
         blind = ", ".join(str(i) for i in np.flatnonzero(visible == 0))
         raise UserError(
-            f"{folder} is not visible to process {blind}. Choose a run folder on a disk that all share."
+            f"{folder} is not visible to process {blind}. Choose a run folder on a disk that all "
+            "share."
         )

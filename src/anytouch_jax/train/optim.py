@@ -1,9 +1,10 @@
 """AdamW, the learning-rate schedule, and rules over parameter names.
 
-A step may not use a parameter, such as a clip's head on a batch of stills. That parameter is skipped: no decay, no
-moment and no count, as in PyTorch when a gradient is None. So each parameter needs its own count, and `optax.adamw` has
-one for all. Small arrays are packed into one vector. A ViT has about twenty parameters a stack, most of them vectors.
-One by one, their updates take longer to compile than the whole backward pass.
+A step may not use a parameter, such as a clip's head on a batch of stills. That parameter is
+skipped: no decay, no moment and no count, as in PyTorch when a gradient is None. So each parameter
+needs its own count, and `optax.adamw` has one for all. Small arrays are packed into one vector. A
+ViT has about twenty parameters a stack, most of them vectors. One by one, their updates take longer
+to compile than the whole backward pass.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ SMALL = 2**16  # elements; a larger array gets its own kernel and is sharded
 
 
 class Packing(NamedTuple):
-    """Which leaves of a tree are packed into one vector: `groups` of leaf numbers. A leaf alone is not changed."""
+    """Which leaves of a tree are packed into one vector: `groups` of leaf numbers.
+
+    A leaf alone is not changed.
+    """
 
     groups: tuple[tuple[int, ...], ...]
     shapes: tuple[tuple[int, ...], ...]
@@ -62,18 +66,23 @@ class Packing(NamedTuple):
         return self.treedef.unflatten(leaves)
 
     def spread(self, group: int, values: Any) -> Any:
-        """Repeat `values` (leaves,) over the elements of a group: (n,), or () for a group of one leaf."""
+        """Repeat `values` (leaves,) over the elements of a group: (n,), or () for a group of one
+        leaf.
+        """
         leaves = self.groups[group]
         if len(leaves) == 1:
             return values[leaves[0]]
-        # The index is known while tracing: jnp.repeat would leave XLA to fold a cumulative sum for seconds.
+        # The index is known while tracing: jnp.repeat would leave XLA to fold a cumulative sum for
+        # seconds.
         return values[
             np.repeat(np.asarray(leaves, np.int32), [int(np.prod(self.shapes[i])) for i in leaves])
         ]
 
 
 def packing(tree: Tree, small: int = SMALL) -> Packing:
-    """Return how to pack a tree of arrays or shapes: leaves below `small` elements together, by data type."""
+    """Return how to pack a tree of arrays or shapes: leaves below `small` elements together, by
+    data type.
+    """
     leaves, treedef = jax.tree.flatten(tree)
     together: dict[Any, list[int]] = {}
     for i, leaf in enumerate(leaves):
@@ -102,7 +111,10 @@ class OptState(NamedTuple):
 
 
 def match_rules(rules: Sequence[tuple[str, T]], names: Iterable[str]) -> dict[str, T]:
-    """Return for each name the value of the first rule whose regex matches. Raises ConfigError if none does."""
+    """Return for each name the value of the first rule whose regex matches.
+
+    Raises ConfigError if none does.
+    """
     matched: dict[str, T] = {}
     for name in names:
         values = [value for pattern, value in rules if re.search(pattern, name)]
@@ -119,9 +131,10 @@ def learning_rate(
 ) -> Array:
     """Return the learning rate at time `t`, f32 of its shape.
 
-    It rises linearly from 0 to `peak` at `warmup`, falls to `floor` at `total`, and stays there. `t`, `warmup` and
-    `total` share a unit (steps or epochs) and may be fractions. `decay` is "linear" (the paper) or "cosine", half a
-    period (the release). Raises ConfigError for another decay.
+    It rises linearly from 0 to `peak` at `warmup`, falls to `floor` at `total`, and stays there.
+    `t`, `warmup` and `total` share a unit (steps or epochs) and may be fractions. `decay` is
+    "linear" (the paper) or "cosine", half a period (the release). Raises ConfigError for another
+    decay.
     """
     if decay not in ("linear", "cosine"):
         raise ConfigError(f"unknown decay {decay!r}. Choose linear or cosine.")
@@ -139,10 +152,12 @@ def schedule(config: Config) -> Callable[[Array | float], Array]:
 
 
 def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | float:
-    """Return the factor on a parameter's learning rate: a number, or one for each of stacked blocks (L, 1, ...).
+    """Return the factor on a parameter's learning rate: a number, or one for each of stacked blocks
+    (L, 1, ...).
 
-    Block i of 1 to L of the touch encoder has the factor layer_decay^(L - i), parameters before the blocks
-    layer_decay^L, and all others 1. In BEiT's fine-tuning (Bao et al. 2022) the last block has layer_decay.
+    Block i of 1 to L of the touch encoder has the factor layer_decay^(L - i), parameters before the
+    blocks layer_decay^L, and all others 1. In BEiT's fine-tuning (Bao et al. 2022) the last block
+    has layer_decay.
     """
     depth = config.model.touch.depth
     decay = config.optim.layer_decay
@@ -154,12 +169,13 @@ def depth_rate(name: str, shape: tuple[int, ...], config: Config) -> Array | flo
 
 
 def optimizer(config: Config) -> optax.GradientTransformationExtraArgs:
-    """Return AdamW as PyTorch computes it, with decoupled decay by `config.weight_decay` and optional clipping.
+    """Return AdamW as PyTorch computes it, with decoupled decay by `config.weight_decay` and
+    optional clipping.
 
-    Call `update(grads, state, params, *, used=None, step=None, learning_rate=None, good=True)`. `used` is a tree of
-    Python bools. An unused parameter does not change, and does not count in the clipping norm. The rate is
-    `learning_rate`, or that of `schedule` at `step`, so that a skipped step does not shift the schedule. If `good`
-    bool () is False, the state stays.
+    Call `update(grads, state, params, *, used=None, step=None, learning_rate=None, good=True)`.
+    `used` is a tree of Python bools. An unused parameter does not change, and does not count in the
+    clipping norm. The rate is `learning_rate`, or that of `schedule` at `step`, so that a skipped
+    step does not shift the schedule. If `good` bool () is False, the state stays.
     """
     options = config.optim
     rate = schedule(config)

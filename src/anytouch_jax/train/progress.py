@@ -1,4 +1,6 @@
-"""A run's folder (config.json, metrics.jsonl with one line a step, the lock), its progress, and signals that end it."""
+"""A run's folder (config.json, metrics.jsonl with one line a step, the lock), its progress, and
+signals that end it.
+"""
 
 import contextlib
 import dataclasses
@@ -37,7 +39,9 @@ def silent(sentence: str) -> None:
 def progress(
     start: int, stop: int, log: Log, *, curve: bool = False
 ) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Give a function for the metrics of each step: a bar on a terminal (with a `curve` of the loss), or log lines."""
+    """Give a function for the metrics of each step: a bar on a terminal (with a `curve` of the
+    loss), or log lines.
+    """
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
 
@@ -84,7 +88,10 @@ def progress(
 
 
 def chart(losses: Sequence[float], width: int = 64, height: int = 8) -> str:
-    """Draw losses as text: a column is the mean of equally many steps. The scale is written on the left."""
+    """Draw losses as text: a column is the mean of equally many steps.
+
+    The scale is written on the left.
+    """
     columns = [
         float(part.mean()) for part in np.array_split(np.asarray(losses), min(width, len(losses)))
     ]
@@ -118,7 +125,10 @@ def summary(row: Mapping[str, Any]) -> str:
 
 @contextlib.contextmanager
 def signals() -> Iterator[list[signal.Signals]]:
-    """Yield a list that collects SIGTERM and Ctrl-C, which then do not end the process. A second Ctrl-C does."""
+    """Yield a list that collects SIGTERM and Ctrl-C, which then do not end the process.
+
+    A second Ctrl-C does.
+    """
     received: list[signal.Signals] = []
 
     def note(number: int, frame: Any) -> None:
@@ -133,7 +143,10 @@ def signals() -> Iterator[list[signal.Signals]]:
 
 @contextlib.contextmanager
 def terminating() -> Iterator[None]:
-    """Let SIGTERM raise `Terminated` while the block runs, so that it cleans up. `signals` takes over inside it."""
+    """Let SIGTERM raise `Terminated` while the block runs, so that it cleans up.
+
+    `signals` takes over inside it.
+    """
 
     def end(number: int, frame: Any) -> None:
         raise Terminated
@@ -142,8 +155,9 @@ def terminating() -> Iterator[None]:
         yield
 
 
-# Settings that may change when a run continues: they decide where and how fast it runs, not its numbers. `pretrain`
-# compares the content of the manifests, since a data set may have moved. The run folder has a copy of the tokenizer.
+# Settings that may change when a run continues: they decide where and how fast it runs, not its
+# numbers. `pretrain` compares the content of the manifests, since a data set may have moved. The
+# run folder has a copy of the tokenizer.
 CHANGEABLE = {
     f"data.{name}"
     for name in ("cache", "manifests", "on_bad_sample", "prefetch", "threads", "tokenizer")
@@ -161,7 +175,8 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         reason = error.strerror or str(error)
         raise UserError(
-            f"cannot write {path}: {reason}. Free some space or make the folder writable, then run the same command "
+            f"cannot write {path}: {reason}. Free some space or make the folder writable, then run "
+            "the same command "
             "again to continue from the last complete checkpoint."
         ) from error
 
@@ -171,7 +186,10 @@ _locked: set[tuple[int, Path]] = set()
 
 @contextlib.contextmanager
 def alone_in(run_dir: Path) -> Iterator[None]:
-    """Make and lock a run folder, except for the same thread. Raises UserError if another process trains there."""
+    """Make and lock a run folder, except for the same thread.
+
+    Raises UserError if another process trains there.
+    """
     mine = (threading.get_ident(), run_dir.resolve())
     if mine in _locked:
         yield
@@ -183,7 +201,8 @@ def alone_in(run_dir: Path) -> Iterator[None]:
             free = stack.enter_context(lock(run_dir / ".lock"))
         if not free:
             raise UserError(
-                f"another process trains in {run_dir}. Wait for it, or choose another folder with --run."
+                f"another process trains in {run_dir}. Wait for it, or choose another folder with "
+                "--run."
             )
         _locked.add(mine)
         stack.callback(_locked.discard, mine)
@@ -191,7 +210,10 @@ def alone_in(run_dir: Path) -> Iterator[None]:
 
 
 def begun_with(run_dir: Path) -> Config | None:
-    """Return the settings that a run started with, or None without a complete checkpoint. Raises UserError."""
+    """Return the settings that a run started with, or None without a complete checkpoint.
+
+    Raises UserError.
+    """
     path = run_dir / "config.json"
     done = steps(run_dir / "checkpoints")
     if not done:
@@ -208,7 +230,10 @@ def begun_with(run_dir: Path) -> Config | None:
 
 
 def open_run(run_dir: Path, config: Config) -> None:
-    """Make a run folder with its config.json, or check that its run started with equal settings. Raises UserError."""
+    """Make a run folder with its config.json, or check that its run started with equal settings.
+
+    Raises UserError.
+    """
     path = run_dir / "config.json"
     with writing(path):
         (run_dir / "figures").mkdir(parents=True, exist_ok=True)
@@ -217,7 +242,10 @@ def open_run(run_dir: Path, config: Config) -> None:
 
 
 def continues(run_dir: Path, config: Config) -> bool:
-    """Return whether a folder has a run to continue. Raises UserError for changed settings, but those CHANGEABLE."""
+    """Return whether a folder has a run to continue.
+
+    Raises UserError for changed settings, but those CHANGEABLE.
+    """
     if (begun := begun_with(run_dir)) is None:
         return False
     before = _flat(dataclasses.asdict(begun))
@@ -230,8 +258,10 @@ def continues(run_dir: Path, config: Config) -> bool:
     if changed:
         longer = f", or start from its weights by --init {run_dir} and another --run folder"
         raise UserError(
-            f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. Use the same settings to "
-            f"continue it, or choose another run folder{longer if before['run.steps'] != now['run.steps'] else ''}."
+            f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. Use the "
+            "same settings to "
+            "continue it, or choose another run "
+            f"folder{longer if before['run.steps'] != now['run.steps'] else ''}."
         )
     return True
 
@@ -252,8 +282,9 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 class Record:
     """metrics.jsonl from step `start` on. Later and incomplete lines, of a killed run, are removed.
 
-    `skipped` counts the skipped steps so far, and `in_a_row` those at the end without a break. With `tensorboard` the
-    numbers also go to an event file. Only the `lead` process writes. Raises UserError for a full disk.
+    `skipped` counts the skipped steps so far, and `in_a_row` those at the end without a break. With
+    `tensorboard` the numbers also go to an event file. Only the `lead` process writes. Raises
+    UserError for a full disk.
     """
 
     def __init__(
@@ -268,7 +299,10 @@ class Record:
             self._file: TextIO | None = self.path.open("a", encoding="utf-8") if lead else None
 
     def write(self, step: int, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Append the line of a step and return it. A number that is not finite becomes null, as JSON has no NaN."""
+        """Append the line of a step and return it.
+
+        A number that is not finite becomes null, as JSON has no NaN.
+        """
         row: dict[str, Any] = {"step": step}
         for name, value in numbers.items():
             value = value.item() if hasattr(value, "item") else value
@@ -328,6 +362,7 @@ def _tensorboard(run_dir: Path, start: int) -> Any:
         from tensorboardX import SummaryWriter
     except ImportError:
         raise UserError(
-            "--run.tensorboard needs tensorboardX. Run pip install 'anytouch-jax[tensorboard]', or leave it off."
+            "--run.tensorboard needs tensorboardX. Run pip install 'anytouch-jax[tensorboard]', or "
+            "leave it off."
         ) from None
     return SummaryWriter(str(run_dir / "tensorboard"), purge_step=start)

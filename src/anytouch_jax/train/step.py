@@ -1,4 +1,6 @@
-"""Training steps as pure functions: loss and gradients, accumulation, the update and its metrics."""
+"""Training steps as pure functions: loss and gradients, accumulation, the update and its
+metrics.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ StepFn = Callable[..., tuple["TrainState", dict[str, Array]]]
 
 @shown_short
 class TrainState(NamedTuple):
-    """The state of training: `step` i32 (), trainable and frozen parameters as nested dicts, the optimiser's state."""
+    """The state of training: `step` i32 (), trainable and frozen parameters as nested dicts, the
+    optimiser's state.
+    """
 
     step: Array
     trainable: Tree
@@ -37,7 +41,10 @@ class TrainState(NamedTuple):
 
 
 def split(params: Tree, rules: Sequence[tuple[str, bool]]) -> tuple[Tree, Tree]:
-    """Split nested parameters into (trainable, frozen) by (regex, frozen?) rules. The first match decides."""
+    """Split nested parameters into (trainable, frozen) by (regex, frozen?) rules.
+
+    The first match decides.
+    """
     leaves = flatten(params)
     frozen = match_rules(rules, leaves)
     trainable, fixed = (
@@ -47,7 +54,10 @@ def split(params: Tree, rules: Sequence[tuple[str, bool]]) -> tuple[Tree, Tree]:
 
 
 def merge(trainable: Tree, frozen: Tree) -> Tree:
-    """Return the nested parameters that `split` separated. Raises ValueError if a parameter is in both."""
+    """Return the nested parameters that `split` separated.
+
+    Raises ValueError if a parameter is in both.
+    """
     merged = dict(trainable)
     for name, value in frozen.items():
         if name not in merged:
@@ -78,16 +88,18 @@ def make_step(
 ) -> StepFn:
     """Return `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
 
-    The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. A run for a time passes the share
-    of its time as `progress`, which then decides the learning rate too. Only trainable parameters are
-    differentiated. Those that a batch does not train by the rules of `trained` (`objectives.trained_by`) are skipped,
-    as in PyTorch (golden H_mixed). If the loss, or the norm of gradients or parameters, is not finite, no update is
-    applied, `step` advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm, param_norm
-    (before the update), update_norm, learning_rate, skipped.
+    The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. A run for a
+    time passes the share of its time as `progress`, which then decides the learning rate too. Only
+    trainable parameters are differentiated. Those that a batch does not train by the rules of
+    `trained` (`objectives.trained_by`) are skipped, as in PyTorch (golden H_mixed). If the loss, or
+    the norm of gradients or parameters, is not finite, no update is applied, `step` advances and
+    `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm, param_norm (before
+    the update), update_norm, learning_rate, skipped.
 
-    `accumulate` micro-batches (rows m, m + accumulate, ...) run in turn, and their losses, gradients and metrics are
-    averaged: equal to the large batch for a mean over rows, not for InfoNCE. Raises ConfigError for rows that do not
-    divide, and for packed image or text slots. `optax.MultiSteps` would need several calls.
+    `accumulate` micro-batches (rows m, m + accumulate, ...) run in turn, and their losses,
+    gradients and metrics are averaged: equal to the large batch for a mean over rows, not for
+    InfoNCE. Raises ConfigError for rows that do not divide, and for packed image or text slots.
+    `optax.MultiSteps` would need several calls.
     """
     tx = optax.with_extra_args_support(tx)
 
@@ -161,12 +173,14 @@ def _finish(
 def micro_batches(batch: Any, accumulate: int) -> Any:
     """Split every leading axis B into (accumulate, B / accumulate). Raises ConfigError.
 
-    Micro-batch m has the rows m, m + accumulate, ...: with strided rows a sharded batch needs no transfer.
+    Micro-batch m has the rows m, m + accumulate, ...: with strided rows a sharded batch needs no
+    transfer.
     """
     for part in jax.tree.leaves(batch, is_leaf=lambda x: isinstance(x, AlignBatch)):
         if isinstance(part, AlignBatch) and part.image.shape[0] + part.text.shape[0] > 0:
             raise ConfigError(
-                "--optim.accumulate must be 1 for batches with images or texts, whose slots refer to rows of the whole "
+                "--optim.accumulate must be 1 for batches with images or texts, whose slots refer "
+                "to rows of the whole "
                 "batch. Lower --batch instead."
             )
 
@@ -181,7 +195,9 @@ def micro_batches(batch: Any, accumulate: int) -> Any:
 
 
 def _mean_over(gradients: Callable[[Any, Array], Any], parts: Any, key: Array) -> Any:
-    """Return the mean of (loss, metrics, gradients) over micro-batches, one at a time, each with its own key."""
+    """Return the mean of (loss, metrics, gradients) over micro-batches, one at a time, each with
+    its own key.
+    """
     count = jax.tree.leaves(parts)[0].shape[0]
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(count))
     first = jax.tree.map(lambda x: x[0], (parts, keys))

@@ -1,4 +1,6 @@
-"""Live touch for the page: a camera or a film in its place, with contact, class, nearest touches and recordings."""
+"""Live touch for the page: a camera or a film in its place, with contact, class, nearest touches
+and recordings.
+"""
 
 import asyncio
 import contextlib
@@ -39,7 +41,10 @@ _LOOK = 0.005  # seconds between looks for a new packet
 
 
 class LoopedFilm:
-    """A film in place of a camera, again and again; late frames are lost. Raises UserError for one without frames."""
+    """A film in place of a camera, again and again; late frames are lost.
+
+    Raises UserError for one without frames.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path.absolute()
@@ -66,7 +71,9 @@ class LoopedFilm:
 
 
 class _Shown(NamedTuple):
-    """What the page shows of a frame: its picture, turned, the untouched gel, what is known, and what was measured."""
+    """What the page shows of a frame: its picture, turned, the untouched gel, what is known, and
+    what was measured.
+    """
 
     number: int = 0
     about: Mapping[str, Any] = {}
@@ -101,9 +108,12 @@ class _Kept(NamedTuple):
 
 
 class Live:
-    """The newest frame of a source, with everything that the page shows of it. `start` begins, `stop` ends.
+    """The newest frame of a source, with everything that the page shows of it.
 
-    `space` holds known touches of the encoder. A head can be taught in the folder `out`, and replaces `head`.
+    `start` begins, `stop` ends.
+
+    `space` holds known touches of the encoder. A head can be taught in the folder `out`, and
+    replaces `head`.
     """
 
     kind = "live"
@@ -179,7 +189,10 @@ class Live:
             self._thread.join(3)
 
     def orient(self, rotate: int, flip: Flip) -> None:
-        """Turn the frames clockwise by `rotate` degrees, then mirror them. The untouched gel is estimated again."""
+        """Turn the frames clockwise by `rotate` degrees, then mirror them.
+
+        The untouched gel is estimated again.
+        """
         with self._lock:
             self._setup = self._with_gel(rotate, flip, None)
 
@@ -194,7 +207,10 @@ class Live:
             self.set_background(self._setup.turned(self._kept[-1].raw))
 
     async def packets(self, layer: str) -> AsyncIterator[bytes]:
-        """Yield each newest frame as a layer: length u32, JSON, length u32, JPEG, little endian. It takes no thread."""
+        """Yield each newest frame as a layer: length u32, JSON, length u32, JPEG, little endian.
+
+        It takes no thread.
+        """
         seen = 0
         while not self._stopped:
             newest = self._newest
@@ -205,7 +221,9 @@ class Live:
                 yield await asyncio.to_thread(_packet, newest, layer)
 
     def set_background(self, picture: Array | None) -> None:
-        """Take a picture RGB u8 (h, w, 3) as the untouched gel, or None to estimate it from the next frames."""
+        """Take a picture RGB u8 (h, w, 3) as the untouched gel, or None to estimate it from the
+        next frames.
+        """
         with self._lock:
             self._setup = self._with_gel(self._setup.rotate, self._setup.flip, picture)
 
@@ -222,7 +240,9 @@ class Live:
         return _Setup(rotate, flip, estimate, gel, small, Preprocess(self._encoder, gel), measure)
 
     def _find_gel(self, setup: _Setup, picture: Array) -> _Setup:
-        """Look for the untouched gel by the rule of `data.gels`: that of the head's unit, or a running estimate."""
+        """Look for the untouched gel by the rule of `data.gels`: that of the head's unit, or a
+        running estimate.
+        """
         running = setup.running
         head = self.teacher.head or self._head
         if running is None:
@@ -243,7 +263,9 @@ class Live:
         return self._replace(setup, running.picture, running)
 
     def _replace(self, setup: _Setup, gel: Array | None, running: RunningGel | None) -> _Setup:
-        """Return a setup with another untouched gel, and use it if the page has not asked for another meanwhile."""
+        """Return a setup with another untouched gel, and use it if the page has not asked for
+        another meanwhile.
+        """
         new = self._with_gel(setup.rotate, setup.flip, gel, running)
         with self._lock:
             if self._setup is setup:
@@ -251,7 +273,9 @@ class Live:
         return new
 
     def _prepare(self, picture: Any) -> Array:
-        """Keep the picture of a frame and return it for the encoder: frames come here one by one, from 0."""
+        """Keep the picture of a frame and return it for the encoder: frames come here one by one,
+        from 0.
+        """
         setup = self._setup
         turned = setup.turned(picture)
         setup = self._find_gel(setup, turned)

@@ -1,7 +1,7 @@
 """The server of the page: an ASGI application with JSON, pictures and the live stream.
 
-No address names a file. Other web sites cannot read or change anything. The name of the host is checked, there are no
-CORS headers, and every change needs a header that another site cannot send.
+No address names a file. Other web sites cannot read or change anything. The name of the host is
+checked, there are no CORS headers, and every change needs a header that another site cannot send.
 """
 
 from __future__ import annotations
@@ -56,7 +56,10 @@ LOCAL = ("127.0.0.1", "localhost", "::1")
 HEADER = "x-anytouch"
 _SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
 _ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
-_POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob: data:"
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' "
+    "blob: data:"
+)
 _SAFE = {
     "Content-Security-Policy": f"{_POLICY}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -70,7 +73,9 @@ Source: TypeAlias = "StartPage | Table | FeatureMap | Run | Live"
 
 
 class StartPage:
-    """The first page without anything to show: the cameras of this machine, which `open_camera` opens."""
+    """The first page without anything to show: the cameras of this machine, which `open_camera`
+    opens.
+    """
 
     kind = "start"
     name = "start"
@@ -88,9 +93,12 @@ class StartPage:
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
-    """Return what the page shows of each path: a manifest, a folder, a film, features or a run. Raises UserError.
+    """Return what the page shows of each path: a manifest, a folder, a film, features or a run.
 
-    Features show the pictures of a table among the paths, or of the manifest in their folder that they were made from.
+    Raises UserError.
+
+    Features show the pictures of a table among the paths, or of the manifest in their folder that
+    they were made from.
     """
     tables = list[Table]()
     sources = list[Source]()
@@ -100,7 +108,8 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
             tables.append(open_examples())
         elif not path.exists():
             raise UserError(
-                f"There is no {path}. Name a manifest, a folder, a film, features, a run or a camera."
+                f"There is no {path}. Name a manifest, a folder, a film, features, a run or a "
+                "camera."
             )
         elif path.suffix.lower() == ".npz":
             features.append(path)
@@ -148,7 +157,8 @@ def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
 def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
     """Return the ASGI application of the page.
 
-    With a `token`, requests for data need it. Other names than `hosts` are refused. Cameras are added to `sources`.
+    With a `token`, requests for data need it. Other names than `hosts` are refused. Cameras are
+    added to `sources`.
     """
 
     def source(request: Request, kind: str) -> Any:
@@ -282,7 +292,10 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
 
 
 def serve(sources: list[Source], host: str, port: int, show: Callable[[str], None]) -> None:
-    """Serve the page until Ctrl-C. `show` gets its address. Raises UserError if the port is taken."""
+    """Serve the page until Ctrl-C. `show` gets its address.
+
+    Raises UserError if the port is taken.
+    """
     is_local = host in LOCAL
     token = "" if is_local else secrets.token_urlsafe(18)
     config = uvicorn.Config(
@@ -335,7 +348,10 @@ class _Token:
 
 
 def _open(start: StartPage, order: Any, sources: list[Source]) -> int:
-    """Open the camera that the page asks for, unless it is open, and return its place. Raises UserError."""
+    """Open the camera that the page asks for, unless it is open, and return its place.
+
+    Raises UserError.
+    """
     camera = order.get("camera") if isinstance(order, dict) else None
     if not isinstance(camera, str) or camera not in start.about()["cameras"]:
         raise UserError("There is no such camera. Plug it in, and look again.")

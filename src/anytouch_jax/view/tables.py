@@ -1,7 +1,8 @@
-"""What the page shows of files: touches of a manifest, a folder of pictures or a film, features, and run folders.
+"""What the page shows of files: touches of a manifest, a folder of pictures or a film, features,
+and run folders.
 
-A touch is the recordings (sequences) that share a value of `touch`, or one without. Pictures are read when shown, and
-libraries that take seconds are imported when they are needed.
+A touch is the recordings (sequences) that share a value of `touch`, or one without. Pictures are
+read when shown, and libraries that take seconds are imported when they are needed.
 """
 
 from __future__ import annotations
@@ -73,12 +74,17 @@ class Table:
         self._measured = lru_cache(256)(self._measure)
 
     def about(self) -> dict[str, Any]:
-        """Return the number of rows and touches, and the columns that filter them with their values."""
+        """Return the number of rows and touches, and the columns that filter them with their
+        values.
+        """
         about = {"rows": len(self.manifest), "touches": len(self._touches(()))}
         return about | {"filters": self._filters, "layers": LAYERS}
 
     def touch(self, place: int, filters: dict[str, str]) -> dict[str, Any]:
-        """Return touch `place` among those that pass `filters` {column: value}, and their number. Raises UserError."""
+        """Return touch `place` among those that pass `filters` {column: value}, and their number.
+
+        Raises UserError.
+        """
         if unknown := sorted(filters.keys() - self._filters.keys()):
             raise UserError(f"{unknown[0][:50]} is no filter of this table.")
         chosen = tuple(sorted(filters.items()))
@@ -112,7 +118,9 @@ class Table:
         return decode(self.manifest.file(row, "image_path"))
 
     def layer(self, row: int, name: str) -> tuple[Array, float, Fields | None]:
-        """Return a layer of a row (see `touch_layer`), its contact score, and its fields for the layers MEASURED."""
+        """Return a layer of a row (see `touch_layer`), its contact score, and its fields for the
+        layers MEASURED.
+        """
         frame = self.frame(row)
         gel = self._untouched(row)
         view, score = touch_layer(frame, gel, self.threshold(row), name)
@@ -140,7 +148,9 @@ class Table:
 
     @cached_property
     def _untouched(self) -> Callable[[int], tuple[Array, UntouchedGel] | None]:
-        """A function from a row to its untouched gel, scaled down and to compare, None if it is unknown."""
+        """A function from a row to its untouched gel, scaled down and to compare, None if it is
+        unknown.
+        """
 
         def made(picture: Array) -> tuple[Array, UntouchedGel]:
             return scale_down(picture), UntouchedGel(picture)
@@ -290,8 +300,8 @@ def touch_layer(
 ) -> tuple[Array, float]:
     """Return one of LAYERS as a picture RGB u8 (h, w, 3), and the contact score.
 
-    Without a `gel` (scaled down) of the same proportions, it is the frame, and the score is NaN. For MEASURED it is the
-    frame, too. Raises UserError for another name.
+    Without a `gel` (scaled down) of the same proportions, it is the frame, and the score is NaN.
+    For MEASURED it is the frame, too. Raises UserError for another name.
     """
     if name not in LAYERS:
         raise UserError(f"A touch has the layers {', '.join(LAYERS)}, not {name[:20]}.")
@@ -352,7 +362,9 @@ def open_examples() -> Table:
 
 
 def title(path: Path) -> str:
-    """Return the name of a file or folder for people: a manifest or features are called by their folder."""
+    """Return the name of a file or folder for people: a manifest or features are called by their
+    folder.
+    """
     path = path.absolute()
     plain = (
         path.parent.name
@@ -392,7 +404,9 @@ class Run:
         return {}
 
     def losses(self, start: int) -> dict[str, Any]:
-        """Return lines {step, loss, ...} of metrics.jsonl from byte `start`, the byte after them, and the figures."""
+        """Return lines {step, loss, ...} of metrics.jsonl from byte `start`, the byte after them,
+        and the figures.
+        """
         file = self._folder / "metrics.jsonl"
         lines: list[dict[str, float]] = []
         if file.is_file():
@@ -444,13 +458,18 @@ def _encoder() -> Encoder:
 
 
 def last_clip(frames: Sequence[Array], length: int) -> Array:
-    """Return the last frames as a clip (length, h, w, 3). Before the first of them nothing moved."""
+    """Return the last frames as a clip (length, h, w, 3).
+
+    Before the first of them nothing moved.
+    """
     same = [frame for frame in frames[-length:] if frame.shape == frames[-1].shape]
     return np.stack([same[0]] * (length - len(same)) + same)
 
 
 def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
-    """Return what was measured of a frame as a picture u8 (h, w, 3): "depth" on the frame, or a "surface" in grey."""
+    """Return what was measured of a frame as a picture u8 (h, w, 3): "depth" on the frame, or a
+    "surface" in grey.
+    """
     from anytouch_jax.encoder.fields import depth_levels, overlay
 
     if name == "depth":
@@ -463,7 +482,9 @@ def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
 
 
 def field_numbers(measured: Fields) -> dict[str, Any]:
-    """Return what the page writes of a frame; `high` is the depth of a white place of the surface, in widths."""
+    """Return what the page writes of a frame; `high` is the depth of a white place of the surface,
+    in widths.
+    """
     from anytouch_jax.encoder.fields import depth_levels
 
     about = measured.summary()
@@ -486,7 +507,9 @@ def field_numbers(measured: Fields) -> dict[str, Any]:
 
 
 class FeatureMap:
-    """A features file of `anytouch embed`, with pictures of the first of `tables` that has its rows; or UserError."""
+    """A features file of `anytouch embed`, with pictures of the first of `tables` that has its
+    rows; or UserError.
+    """
 
     kind = "space"
 
@@ -508,7 +531,10 @@ class FeatureMap:
         return about | {"methods": list(METHODS), "from": self.index.about}
 
     def _map(self, method: str) -> dict[str, Any]:
-        """Return points {x, y, rows} in -1..1 of at most METHODS[method] rows, evenly spread. Raises UserError."""
+        """Return points {x, y, rows} in -1..1 of at most METHODS[method] rows, evenly spread.
+
+        Raises UserError.
+        """
         if method not in METHODS:
             raise UserError(f"A map is by {' or '.join(METHODS)}, not {method[:20]}.")
         rows = np.unique(
@@ -532,7 +558,10 @@ class FeatureMap:
         }
 
     def colours(self, method: str, column: str) -> dict[str, Any]:
-        """Return {values} of a column of numbers, or {codes, names}, for the points of a map. Raises UserError."""
+        """Return {values} of a column of numbers, or {codes, names}, for the points of a map.
+
+        Raises UserError.
+        """
         if column not in self.index.keys:
             raise UserError(f"The features have no column {column[:50]}.")
         values = self.index.keys[column][self.map(method)["rows"]]
@@ -550,7 +579,9 @@ class FeatureMap:
         return {"codes": place[codes].tolist(), "names": names}
 
     def neighbours(self, row: int, *, others: bool) -> dict[str, Any]:
-        """Return a row and its ten nearest of other recordings, by cosine; of other sensors with `others`."""
+        """Return a row and its ten nearest of other recordings, by cosine; of other sensors with
+        `others`.
+        """
         if not 0 <= row < len(self._rows):
             raise UserError(f"There are {len(self._rows)} features, no row {row}.")
         allowed = np.ones(len(self._rows), bool)
@@ -564,7 +595,9 @@ class FeatureMap:
     def near(
         self, values: Array, among: Array | None = None, count: int = 10
     ) -> list[dict[str, Any]]:
-        """Return the nearest of `among` rows (m,) to unit features (d,) with cosines, one frame of a recording."""
+        """Return the nearest of `among` rows (m,) to unit features (d,) with cosines, one frame of
+        a recording.
+        """
         from anytouch_jax.encoder.embed import nearest
 
         among = np.arange(len(self._rows)) if among is None else among
@@ -584,7 +617,9 @@ class FeatureMap:
         return {"row": row, "table_row": int(self._rows[row]), "about": self.index.describe(row)}
 
     def _has_rows_of(self, table: Table) -> bool:
-        """Whether the rows of the file are rows of a table: the same frames at the first, middle and last."""
+        """Whether the rows of the file are rows of a table: the same frames at the first, middle
+        and last.
+        """
         few = self._rows[[0, len(self._rows) // 2, -1]]
         if few.min() < 0 or self._rows.max() >= len(table.manifest):
             return False

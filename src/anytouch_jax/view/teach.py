@@ -1,7 +1,8 @@
 """Recordings of live touch, and a classifier that is taught by them.
 
-A recording is a touch with a name: frames in a folder, and rows in its manifest.parquet. The head is fitted as
-`anytouch probe label --save` does. Recordings are left out to calibrate it, and to compare it with raw pixels.
+A recording is a touch with a name: frames in a folder, and rows in its manifest.parquet. The head
+is fitted as `anytouch probe label --save` does. Recordings are left out to calibrate it, and to
+compare it with raw pixels.
 """
 
 import math
@@ -56,7 +57,9 @@ SCORE = "label.contact_score"
 
 
 class LiveRecorder:
-    """Writes frames of recordings into a folder, which is hidden until it is whole, and then its manifest.parquet."""
+    """Writes frames of recordings into a folder, which is hidden until it is whole, and then its
+    manifest.parquet.
+    """
 
     def __init__(self, out: Path, sensor: str | None) -> None:
         self.out = out.expanduser().resolve()
@@ -112,7 +115,9 @@ class LiveRecorder:
         self._queue = waiting
 
     def add(self, picture: Array, score: float, values: Array) -> None:
-        """Store a frame RGB u8 (h, w, 3), its contact score, NaN if unknown, and its features if a recording is on."""
+        """Store a frame RGB u8 (h, w, 3), its contact score, NaN if unknown, and its features if a
+        recording is on.
+        """
         waiting = self._queue
         if waiting is not None and waiting.qsize() < _WAITING:
             waiting.put((picture, score, values))
@@ -185,7 +190,9 @@ class LiveRecorder:
 
 
 class Teacher:
-    """The recordings of a folder, and the `head` that was fitted on them with its features, for the next start too."""
+    """The recordings of a folder, and the `head` that was fitted on them with its features, for the
+    next start too.
+    """
 
     def __init__(
         self,
@@ -220,7 +227,9 @@ class Teacher:
         self.version += 1
 
     def about(self) -> dict[str, Any]:
-        """Return the names with their recordings, what is known of the head, and what is missing for one."""
+        """Return the names with their recordings, what is known of the head, and what is missing
+        for one.
+        """
         names: dict[str, dict[str, Any]] = {}
         if self.table is not None:
             manifest = self.table.manifest
@@ -255,7 +264,10 @@ class Teacher:
         }
 
     def train(self) -> None:
-        """Fit a head on all recordings, in a thread. Raises UserError without two names, and while one is fitted."""
+        """Fit a head on all recordings, in a thread.
+
+        Raises UserError without two names, and while one is fitted.
+        """
         if missing := self.about()["missing"]:
             raise UserError(missing)
         if not self._training.acquire(blocking=False):
@@ -276,7 +288,9 @@ class Teacher:
         self.reload()
 
     def archive(self) -> IO[bytes]:
-        """Return a ZIP of the recordings: the manifest and its pictures, and the head with its features."""
+        """Return a ZIP of the recordings: the manifest and its pictures, and the head with its
+        features.
+        """
         out = self._recorder.out
         files = {self._recorder.file, self.head_file, self._features}
         if self.table is not None:
@@ -331,7 +345,8 @@ class Teacher:
         if encoder.subtracts:
             head = replace(head, gels=gels.pictures(ids))
         if several:
-            # What so few recordings can promise: a share of 0.9 takes nine. A fold that lacks a name is not counted.
+            # What so few recordings can promise: a share of 0.9 takes nine. A fold that lacks a
+            # name is not counted.
             once = len(recorded) - several
             count = max(1, several - once * math.ceil(len(recorded) / splits.FOLDS))
             shares = {"coverage": min(COVERAGE, math.floor(100 * count / (count + 1)) / 100)}
@@ -366,7 +381,9 @@ class Teacher:
             self._use(head)
 
     def _embed(self, table: Manifest, ids: Array) -> Array:
-        """Return features (n, d) of rows: those that live touch had, and those of frames recorded before."""
+        """Return features (n, d) of rows: those that live touch had, and those of frames recorded
+        before.
+        """
         features = self._recorder.features
         paths = table.text_column("path")[ids].tolist()
         unknown = [place for place, path in enumerate(paths) if path not in features]
@@ -375,13 +392,17 @@ class Teacher:
             found, values = embed_rows(self._encoder, table, ids[unknown], **about)
             if len(found) < len(unknown):
                 raise UserError(
-                    f"{len(unknown) - len(found)} recorded frames have no picture of the untouched gel."
+                    f"{len(unknown) - len(found)} recorded frames have no picture of the untouched "
+                    "gel."
                 )
             features |= {paths[place]: one for place, one in zip(unknown, values, strict=True)}
         return np.stack([features[path] for path in paths])
 
     def _use(self, head: LinearHead) -> None:
-        """Let live touch be named by a head that lies in the folder. Raises UserError for one of another encoder."""
+        """Let live touch be named by a head that lies in the folder.
+
+        Raises UserError for one of another encoder.
+        """
         self.reload()
         space = FeatureMap(self._features, [] if self.table is None else [self.table])
         head.check(self._encoder.source, self._encoder.fingerprint, self._pooling, 1)
@@ -403,7 +424,9 @@ _RESULT = (
 
 
 def _measure(x: Array, pixels: Array, rows: TaskRows, tested: Array) -> dict[str, float]:
-    """Return the accuracy of features and of raw pixels on recordings that are left out, for `tested` (n,) rows."""
+    """Return the accuracy of features and of raw pixels on recordings that are left out, for
+    `tested` (n,) rows.
+    """
     result = {
         "chance": float(np.unique(rows.labels[tested], return_counts=True)[1].max() / tested.sum())
     }
@@ -420,7 +443,9 @@ def _measure(x: Array, pixels: Array, rows: TaskRows, tested: Array) -> dict[str
 
 
 def _typical(table: Manifest, rows: TaskRows, threshold: float) -> Array:
-    """Return places of rows to fit on: at most _FRAMES of a recording, those with contact where there are any."""
+    """Return places of rows to fit on: at most _FRAMES of a recording, those with contact where
+    there are any.
+    """
     scores = table.number_column(SCORE)
     chosen = []
     for group in dict.fromkeys(rows.groups.tolist()):

@@ -1,13 +1,15 @@
-"""Checkpoints of a run: the one file that knows Orbax (its v1 API), and the record that each checkpoint has of itself.
+"""Checkpoints of a run: the one file that knows Orbax (its v1 API), and the record that each
+checkpoint has of itself.
 
-A checkpoint is a folder `<checkpoints>/<step>` that appears whole or not at all: it is written under another name, then
-renamed. Its `checkpoint.json` stores config, metadata, metrics, and the size and checksum of every file, and a folder
-is read only if its files match. Arrays are stored by name: parameters can be read without the optimiser.
+A checkpoint is a folder `<checkpoints>/<step>` that appears whole or not at all: it is written
+under another name, then renamed. Its `checkpoint.json` stores config, metadata, metrics, and the
+size and checksum of every file, and a folder is read only if its files match. Arrays are stored by
+name: parameters can be read without the optimiser.
 """
 
-# Orbax's `training.Checkpointer` renames a folder itself once the arrays are written. Our record needs the checksums of
-# the written files, and must be in the folder before that rename: a kill between the two left a checkpoint that could
-# not be verified. So the rename is ours.
+# Orbax's `training.Checkpointer` renames a folder itself once the arrays are written. Our record
+# needs the checksums of the written files, and must be in the folder before that rename: a kill
+# between the two left a checkpoint that could not be verified. So the rename is ours.
 
 from __future__ import annotations
 
@@ -55,11 +57,15 @@ _ORBAX = threading.Lock()
 
 
 class CheckpointError(UserError):
-    """A checkpoint that cannot be written or read; the message is one sentence that names the path."""
+    """A checkpoint that cannot be written or read; the message is one sentence that names the
+    path.
+    """
 
 
 def quiet_hook(hook: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an exception hook without what Tensorstore's threads raise for each write after the first failed one."""
+    """Return an exception hook without what Tensorstore's threads raise for each write after the
+    first failed one.
+    """
 
     def quiet(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         if kind is not RuntimeError or str(error) != "Event loop is closed":
@@ -74,10 +80,12 @@ sys.excepthook = quiet_hook(sys.excepthook)
 
 
 class Checkpoints:
-    """The checkpoints of one run: asynchronous saves, of which the last `keep` and the best (lowest `loss`) are kept.
+    """The checkpoints of one run: asynchronous saves, of which the last `keep` and the best (lowest
+    `loss`) are kept.
 
-    `config_json` and `metadata` (JSON values) are stored with every checkpoint. Leftovers of a killed run in `folder`
-    are removed. Every process of a multi-process run makes one; process 0 renames and removes.
+    `config_json` and `metadata` (JSON values) are stored with every checkpoint. Leftovers of a
+    killed run in `folder` are removed. Every process of a multi-process run makes one; process 0
+    renames and removes.
     """
 
     def __init__(
@@ -93,20 +101,25 @@ class Checkpoints:
         self._sweep()
 
     def check_space(self, state: Tree) -> None:
-        """Raise CheckpointError if the disk has less space than `state` takes: a save would find out late."""
+        """Raise CheckpointError if the disk has less space than `state` takes: a save would find
+        out late.
+        """
         needed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
         disk = shutil.disk_usage(self.folder)
         if disk.total and disk.free < needed and jax.process_count() == 1:
             raise CheckpointError(
-                f"cannot write a checkpoint in {self.folder}: the disk is full. It needs {needed:,} bytes and has "
-                f"{disk.free:,}. Free some space and run the same command again. Older checkpoints are untouched."
+                f"cannot write a checkpoint in {self.folder}: the disk is full. It needs "
+                f"{needed:,} bytes and has "
+                f"{disk.free:,}. Free some space and run the same command again. Older checkpoints "
+                "are untouched."
             )
 
     def save(self, step: int, state: Tree, metrics: Mapping[str, Any]) -> None:
-        """Start saving `state`, a pytree of arrays; it may be donated or changed as soon as this returns.
+        """Start saving `state`, a pytree of arrays; it may be donated or changed as soon as this
+        returns.
 
-        Waits for the previous save first, and raises its CheckpointError. A step that was saved before is replaced
-        when the new one is complete.
+        Waits for the previous save first, and raises its CheckpointError. A step that was saved
+        before is replaced when the new one is complete.
         """
         self.wait()
         self._sweep()  # threads of a failed save may have written on
@@ -146,7 +159,10 @@ class Checkpoints:
             raise
 
     def wait(self) -> None:
-        """Block until the running save is on disk. Raises CheckpointError if it failed (a full disk)."""
+        """Block until the running save is on disk.
+
+        Raises CheckpointError if it failed (a full disk).
+        """
         if self._pending is None:
             return
         (target, future, _) = self._pending
@@ -165,10 +181,12 @@ class Checkpoints:
         return max(steps(self.folder), default=None)
 
     def restore(self, abstract_state: Tree, step: int | None = None) -> Tree:
-        """Return the state of `step` (None: the latest), with the structure and shardings of `abstract_state`.
+        """Return the state of `step` (None: the latest), with the structure and shardings of
+        `abstract_state`.
 
-        `abstract_state` is a tree of `jax.ShapeDtypeStruct` or arrays. A leaf without sharding goes to the first
-        device. Raises CheckpointError if the checkpoint is missing or damaged, or if names, shapes or types differ.
+        `abstract_state` is a tree of `jax.ShapeDtypeStruct` or arrays. A leaf without sharding goes
+        to the first device. Raises CheckpointError if the checkpoint is missing or damaged, or if
+        names, shapes or types differ.
         """
         self.wait()
         folder = resolve(self.folder, step)
@@ -190,7 +208,10 @@ class Checkpoints:
         )
 
     def close(self) -> None:
-        """Finish the running save and its housekeeping. Raises CheckpointError if the save failed."""
+        """Finish the running save and its housekeeping.
+
+        Raises CheckpointError if the save failed.
+        """
         self.wait()
         self._worker.shutdown()
 
@@ -200,7 +221,9 @@ class Checkpoints:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """`close` at the end of a context; after an error in one of several processes, wait at most half a minute."""
+        """`close` at the end of a context; after an error in one of several processes, wait at most
+        half a minute.
+        """
         if error is None or jax.process_count() == 1:
             self.close()
             return
@@ -216,7 +239,9 @@ class Checkpoints:
     def _finish(
         self, target: Path, response: Any, content: dict[str, Any], release: Callable[[], None]
     ) -> None:
-        """Write the record once the arrays are on disk, rename, and remove old checkpoints (on the worker thread)."""
+        """Write the record once the arrays are on disk, rename, and remove old checkpoints (on the
+        worker thread).
+        """
         try:
             response.result()
         finally:
@@ -240,7 +265,9 @@ class Checkpoints:
 
     @contextmanager
     def _one_sentence(self, path: Path) -> Iterator[None]:
-        """Turn an error of the storage layers while writing into a CheckpointError, and remove the debris."""
+        """Turn an error of the storage layers while writing into a CheckpointError, and remove the
+        debris.
+        """
         try:
             yield
         except Exception as error:  # Orbax and tensorstore wrap OSError in several types
@@ -263,7 +290,10 @@ class Checkpoints:
 
 
 def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]:
-    """Return metadata, `step`, `config` (JSON) and `metrics` of a run or checkpoint. Raises CheckpointError."""
+    """Return metadata, `step`, `config` (JSON) and `metrics` of a run or checkpoint.
+
+    Raises CheckpointError.
+    """
     return _description(read_record(resolve(Path(folder), step)))
 
 
@@ -272,8 +302,8 @@ def load_params(
 ) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Return (parameters as a nested dict of numpy arrays, config JSON, metadata) of a checkpoint.
 
-    `folder` is a run, its checkpoints folder, or one checkpoint. If a running run removes the latest meanwhile, the
-    next one is read. Raises CheckpointError.
+    `folder` is a run, its checkpoints folder, or one checkpoint. If a running run removes the
+    latest meanwhile, the next one is read. Raises CheckpointError.
     """
     for _ in range(_TRIES if step is None else 1):
         target = resolve(Path(folder), step)
@@ -309,7 +339,9 @@ def load_params(
 
 
 def _acquire_orbax() -> Callable[[], None]:
-    """Wait until no other operation of Orbax runs; return its release, which any thread may call, also twice."""
+    """Wait until no other operation of Orbax runs; return its release, which any thread may call,
+    also twice.
+    """
     stack = ExitStack()
     stack.callback(_ORBAX.release)
     _ORBAX.acquire()
@@ -321,7 +353,9 @@ def _writing(target: Path) -> Path:
 
 
 def _discard(target: Path) -> None:
-    """Remove a checkpoint: renamed first, so that a kill halfway leaves nothing that looks complete."""
+    """Remove a checkpoint: renamed first, so that a kill halfway leaves nothing that looks
+    complete.
+    """
     doomed = target.with_name(f"{target.name}.deleted")
     shutil.rmtree(doomed, ignore_errors=True)
     target.rename(doomed)
@@ -329,7 +363,10 @@ def _discard(target: Path) -> None:
 
 
 def _load(folder: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the named arrays that are not empty, of the types of `wanted`. Raises CheckpointError for other shapes."""
+    """Return the named arrays that are not empty, of the types of `wanted`.
+
+    Raises CheckpointError for other shapes.
+    """
     # a wrong JAX_PLATFORMS is no fault of the checkpoint
     jax.local_devices()
     context = ocp.Context()
@@ -364,7 +401,9 @@ def _forms(record: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Raise CheckpointError that names up to five entries if a checkpoint does not have the wanted form."""
+    """Raise CheckpointError that names up to five entries if a checkpoint does not have the wanted
+    form.
+    """
 
     def form(like: Any) -> str:
         if like is None:
@@ -382,8 +421,10 @@ def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any])
     ]
     if differing:
         raise CheckpointError(
-            f"checkpoint {folder} does not fit this configuration, use the preset and settings it was trained with; "
-            f"{len(differing)} entries differ ({'; '.join(differing[:_LISTED])}{'; ...' * (len(differing) > _LISTED)})"
+            f"checkpoint {folder} does not fit this configuration, use the preset and settings it "
+            "was trained with; "
+            f"{len(differing)} entries differ "
+            f"({'; '.join(differing[:_LISTED])}{'; ...' * (len(differing) > _LISTED)})"
         )
 
 
@@ -397,7 +438,9 @@ def _description(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def best_of(folder: Path) -> int | None:
-    """Return the step of lowest loss over many steps in a folder, the latest of equals; None if no loss is known."""
+    """Return the step of lowest loss over many steps in a folder, the latest of equals; None if no
+    loss is known.
+    """
     losses: dict[int, float] = {}
     for step in steps(folder):
         # `restore` reports a damaged one
@@ -428,7 +471,9 @@ def is_run(folder: Path) -> bool:
 
 
 def resolve(folder: Path, step: int | None) -> Path:
-    """Return the folder of one checkpoint, from a run, a folder of checkpoints or that folder itself."""
+    """Return the folder of one checkpoint, from a run, a folder of checkpoints or that folder
+    itself.
+    """
     folder = folder.absolute()
     if (folder / "checkpoints").is_dir():
         folder = folder / "checkpoints"
@@ -468,7 +513,10 @@ def write_record(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return the record of a checkpoint folder. Raises CheckpointError if it is missing, foreign or damaged."""
+    """Return the record of a checkpoint folder.
+
+    Raises CheckpointError if it is missing, foreign or damaged.
+    """
     path = folder / RECORD
     if not path.is_file():
         raise CheckpointError(f"{folder} is not a checkpoint of this program: it has no {RECORD}")
@@ -539,7 +587,9 @@ _FIELDS: dict[str, tuple[type, Callable[[str, Any], bool]]] = {
 
 
 def checked(folder: Path) -> dict[str, Any]:
-    """Return the record of a checkpoint whose files are whole; an error names an older step that is."""
+    """Return the record of a checkpoint whose files are whole; an error names an older step that
+    is.
+    """
     try:
         return _verified(folder)
     except CheckpointError as error:
@@ -552,7 +602,10 @@ def checked(folder: Path) -> dict[str, Any]:
 
 
 def _verified(folder: Path) -> dict[str, Any]:
-    """Return the record after comparing every file with it. Raises CheckpointError that names the first bad file."""
+    """Return the record after comparing every file with it.
+
+    Raises CheckpointError that names the first bad file.
+    """
     record = read_record(folder)
     for name, (size, checksum) in record["files"].items():
         path = folder / name

@@ -1,7 +1,9 @@
-"""Weight conversion: files of the authors, HF CLIP and OpenCLIP to our parameters, and back to the authors' layout.
+"""Weight conversion: files of the authors, HF CLIP and OpenCLIP to our parameters, and back to the
+authors' layout.
 
-Every key of a file is accounted for. One error counts the keys that are unknown, missing or of another shape. Weights
-are fitted to a model: checks of its form, resized positions, sensor rows by name.
+Every key of a file is accounted for. One error counts the keys that are unknown, missing or of
+another shape. Weights are fitted to a model: checks of its form, resized positions, sensor rows by
+name.
 """
 
 from __future__ import annotations
@@ -58,7 +60,10 @@ KEYMAPS = {keymap.name: keymap for keymap in (STAGE2, STAGE1, PROBE, OPENCLIP, H
 
 
 def detect_layout(weights: Weights) -> str:
-    """Return the name of a file's key map: stage1, stage2, probe, clip, openclip or own. Raises WeightsError."""
+    """Return the name of a file's key map: stage1, stage2, probe, clip, openclip or own.
+
+    Raises WeightsError.
+    """
     for keymap in KEYMAPS.values():
         if any(re.fullmatch(keymap.mark, key) for key in weights):
             return keymap.name
@@ -69,15 +74,17 @@ def detect_layout(weights: Weights) -> str:
 
 
 def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, int]]:
-    """Return the model that a file was made for, from the shapes of its arrays, and stacks of unknown head counts.
+    """Return the model that a file was made for, from the shapes of its arrays, and stacks of
+    unknown head counts.
 
-    Counts that neither `heads` nor a published width gives are 1, and the second value has these widths. A CLIP file
-    gets the authors' decoder. Raises WeightsError.
+    Counts that neither `heads` nor a published width gives are 1, and the second value has these
+    widths. A CLIP file gets the authors' decoder. Raises WeightsError.
     """
     layout = detect_layout(weights)
     if layout == "own":
         raise WeightsError(
-            "its metadata lack the model; write the file again by `anytouch export --to safetensors`"
+            "its metadata lack the model; write the file again by `anytouch export --to "
+            "safetensors`"
         )
     try:
         return KEYMAPS[layout].detect(weights, heads)
@@ -88,7 +95,8 @@ def detect_form(weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, 
         TypeError,
     ) as error:  # an array is missing or has an odd shape
         raise WeightsError(
-            f"the model cannot be detected from these {layout} weights: {error} is missing or of an odd shape"
+            f"the model cannot be detected from these {layout} weights: {error} is missing or of "
+            "an odd shape"
         ) from None
 
 
@@ -98,7 +106,8 @@ def refuse_unknown(stacks: Mapping[str, int]) -> None:
         names = " and ".join(f"{name} (width {width})" for name, width in stacks.items())
         example = ", ".join(f'"{name}": {{"heads": N}}' for name in stacks)
         raise WeightsError(
-            f"the weights do not store the number of attention heads of {names}. Write it to a config.json "
+            f"the weights do not store the number of attention heads of {names}. Write it to a "
+            "config.json "
             f'in its folder, as {{"model": {{{example}}}}}. Or write the file by `anytouch export --to safetensors`, '
             "which stores it."
         )
@@ -113,9 +122,9 @@ def to_params(
 ) -> Params:
     """Return the parameters of a file as a nested dict of float32 arrays under our names.
 
-    Left out are parts that `model` lacks, buffers, the authors' unused arrays (golden Q2) and the keys in `ignore`.
-    Position tables are resized. A probe file gives its classifier as `head`. A file may lack those in `optional`.
-    Raises WeightsError.
+    Left out are parts that `model` lacks, buffers, the authors' unused arrays (golden Q2) and the
+    keys in `ignore`. Position tables are resized. A probe file gives its classifier as `head`. A
+    file may lack those in `optional`. Raises WeightsError.
     """
     layout = detect_layout(weights)
     shapes = param_shapes(model)
@@ -147,7 +156,10 @@ def to_params(
 def fill(
     entries: Sequence[Entry], arrays: Weights, shapes: Mapping[str, Shape]
 ) -> dict[str, np.ndarray]:
-    """Return our parameters by name, in float32, from the arrays of a file. Each number is copied once."""
+    """Return our parameters by name, in float32, from the arrays of a file.
+
+    Each number is copied once.
+    """
     flat = {
         name: np.empty(shapes[name], np.float32)
         for name in dict.fromkeys(entry.name for entry in entries)
@@ -163,20 +175,24 @@ def fill(
 def to_release(
     params: Params, model: ModelConfig, *, allow_extra: bool = False
 ) -> dict[str, np.ndarray]:
-    """Return the parameters under the authors' names: stage 2 if `params` has a tower, else stage 1.
+    """Return the parameters under the authors' names: stage 2 if `params` has a tower, else stage
+    1.
 
-    Arrays that the authors' loader expects and never reads are filled in. The matching MLP of the paper has no place
-    in those files: it is refused, or stored as `cross_sensor_mlp.*` with `allow_extra`. Raises WeightsError.
+    Arrays that the authors' loader expects and never reads are filled in. The matching MLP of the
+    paper has no place in those files: it is refused, or stored as `cross_sensor_mlp.*` with
+    `allow_extra`. Raises WeightsError.
     """
     flat = {name: np.asarray(array, np.float32) for name, array in flatten(params).items()}
     keymap = STAGE2 if "image" in params or "text" in params else STAGE1
     if model.match_head == "mlp" and keymap is STAGE2 and not allow_extra:
         raise WeightsError(
-            "the matching MLP of recipe paper has no counterpart in the authors' files; allow extra keys to store it"
+            "the matching MLP of recipe paper has no counterpart in the authors' files; allow "
+            "extra keys to store it"
         )
     if model.patch_encoder != "shared":
         raise WeightsError(
-            "the authors' files have one patch projection for all sensors; this model has one for each"
+            "the authors' files have one patch projection for all sensors; this model has one for "
+            "each"
         )
     if model.sensors[-1] != UNIVERSAL:
         last = model.sensors[-1]
@@ -196,7 +212,9 @@ def to_release(
 
 
 def check_arrays(title: str, arrays: Mapping[str, Any], wanted: Mapping[str, Shape]) -> None:
-    """Raise WeightsError unless the arrays have the wanted names and shapes; it counts and names the others."""
+    """Raise WeightsError unless the arrays have the wanted names and shapes; it counts and names
+    the others.
+    """
     lists = {
         "unknown keys": [key for key in arrays if key not in wanted],
         "missing keys": [key for key in wanted if key not in arrays],
@@ -268,16 +286,21 @@ _FORM += ("touch.heads", "decoder.heads", "norm_eps", "decoder_norm_eps", "pre_n
 
 
 def check_activation(path: Path, trained: str | None, config: Config) -> None:
-    """Raise UserError if weights were trained with another activation than the run's; None means unknown."""
+    """Raise UserError if weights were trained with another activation than the run's; None means
+    unknown.
+    """
     ours = config.model.activation
     if trained not in (None, ours):
         raise UserError(
-            f"{path} was trained with {trained}, this run would use {ours}: add --model.activation {trained}"
+            f"{path} was trained with {trained}, this run would use {ours}: add --model.activation "
+            f"{trained}"
         )
 
 
 def check_form(path: Path, before: ModelConfig, config: Config, preset: str = "custom") -> None:
-    """Raise UserError with the missing options if weights, of this preset, belong to another network than the run's."""
+    """Raise UserError with the missing options if weights, of this preset, belong to another
+    network than the run's.
+    """
     pairs = {
         name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in _FORM
     }
@@ -307,7 +330,9 @@ def _option(name: str, value: Any) -> str:
 
 
 def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) -> None:
-    """Raise UserError if CLIP's image tower has another size than the run's image tower or, with `touch`, encoder."""
+    """Raise UserError if CLIP's image tower has another size than the run's image tower or, with
+    `touch`, encoder.
+    """
     theirs = (clip.touch.width, clip.touch.depth, clip.patch)
     for name, stack in (
         ("image tower", config.model.image),
@@ -320,20 +345,25 @@ def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) ->
             for width, depth, patch in (theirs, ours)
         ]
         raise UserError(
-            f"the image tower in {path} has {sizes[0]}, this run's {name} {sizes[1]}: --preset large fits ViT-L/14, "
+            f"the image tower in {path} has {sizes[0]}, this run's {name} {sizes[1]}: --preset "
+            "large fits ViT-L/14, "
             "--preset base fits ViT-B/16; add the one that fits, or give other --clip-weights"
         )
 
 
 def match_sensors(table: np.ndarray, stored: Sequence[str], wanted: Sequence[str]) -> np.ndarray:
-    """Return a table's rows (R, ...) by name from `stored` to `wanted`; a new sensor gets the universal row."""
+    """Return a table's rows (R, ...) by name from `stored` to `wanted`; a new sensor gets the
+    universal row.
+    """
     return np.stack([table[stored.index(name if name in stored else UNIVERSAL)] for name in wanted])
 
 
 def map_sensors(
     touch: Params, model: ModelConfig, change: Callable[[np.ndarray], np.ndarray]
 ) -> Params:
-    """Return a touch encoder with its tables of sensors changed: the tokens, and the patch kernels if each has one."""
+    """Return a touch encoder with its tables of sensors changed: the tokens, and the patch kernels
+    if each has one.
+    """
     changed: Params = {"sensor_tokens": change(np.asarray(touch["sensor_tokens"]))}
     if model.patch_encoder == "sensor":
         changed["patch"] = {"kernel": change(np.asarray(touch["patch"]["kernel"]))}
@@ -343,7 +373,9 @@ def map_sensors(
 def serve_unseen(
     touch: Params, model: ModelConfig, trained: Sequence[str], *, universal_drawn: bool
 ) -> Params:
-    """Return a touch encoder whose untrained sensors have the universal row (Sec. 3.5), or the mean if never drawn."""
+    """Return a touch encoder whose untrained sensors have the universal row (Sec. 3.5), or the mean
+    if never drawn.
+    """
     rows = [row for row, name in enumerate(model.sensors) if name in trained and name != UNIVERSAL]
     unseen = [row for row in range(len(model.sensors)) if row not in rows]
     if not rows:
@@ -358,10 +390,11 @@ def serve_unseen(
 
 
 def resize_position(table: np.ndarray, rows: int) -> np.ndarray:
-    """Return a (1 + M, D) table of a square grid resized to (`rows`, D); row 0, the class token's, is unchanged.
+    """Return a (1 + M, D) table of a square grid resized to (`rows`, D); row 0, the class token's,
+    is unchanged.
 
-    Equal to torch's `interpolate(mode="bicubic", align_corners=False, antialias=False)`, computed in float64.
-    Raises ValueError if either grid is not square.
+    Equal to torch's `interpolate(mode="bicubic", align_corners=False, antialias=False)`, computed
+    in float64. Raises ValueError if either grid is not square.
     """
     old = math.isqrt(len(table) - 1)
     new = math.isqrt(rows - 1)

@@ -1,4 +1,6 @@
-"""Families of encoders that others published: how their files are recognised and read, and how they are fed."""
+"""Families of encoders that others published: how their files are recognised and read, and how they
+are fed.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,12 @@ _HEADS = {192: 3, 1152: 16} | VISION_HEADS
 
 @dataclass(frozen=True)
 class Preparation:
-    """How a family prepares a frame RGB u8, in this order. A config.json may change it (`"preparation"`).
+    """How a family prepares a frame RGB u8, in this order.
 
-    `difference`: Sparsh's frame - background + 127 in whole grey levels, AnyTouch 2's + 130 in floats, or SITR's plain
-    difference without an offset, in grey levels.
+    A config.json may change it (`"preparation"`).
+
+    `difference`: Sparsh's frame - background + 127 in whole grey levels, AnyTouch 2's + 130 in
+    floats, or SITR's plain difference without an offset, in grey levels.
     """
 
     background: Literal["keep", "subtract", "either"] = "keep"
@@ -67,9 +71,9 @@ class Preparation:
 class Family:
     """One layout of a family's files.
 
-    A file is of the family if, after one of the `prefixes`, it has all keys in `needs` and none in `lacks`, and
-    `beside` without the prefix. The patch kernel, first of `needs`, has five axes for `video`. Keys in `unused` (a
-    regex) are not read. `renamed` comes first.
+    A file is of the family if, after one of the `prefixes`, it has all keys in `needs` and none in
+    `lacks`, and `beside` without the prefix. The patch kernel, first of `needs`, has five axes for
+    `video`. Keys in `unused` (a regex) are not read. `renamed` comes first.
     """
 
     name: str
@@ -97,7 +101,9 @@ class Family:
     bare_class: bool = False  # The stored positions have none of the class token.
 
     def weights(self, weights: Weights) -> dict[str, np.ndarray] | None:
-        """Return the arrays of the encoder without their prefix, None if the file is of another family."""
+        """Return the arrays of the encoder without their prefix, None if the file is of another
+        family.
+        """
         if self.beside is not None and self.beside not in weights:
             return None
         for prefix in self.prefixes:
@@ -147,7 +153,8 @@ FAMILIES = (
     Family(
         "anytouch2", "AnyTouch 2", "MIT", "GelSight, DIGIT, GelSight Mini, DuraGel by tokens",
         keymaps.ANYTOUCH2, ("touch_model.embeddings.patch_embedding.weight", "sensor_token"),
-        Preparation("subtract", "offset", mean=CLIP_MEAN, std=CLIP_STD),  # not ImageNet's, unlike AnyTouch
+        # not ImageNet's, unlike AnyTouch
+        Preparation("subtract", "offset", mean=CLIP_MEAN, std=CLIP_STD),
         lacks=("video_patch_embedding.weight",), prefixes=("touch_mae_model.",), eps=1e-5, frames=4, video=True,
         unused=r"(decoder|mask_token|new_position_ids).*", feature="projected", tokens="hidden",
         names=("gelsight", "digit", "sensor2", "gelsight_mini", "duragel"),
@@ -218,7 +225,9 @@ FAMILIES = (
 
 @dataclass(frozen=True)
 class FamilyModel:
-    """An encoder of a family, as its file has it: the form of its network, its preparation, its parameters."""
+    """An encoder of a family, as its file has it: the form of its network, its preparation, its
+    parameters.
+    """
 
     family: Family
     form: VitConfig
@@ -269,7 +278,10 @@ def _refuse_relatives(path: Path, weights: Weights) -> None:
 def load_family(
     path: Path, *, heads: int | None = None, image_size: Any = None
 ) -> tuple[FamilyModel | None, Weights | None]:
-    """Return the encoder of a family's file or folder, or None, and the arrays that were read. Raises WeightsError."""
+    """Return the encoder of a family's file or folder, or None, and the arrays that were read.
+
+    Raises WeightsError.
+    """
     if not path.exists() or path.suffix.lower() == ".npz" or load.is_run_folder(path):
         return None, None
     trunks = (
@@ -299,7 +311,8 @@ def load_family(
         ), weights
     if trunk is None:
         raise WeightsError(
-            f"{file} has no final norm; if it is an encoder of T3, put its trunk.pth into its folder"
+            f"{file} has no final norm; if it is an encoder of T3, put its trunk.pth into its "
+            "folder"
         )
     rest = {f"trunk.{key}": array for key, array in load.read_weights(trunk).items()}
     sensors = sensors or {ALIASES.get(file.stem, file.stem): file}
@@ -316,7 +329,8 @@ def load_family(
     first = models[0]
     if first is None or any(model is None or model.form != first.form for model in models):
         raise WeightsError(
-            f"the encoders {', '.join(sensors)} of {path} have different forms; load one file at a time"
+            f"the encoders {', '.join(sensors)} of {path} have different forms; load one file at a "
+            "time"
         )
     several = (
         []
@@ -330,7 +344,9 @@ def load_family(
 
 
 def _folder(file: Path) -> dict[str, Any]:
-    """Return the config.json beside a file, with what it and a preprocessor_config.json state as `stated`."""
+    """Return the config.json beside a file, with what it and a preprocessor_config.json state as
+    `stated`.
+    """
     config, theirs = (
         load.read_settings(file.with_name(f"{name}config.json")) for name in ("", "preprocessor_")
     )
@@ -354,8 +370,8 @@ def read_family(
 ) -> FamilyModel | None:
     """Return the encoder of a file, None for a file of no family.
 
-    `folder` is the config.json: heads, epsilon, changes of the preparation. `image_size` is a side or (height, width).
-    `sensors` are T3's. Raises WeightsError.
+    `folder` is the config.json: heads, epsilon, changes of the preparation. `image_size` is a side
+    or (height, width). `sensors` are T3's. Raises WeightsError.
     """
     if (found := find_family(weights)) is None:
         return None
@@ -403,7 +419,8 @@ def read_family(
         raise WeightsError(f"{path}: {error}") from None
     except (KeyError, IndexError, ValueError, TypeError) as error:
         raise WeightsError(
-            f"{path} is not a whole file of {family.title}: {error} is missing or of an odd shape; download it again"
+            f"{path} is not a whole file of {family.title}: {error} is missing or of an odd shape; "
+            "download it again"
         ) from None
     load.check_finite(path, params)
     return FamilyModel(family, form, preparation, size, params)
@@ -412,7 +429,9 @@ def read_family(
 def _completed(
     family: Family, weights: dict[str, np.ndarray], folder: Mapping[str, Any], heads: int | None
 ) -> dict[str, np.ndarray]:
-    """Return a file's arrays with those left out: biases and periods of DINOv3, the position of a class token."""
+    """Return a file's arrays with those left out: biases and periods of DINOv3, the position of a
+    class token.
+    """
     own = dict(weights)
     if family.bare_class:
         own["pos_embed"] = np.concatenate(
@@ -453,9 +472,11 @@ def load_start(
     init: str | Path | None = None,
     clip: str | Path | None = None,
 ) -> load.Start:
-    """Return the first parameters of a run, as `load.load_init`, where `init` may also be an encoder of photographs.
+    """Return the first parameters of a run, as `load.load_init`, where `init` may also be an
+    encoder of photographs.
 
-    DINOv2, ViT-MAE, ViT and DeiT start the touch encoder. CLIP weights do so in stage 1, as `clip`. Raises UserError.
+    DINOv2, ViT-MAE, ViT and DeiT start the touch encoder. CLIP weights do so in stage 1, as `clip`.
+    Raises UserError.
     """
     model, weights = (None, None) if init is None else load_family(registry.locate(init))
     if model is None:
@@ -477,17 +498,20 @@ def load_start(
 def touch_of_photographs(
     model: FamilyModel, source: str, config: Config, fresh: dict[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return a touch encoder that gives a still the tokens of a ViT of photographs, and sentences to log.
+    """Return a touch encoder that gives a still the tokens of a ViT of photographs, and sentences
+    to log.
 
-    The patch kernel is divided among the frames. Its bias goes into the resized positions, and layer scales into the
-    layers before them. Raises UserError for another family, and for a network of another form.
+    The patch kernel is divided among the frames. Its bias goes into the resized positions, and
+    layer scales into the layers before them. Raises UserError for another family, and for a network
+    of another form.
     """
     form = model.form
     ours = config.model
     has_tokens = {"position", "class_token"} <= model.params.keys() and not form.tanh
     if model.family.sensors != _IMAGES or form.model.touch.depth == 0 or not has_tokens:
         raise UserError(
-            f"{source} is an encoder of {model.family.title}; a run starts from weights of AnyTouch, DINOv2, ViT-MAE, "
+            f"{source} is an encoder of {model.family.title}; a run starts from weights of "
+            "AnyTouch, DINOv2, ViT-MAE, "
             "ViT, DeiT or CLIP"
         )
     kept = {
@@ -520,7 +544,8 @@ def touch_of_photographs(
     touch = {name: fresh[name] for name in ("sensor_tokens", "projection")}
     touch |= nest({**own, "position": position, "class_token": model.params["class_token"]})
     notes = [
-        f"{source} gives the touch encoder; its projection, the sensor tokens and the decoder start untrained"
+        f"{source} gives the touch encoder; its projection, the sensor tokens and the decoder "
+        "start untrained"
     ]
     if form.registers:
         notes.append(f"the {form.registers} register tokens of {source} are left out")
@@ -541,7 +566,9 @@ def form_of(
     image_size: Size | None,
     sensors: tuple[str, ...],
 ) -> tuple[VitConfig, Size]:
-    """Return the form of the network that made a file, and the size of its images, from the shapes of its arrays."""
+    """Return the form of the network that made a file, and the size of its images, from the shapes
+    of its arrays.
+    """
     rows = {row.name: row for row in family.table}
 
     def has(name: str) -> bool:
@@ -624,7 +651,9 @@ def form_of(
 def _grid(
     places: int, family: Family, time: int, size: Size | None, patch: int
 ) -> tuple[int, int, int]:
-    """Return (time, rows, columns) of stored positions: of `size` if not resized, 4:3 (Sparsh), or square."""
+    """Return (time, rows, columns) of stored positions: of `size` if not resized, 4:3 (Sparsh), or
+    square.
+    """
     rows, columns = (0, 0) if size is None else (size[0] // patch, size[1] // patch)
     given = (places // max(rows * columns, 1) if family.video else 1, rows, columns)
     grids = [given]
@@ -648,7 +677,9 @@ def _grid(
 
 
 def _heads(width: int, heads: int | None, folder: Mapping[str, Any]) -> int:
-    """Return the number of heads: as given, of a config.json of Hugging Face or ours, or of the published width."""
+    """Return the number of heads: as given, of a config.json of Hugging Face or ours, or of the
+    published width.
+    """
     stacks = folder.get("model", {})
     ours = stacks.get("touch", {}) if isinstance(stacks, dict) else {}
     ours = ours.get("heads") if isinstance(ours, dict) else None
@@ -662,7 +693,8 @@ def _heads(width: int, heads: int | None, folder: Mapping[str, Any]) -> int:
     return count
 
 
-# Preprocessing that timm (config.json) or Hugging Face (preprocessor_config.json) states in a file next to weights.
+# Preprocessing that timm (config.json) or Hugging Face (preprocessor_config.json) states in a file
+# next to weights.
 _FILTERS = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
 _HF_STEPS = {"do_resize", "do_center_crop", "do_rescale", "do_normalize", "do_convert_rgb"}
 _HF_VALUES = {
@@ -689,7 +721,9 @@ _TIMM = ("mean", "std", "interpolation", "crop_pct", "crop_mode", "input_size")
 def stated_steps(
     config: Mapping[str, Any], theirs: Mapping[str, Any]
 ) -> tuple[dict[str, Any], Any, list[str]]:
-    """Return changes of a Preparation, the (height, width) of the input or None, and what of both files is ignored."""
+    """Return changes of a Preparation, the (height, width) of the input or None, and what of both
+    files is ignored.
+    """
     if theirs:
         return _hugging_face(theirs)
     timm = config.get("pretrained_cfg", config if "architecture" in config else None)

@@ -1,7 +1,10 @@
-"""Key maps: which array of a weights file is which parameter of the model. CLIP, the authors' AnyTouch, plain ViTs.
+"""Key maps: which array of a weights file is which parameter of the model.
 
-A row takes part where the model has its parameter, and the sizes of a model are read from the arrays by the same rows.
-Our names are those of `Net.abstract()`: paths joined with "/", blocks stacked on axis 0, kernels as (in, out).
+CLIP, the authors' AnyTouch, plain ViTs.
+
+A row takes part where the model has its parameter, and the sizes of a model are read from the
+arrays by the same rows. Our names are those of `Net.abstract()`: paths joined with "/", blocks
+stacked on axis 0, kernels as (in, out).
 """
 
 from __future__ import annotations
@@ -28,7 +31,9 @@ Conversion = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Entry:
-    """An array of a file: its key ("{}" for the layer), our name, exact conversions both ways, a third of a kernel."""
+    """An array of a file: its key ("{}" for the layer), our name, exact conversions both ways, a
+    third of a kernel.
+    """
 
     key: str
     name: str
@@ -75,7 +80,8 @@ SAME: tuple[Conversion, Conversion] = (_same, _same)
 _TURNED: tuple[Conversion, Conversion] = (np.transpose, np.transpose)
 _LEADING = (partial(np.squeeze, axis=0), partial(np.expand_dims, axis=0))
 _TWO_LEADING = (partial(np.squeeze, axis=(0, 1)), partial(np.expand_dims, axis=(0, 1)))
-# kind of a row -> the arrays of such a layer: what is added to its key and to our name, the conversions, the third
+# kind of a row -> the arrays of such a layer: what is added to its key and to our name, the
+# conversions, the third
 _KINDS: dict[str, list[tuple[Any, ...]]] = {
     "same": [("", "", *SAME)],
     "row": [("", "", *_LEADING)],
@@ -102,7 +108,10 @@ _KINDS: dict[str, list[tuple[Any, ...]]] = {
 
 
 def rows(table: str, theirs: str = "", ours: str = "") -> tuple[Entry, ...]:
-    """Return the rows of a table. A line has the kind of a layer in `_KINDS`, its key and our name."""
+    """Return the rows of a table.
+
+    A line has the kind of a layer in `_KINDS`, its key and our name.
+    """
     return tuple(
         Entry(f"{theirs}{key}{key_end}", f"{ours}{name}{name_end}", *rest)
         for kind, key, name in (line.split() for line in table.strip().splitlines())
@@ -111,7 +120,9 @@ def rows(table: str, theirs: str = "", ours: str = "") -> tuple[Entry, ...]:
 
 
 def each_layer(table: Iterable[Entry], shapes: Mapping[str, Shape]) -> list[Entry]:
-    """Return the rows of a table whose parameters are in `shapes`, one for each layer of a stack."""
+    """Return the rows of a table whose parameters are in `shapes`, one for each layer of a
+    stack.
+    """
     table = [row for row in table if row.name in shapes]
     layers = [range(shapes[row.name][0]) if "{}" in row.key else (None,) for row in table]
     return [
@@ -122,7 +133,10 @@ def each_layer(table: Iterable[Entry], shapes: Mapping[str, Shape]) -> list[Entr
 
 
 def find_depth(key: str, keys: Iterable[str]) -> int:
-    """Return the number of layers of a key with "{}" for the layer. Raises KeyError if one is missing between."""
+    """Return the number of layers of a key with "{}" for the layer.
+
+    Raises KeyError if one is missing between.
+    """
     pattern = re.compile(re.escape(key).replace(r"\{\}", r"(\d+)"))
     layers = {int(match[1]) for name in keys if (match := pattern.fullmatch(name))}
     if missing := set(range(max(len(layers), 1))) - layers:
@@ -138,7 +152,8 @@ def param_shapes(model: ModelConfig) -> Mapping[str, Shape]:
     )
 
 
-# Heads of the published towers by width: OpenAI's CLIP and the authors (width / 64), OpenCLIP's larger towers (16).
+# Heads of the published towers by width: OpenAI's CLIP and the authors (width / 64), OpenCLIP's
+# larger towers (16).
 VISION_HEADS = {384: 6, 512: 8, 768: 12, 896: 14, 1024: 16, 1280: 16, 1408: 16, 1664: 16}
 _TEXT_HEADS = {384: 6, 512: 8, 640: 10, 768: 12, 1024: 16, 1280: 20}
 _HEADS = {"touch": VISION_HEADS, "image": VISION_HEADS, "text": _TEXT_HEADS, "decoder": {512: 16}}
@@ -149,9 +164,10 @@ DECODER = Stack(512, 8, 16, 2048)  # the authors', for files without a decoder
 class KeyMap:
     """A family of weights files.
 
-    `mark` is a regex that only its files have a key for. `table` lists the arrays (none: our own names), and `lora`
-    those that replace them with LoRA. `unused` maps a key that no code reads to the key it is made from, a copy or the
-    mean over frames (golden Q2). `towers` matches the keys of each part that a model may lack.
+    `mark` is a regex that only its files have a key for. `table` lists the arrays (none: our own
+    names), and `lora` those that replace them with LoRA. `unused` maps a key that no code reads to
+    the key it is made from, a copy or the mean over frames (golden Q2). `towers` matches the keys
+    of each part that a model may lack.
     """
 
     name: str
@@ -172,10 +188,11 @@ class KeyMap:
         return {row.name: row for row in (*self.table, *(self.lora if lora else ()))}
 
     def detect(self, weights: Weights, heads: Heads) -> tuple[ModelConfig, dict[str, int]]:
-        """Return the model that made a file, and the widths of its stacks of unknown head counts, which are 1 in it.
+        """Return the model that made a file, and the widths of its stacks of unknown head counts,
+        which are 1 in it.
 
-        A head count is that of `heads`, else that of a published tower of this width. Odd files raise KeyError,
-        IndexError, ValueError or TypeError.
+        A head count is that of `heads`, else that of a published tower of this width. Odd files
+        raise KeyError, IndexError, ValueError or TypeError.
         """
         table = self._rows(any(".lora_A." in key for key in weights))
         unknown = dict[str, int]()
@@ -234,7 +251,8 @@ class KeyMap:
         ), unknown
 
 
-# CLIP of Hugging Face and of OpenCLIP. The authors' touch encoder is the vision transformer of the first.
+# CLIP of Hugging Face and of OpenCLIP. The authors' touch encoder is the vision transformer of the
+# first.
 BLOCKS = """
     linear  encoder.layers.{}.self_attn.q_proj    blocks/attention/query
     linear  encoder.layers.{}.self_attn.k_proj    blocks/attention/key
@@ -389,7 +407,8 @@ PROBE = KeyMap(
     towers=_TOWERS,
 )
 
-# Plain ViTs: the layouts of timm (Sparsh, T3, SITR, DINOv2's authors), of Hugging Face, and of AnyTouch 2.
+# Plain ViTs: the layouts of timm (Sparsh, T3, SITR, DINOv2's authors), of Hugging Face, and of
+# AnyTouch 2.
 _BLOCKS = """
     fused   blocks.{}.attn.qkv   blocks/attention
     linear  blocks.{}.attn.proj  blocks/attention/out

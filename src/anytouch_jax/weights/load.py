@@ -1,4 +1,6 @@
-"""Loading of parameters: run folders, checkpoints, weights files, the authors' .pth files and CLIP towers."""
+"""Loading of parameters: run folders, checkpoints, weights files, the authors' .pth files and CLIP
+towers.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ _INNER = re.compile(r"(^|\.)(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_
 
 
 class Start(NamedTuple):
-    """The first parameters of a run, sentences to log, and the sensors that they were trained on."""
+    """The first parameters of a run, sentences to log, and the sensors that they were trained
+    on.
+    """
 
     params: Params
     notes: list[str]
@@ -64,10 +68,12 @@ def load_model(
     stored_rows: bool = False,
     weights: Weights | None = None,
 ) -> Loaded:
-    """Load an encoder by name, a run folder, a checkpoint folder, a weights file or a folder with a .pth file.
+    """Load an encoder by name, a run folder, a checkpoint folder, a weights file or a folder with a
+    .pth file.
 
-    `step` chooses a checkpoint, the latest by default. With `stored_rows` the rows for sensors outside the training are
-    unchanged, as a conversion needs them. `weights` are those of the file, if they are read. Raises UserError.
+    `step` chooses a checkpoint, the latest by default. With `stored_rows` the rows for sensors
+    outside the training are unchanged, as a conversion needs them. `weights` are those of the file,
+    if they are read. Raises UserError.
     """
     path = registry.locate(path)
     if not path.exists():
@@ -130,7 +136,9 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def trained_sensors(metadata: Mapping[str, str], model: ModelConfig) -> tuple[str, ...] | None:
-    """Return the sensors that a file was trained on: as its metadata says, or the authors' for a file of theirs."""
+    """Return the sensors that a file was trained on: as its metadata says, or the authors' for a
+    file of theirs.
+    """
     if safetensors.SEEN_KEY in metadata:
         return tuple(metadata[safetensors.SEEN_KEY].split(","))
     if safetensors.MODEL_KEY not in metadata and model.sensors == SENSORS:
@@ -141,10 +149,12 @@ def trained_sensors(metadata: Mapping[str, str], model: ModelConfig) -> tuple[st
 def load_init(
     fresh: Params, config: Config, *, init: str | Path | None = None, clip: str | Path | None = None
 ) -> Start:
-    """Return the first parameters of a run: `fresh` with parts of `init` and `clip` (golden K_weight_loading_map).
+    """Return the first parameters of a run: `fresh` with parts of `init` and `clip` (golden
+    K_weight_loading_map).
 
-    `init`, a run or a weights file, gives the touch encoder and the decoder. `clip`, CLIP weights, gives the towers
-    and, without `init`, the touch encoder. Raises UserError if either does not fit the run.
+    `init`, a run or a weights file, gives the touch encoder and the decoder. `clip`, CLIP weights,
+    gives the towers and, without `init`, the touch encoder. Raises UserError if either does not fit
+    the run.
     """
     notes: list[str] = []
     trained: tuple[str, ...] = ()
@@ -172,7 +182,8 @@ def load_init(
             if trained_by is None:
                 ours, other = sorted(("gelu", "quick_gelu"), key=config.model.activation.__ne__)
                 notes.append(
-                    f"the activation of {file} is not stored, this run uses {ours}: OpenAI's CLIP wants quick_gelu, "
+                    f"the activation of {file} is not stored, this run uses {ours}: OpenAI's CLIP "
+                    "wants quick_gelu, "
                     "most others gelu; put the config.json of the weights next to the file, or add "
                     f"--model.activation {other}"
                 )
@@ -209,7 +220,8 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     notes = []
     if background != config.data.background:
         notes.append(
-            f"{path} was trained with --data.background {background}, this run with {config.data.background}: its "
+            f"{path} was trained with --data.background {background}, this run with "
+            f"{config.data.background}: its "
             "encoder was never trained on such touches"
         )
     ours = config.model.sensors
@@ -221,7 +233,8 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     if lost:
         option = " ".join((*ours, *lost))
         notes.append(
-            f"the tokens of {', '.join(lost)} in {path} are left out; --model.sensors {option} keeps them"
+            f"the tokens of {', '.join(lost)} in {path} are left out; --model.sensors {option} "
+            "keeps them"
         )
     has_decoder = "decoder" in loaded.params
     if config.reconstructs and not has_decoder:
@@ -244,7 +257,8 @@ def check_finite(path: str | Path, arrays: Mapping[str, Any]) -> None:
     if wrong:
         others = f" and {len(wrong) - 1} other arrays have" if len(wrong) > 1 else " has"
         raise WeightsError(
-            f"{path}: {wrong[0]}{others} values that are not finite (NaN or infinite); its training diverged or the "
+            f"{path}: {wrong[0]}{others} values that are not finite (NaN or infinite); its "
+            "training diverged or the "
             "file is damaged, so take an earlier checkpoint or another file"
         )
 
@@ -276,11 +290,12 @@ def _fit(loaded: Loaded, config: Config) -> Params:
 def first_params(
     params: Params, model: ModelConfig, *, stage1: Params | None = None, clip: Weights | None = None
 ) -> Params:
-    """Return fresh `params` with touch and decoder from `stage1`, and the towers and the temperature from CLIP.
+    """Return fresh `params` with touch and decoder from `stage1`, and the towers and the
+    temperature from CLIP.
 
-    Without `stage1` the touch encoder starts from CLIP's vision tower. The patch kernel is repeated over the frames and
-    not divided, as the authors do (golden Q1): the response to a still is three times CLIP's. A tower without a
-    projection leaves that of `params`. Raises WeightsError.
+    Without `stage1` the touch encoder starts from CLIP's vision tower. The patch kernel is repeated
+    over the frames and not divided, as the authors do (golden Q1): the response to a still is three
+    times CLIP's. A tower without a projection leaves that of `params`. Raises WeightsError.
     """
     merged = dict(params)
     if clip is not None and stage1 is None:
@@ -301,7 +316,9 @@ def first_params(
 
 
 def inflate(params: Params, image: Params, *, divide: bool = False) -> Params:
-    """Return `params` with the touch encoder of an image tower; with `divide` a still's response equals the tower's."""
+    """Return `params` with the touch encoder of an image tower; with `divide` a still's response
+    equals the tower's.
+    """
     # (T, ...), or (R, T, ...) with one kernel a sensor
     shape = params["touch"]["patch"]["kernel"].shape
     kernel = np.broadcast_to(np.asarray(image["patch"]["kernel"]), shape) / np.float32(
@@ -334,7 +351,10 @@ def is_run_folder(path: Path) -> bool:
 
 
 def find_weights_file(path: str | Path) -> Path:
-    """Return the weights file in a downloaded folder, or the file itself. Raises UserError if there is none."""
+    """Return the weights file in a downloaded folder, or the file itself.
+
+    Raises UserError if there is none.
+    """
     path = Path(path)
     if not path.is_dir():
         return path
@@ -351,10 +371,11 @@ def _weights_files(folder: Path) -> list[Path]:
 
 
 def read_weights(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a .safetensors, .npz, .pth, .pt, .ckpt or .bin file by name, floats as float32.
+    """Return the arrays of a .safetensors, .npz, .pth, .pt, .ckpt or .bin file by name, floats as
+    float32.
 
-    An index stands for all of its files. Prefixes of training frameworks are removed. No code in a pickle is run.
-    Raises WeightsError for a missing, truncated, foreign or unsafe file.
+    An index stands for all of its files. Prefixes of training frameworks are removed. No code in a
+    pickle is run. Raises WeightsError for a missing, truncated, foreign or unsafe file.
     """
     path = safetensors.existing_file(path)
     if shard := _SHARD.fullmatch(path.name):
@@ -394,7 +415,9 @@ def _read_file(path: Path) -> dict[str, np.ndarray]:
 
 
 def _strip_prefixes(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arrays without prefixes that all names share, nor wrappers inside a name, if names stay different."""
+    """Return the arrays without prefixes that all names share, nor wrappers inside a name, if names
+    stay different.
+    """
     names = {name: _INNER.sub(r"\1", name) for name in weights}
     while (
         len(shared := {(_PREFIX.match(name) or [""])[0] for name in names.values()}) == 1
@@ -407,7 +430,10 @@ def _strip_prefixes(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _read_parts(index: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of all files that an index names. Raises WeightsError for missing files and arrays."""
+    """Return the arrays of all files that an index names.
+
+    Raises WeightsError for missing files and arrays.
+    """
     homes = _object(read_settings(index), "weight_map")
     if not homes or not all(
         isinstance(part, str) and Path(part).name == part for part in homes.values()
@@ -431,7 +457,10 @@ def _read_parts(index: Path) -> dict[str, np.ndarray]:
 
 
 def model_of_file(path: str | Path, weights: Weights) -> ModelConfig:
-    """Return the model of a weights file, see `form_of_file`. Raises WeightsError for unknown head counts."""
+    """Return the model of a weights file, see `form_of_file`.
+
+    Raises WeightsError for unknown head counts.
+    """
     model, unknown = form_of_file(path, weights)
     with _naming(path):
         convert.refuse_unknown(unknown)
@@ -439,7 +468,10 @@ def model_of_file(path: str | Path, weights: Weights) -> ModelConfig:
 
 
 def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[str, int]]:
-    """Return the model of a file, and widths of stacks of unknown heads, by metadata or shapes. Raises WeightsError."""
+    """Return the model of a file, and widths of stacks of unknown heads, by metadata or shapes.
+
+    Raises WeightsError.
+    """
     if (text := safetensors.read_file_metadata(path).get(safetensors.MODEL_KEY)) is not None:
         return from_json(text, ModelConfig), {}
     config, openclip = _folder_config(path)
@@ -455,7 +487,9 @@ def form_of_file(path: str | Path, weights: Weights) -> tuple[ModelConfig, dict[
 
 
 def _folder_config(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the config.json in the folder of weights, of a run or of HF, and the model of OpenCLIP's file."""
+    """Return the config.json in the folder of weights, of a run or of HF, and the model of
+    OpenCLIP's file.
+    """
     config = read_settings(Path(path).with_name("config.json"))
     if config.get("model_type") == "clip_vision_model":  # of the vision tower alone
         config = {"vision_config": config} | config
@@ -467,7 +501,10 @@ def _folder_config(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def _stored_heads(
     path: str | Path, config: dict[str, Any], openclip: dict[str, Any]
 ) -> dict[str, int]:
-    """Return the head counts of stacks. Raises WeightsError for a count that is no positive integer."""
+    """Return the head counts of stacks.
+
+    Raises WeightsError for a count that is no positive integer.
+    """
     tower = _object(openclip, "vision_cfg")
     ours = _object(config, "model")
     heads = dict[str, Any]()
@@ -486,7 +523,8 @@ def _stored_heads(
     for name, count in heads.items():
         if count is not None and (type(count) is not int or not 0 < count <= 1024):
             raise WeightsError(
-                f"the configuration in the folder of {path} gives {name} {str(count)[:40]} heads; correct it"
+                f"the configuration in the folder of {path} gives {name} {str(count)[:40]} heads; "
+                "correct it"
             )
     return {name: count for name, count in heads.items() if count is not None}
 
@@ -500,7 +538,10 @@ def _object(value: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def clip_activation(path: str | Path) -> str | None:
-    """Return the activation that the files beside weights state, None if they do not. Raises WeightsError."""
+    """Return the activation that the files beside weights state, None if they do not.
+
+    Raises WeightsError.
+    """
     if (text := safetensors.read_file_metadata(path).get(safetensors.MODEL_KEY)) is not None:
         return str(from_json(text, ModelConfig).activation)
     config, openclip = _folder_config(path)
@@ -516,7 +557,8 @@ def clip_activation(path: str | Path) -> str | None:
         names.add("quick_gelu" if openclip.get("quick_gelu") else "gelu")
     if len(names) > 1 or not names <= {"gelu", "quick_gelu"}:
         raise WeightsError(
-            f"the configuration in the folder of {path} names the activation {' and '.join(sorted(names))}; give CLIP "
+            f"the configuration in the folder of {path} names the activation "
+            f"{' and '.join(sorted(names))}; give CLIP "
             "weights of which both towers use gelu, or both quick_gelu"
         )
     return next(iter(names), None)

@@ -45,7 +45,9 @@ def list_encoders() -> list[str]:
 
 
 def read_card(name: str) -> dict[str, Any]:
-    """Return what the package knows of an encoder: summary, licence, sensors, sizes, the SHA-256 of its weights."""
+    """Return what the package knows of an encoder: summary, licence, sensors, sizes, the SHA-256 of
+    its weights.
+    """
     card = parse_json((FOLDER / name / CARD).read_text(encoding="utf-8"))
     return dict(card)
 
@@ -53,8 +55,9 @@ def read_card(name: str) -> dict[str, Any]:
 def locate(model: str | Path) -> Path:
     """Return the path that a name, an address on the hub, or a path stands for.
 
-    A name comes before a folder of that name: write ./anytouch-tiny for the folder. An address is hf://user/repo or
-    hf://user/repo@revision. Raises UserError for a damaged package, and for a repository that cannot be read.
+    A name comes before a folder of that name: write ./anytouch-tiny for the folder. An address is
+    hf://user/repo or hf://user/repo@revision. Raises UserError for a damaged package, and for a
+    repository that cannot be read.
     """
     if str(model) == FORMER and not Path(model).exists():
         warnings.warn(
@@ -67,7 +70,8 @@ def locate(model: str | Path) -> Path:
         return _download(address[1], address[2])
     if str(model).startswith("hf:"):
         raise UserError(
-            f"{model} is not an address on the hub. Write hf://user/repo or hf://user/repo@revision."
+            f"{model} is not an address on the hub. Write hf://user/repo or "
+            "hf://user/repo@revision."
         )
     path = Path(model)
     # a Path drops ./
@@ -82,7 +86,8 @@ def _packaged(name: str) -> Path:
     expected = read_card(name).get("sha256")
     if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != expected:
         raise UserError(
-            f"The weights of {name} in the package are damaged or missing. Install anytouch_jax again."
+            f"The weights of {name} in the package are damaged or missing. Install anytouch_jax "
+            "again."
         )
     return file
 
@@ -113,10 +118,11 @@ def write_encoder(
     parts: tuple[str, ...] = PARTS,
     tokenizer: Path | None = None,
 ) -> Path:
-    """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16, config.json, README.md.
+    """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16,
+    config.json, README.md.
 
-    The copy computes in float32. `parts` of the model are kept. `notes` is Markdown for the card. Raises WeightsError
-    for values that float16 cannot hold.
+    The copy computes in float32. `parts` of the model are kept. `notes` is Markdown for the card.
+    Raises WeightsError for values that float16 cannot hold.
     """
     # imports jax
     from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors

@@ -26,17 +26,21 @@ FIELDS_KEY = "fields"  # calibration of what is measured, as JSON: `encoder.fiel
 
 
 class WeightsError(UserError):
-    """A weights file that cannot be read or does not fit; the message names the file or the keys."""
+    """A weights file that cannot be read or does not fit; the message names the file or the
+    keys.
+    """
 
 
 @shown_short
 @dataclass(frozen=True)
 class Loaded:
-    """Parameters from a run or a weights file, with every part it has: touch, decoder, image, text and others.
+    """Parameters from a run or a weights file, with every part it has: touch, decoder, image, text
+    and others.
 
-    Sensors outside `trained_sensors` have the universal row. `trained_sensors` is None if the file does not store it.
-    `universal_drawn` is False if training never drew the universal tokens. `config` of a file has its model and its
-    background, and defaults elsewhere. `metadata` is that of the checkpoint or the file.
+    Sensors outside `trained_sensors` have the universal row. `trained_sensors` is None if the file
+    does not store it. `universal_drawn` is False if training never drew the universal tokens.
+    `config` of a file has its model and its background, and defaults elsewhere. `metadata` is that
+    of the checkpoint or the file.
     """
 
     path: Path
@@ -62,7 +66,10 @@ class Loaded:
 def write_safetensors(
     path: str | Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
 ) -> None:
-    """Write arrays to one safetensors file, whole or not at all; `metadata` is text by name. Raises WeightsError."""
+    """Write arrays to one safetensors file, whole or not at all; `metadata` is text by name.
+
+    Raises WeightsError.
+    """
     from safetensors.numpy import save_file
 
     path = Path(path)
@@ -85,7 +92,9 @@ def write_safetensors(
 
 
 def _sort_metadata(file: Path) -> None:
-    """Sort the metadata of a file: the library writes them in a random order, but equal weights are equal bytes."""
+    """Sort the metadata of a file: the library writes them in a random order, but equal weights are
+    equal bytes.
+    """
     with file.open("r+b") as header:
         size = int.from_bytes(header.read(8), "little")
         entries = json.loads(header.read(size))
@@ -97,20 +106,28 @@ def _sort_metadata(file: Path) -> None:
 
 
 def export_safetensors(path: str | Path, params: Any, metadata: Mapping[str, str]) -> None:
-    """Write a parameter tree to one safetensors file, names joined with "/". Raises WeightsError."""
+    """Write a parameter tree to one safetensors file, names joined with "/".
+
+    Raises WeightsError.
+    """
     write_safetensors(
         path, {name: np.asarray(leaf) for name, leaf in flatten(params).items()}, metadata
     )
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return (arrays in their stored types, metadata) of a safetensors file. Raises WeightsError."""
+    """Return (arrays in their stored types, metadata) of a safetensors file.
+
+    Raises WeightsError.
+    """
     with _opened(path) as file:
         return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
 
 
 def read_file_metadata(path: str | Path) -> dict[str, str]:
-    """Return the metadata of a safetensors file without its arrays; {} for a file of another type."""
+    """Return the metadata of a safetensors file without its arrays; {} for a file of another
+    type.
+    """
     if Path(path).suffix.lower() != ".safetensors":
         return {}
     with _opened(path) as file:
@@ -135,7 +152,8 @@ def existing_file(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_file():
         raise WeightsError(
-            f"there is no weights file {path}; give the path of a .safetensors, .npz, .pth, .pt, .ckpt or .bin file"
+            f"there is no weights file {path}; give the path of a .safetensors, .npz, .pth, .pt, "
+            ".ckpt or .bin file"
         )
     if kind := placeholder(path):
         raise WeightsError(f"{path} is {kind}")

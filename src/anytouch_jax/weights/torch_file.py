@@ -1,7 +1,9 @@
-"""PyTorch files (.pth, .pt, .ckpt, .bin) read without torch, in the zip form and in the form before torch 1.6.
+"""PyTorch files (.pth, .pt, .ckpt, .bin) read without torch, in the zip form and in the form before
+torch 1.6.
 
-A pickle is a program for a stack machine. It is run by the standard library's `pickle._Unpickler`, cut down to data:
-a class or function in it is only a name, looked up in `_BUILDERS` and never imported. Anything else is an error.
+A pickle is a program for a stack machine. It is run by the standard library's `pickle._Unpickler`,
+cut down to data: a class or function in it is only a name, looked up in `_BUILDERS` and never
+imported. Anything else is an error.
 """
 
 from __future__ import annotations
@@ -51,8 +53,9 @@ _DEPTH = 4  # of wrappings in each other
 def read_torch(path: str | Path) -> dict[str, np.ndarray]:
     """Return the state_dict of a torch file, out of its wrappings.
 
-    bfloat16 becomes float32, other types are unchanged. No code in the file is run. Raises WeightsError for a
-    truncated or foreign file, and for an object that is neither a tensor nor a plain container.
+    bfloat16 becomes float32, other types are unchanged. No code in the file is run. Raises
+    WeightsError for a truncated or foreign file, and for an object that is neither a tensor nor a
+    plain container.
     """
     path = existing_file(path)
     try:
@@ -94,7 +97,9 @@ class _Other:
 
 @dataclass(frozen=True)
 class _Storage:
-    """A block of numbers elsewhere in the file: its key there, the type of one number, its length."""
+    """A block of numbers elsewhere in the file: its key there, the type of one number, its
+    length.
+    """
 
     key: str
     dtype: np.dtype
@@ -111,7 +116,10 @@ class _Tensor:
     stride: tuple[int, ...]
 
     def read(self, data: bytes, *, big: bool) -> np.ndarray:
-        """Return the values, given the bytes of the storage. Raises ValueError if the view leaves its storage."""
+        """Return the values, given the bytes of the storage.
+
+        Raises ValueError if the view leaves its storage.
+        """
         flat = np.frombuffer(data, self.storage.dtype)
         if len(flat) != self.storage.length:
             raise ValueError(
@@ -171,7 +179,9 @@ class _Zip:
 
 
 class _Legacy:
-    """torch.save before 1.6: five pickles, then the storages one after the other, each with its length."""
+    """torch.save before 1.6: five pickles, then the storages one after the other, each with its
+    length.
+    """
 
     big = False
 
@@ -195,7 +205,9 @@ class _Legacy:
 
 
 def _unwrap(content: Any, path: Path) -> Any:
-    """Return the state dict inside the usual wrappings, plain weights before averaged ones, which give a warning."""
+    """Return the state dict inside the usual wrappings, plain weights before averaged ones, which
+    give a warning.
+    """
     for _ in range(_DEPTH):
         inner = content if isinstance(content, dict) else {}
         name = next(
@@ -222,7 +234,8 @@ def _state(content: Any) -> dict[str, _Tensor]:
     ]
     if others:
         raise WeightsError(
-            f"it has no state_dict: {', '.join(others[:5])} {'are' if others[1:] else 'is'} no tensor"
+            f"it has no state_dict: {', '.join(others[:5])} {'are' if others[1:] else 'is'} no "
+            "tensor"
         )
     return content
 
@@ -278,7 +291,8 @@ _DATA = """PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT BINI
     FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING SHORT_BINSTRING BINBYTES
     SHORT_BINBYTES BINBYTES8 EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET TUPLE TUPLE1 TUPLE2 TUPLE3 LIST APPEND APPENDS
     PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BINPERSID"""
-# Operations replaced in `_Unpickler`. Hashing a tuple that is nested 150,000 times would end the process.
+# Operations replaced in `_Unpickler`. Hashing a tuple that is nested 150,000 times would end the
+# process.
 _GUARDED = "DICT SETITEM SETITEMS ADDITEMS REDUCE NEWOBJ BUILD INST"
 
 
@@ -295,13 +309,17 @@ def _code(name: str) -> int:
 
 def _refused(name: str) -> WeightsError:
     return WeightsError(
-        f"the pickle wants {name!r}, which is neither a tensor nor a plain container; it was refused and nothing was "
+        f"the pickle wants {name!r}, which is neither a tensor nor a plain container; it was "
+        "refused and nothing was "
         "run: save the weights as a plain state_dict or as safetensors"
     )
 
 
 class _Unpickler(pickle._Unpickler):
-    """The library's reader in Python, without imports or calls. That in C ends the process at a deep tuple as a key."""
+    """The library's reader in Python, without imports or calls.
+
+    That in C ends the process at a deep tuple as a key.
+    """
 
     stack: list[Any]
     readline: Callable[[], bytes]
@@ -312,7 +330,9 @@ class _Unpickler(pickle._Unpickler):
         self.storages: dict[str, _Storage] = {}
 
     def load(self) -> Any:
-        """Return the object pickled at the position of the file: plain containers, numbers, text and `_Tensor`."""
+        """Return the object pickled at the position of the file: plain containers, numbers, text
+        and `_Tensor`.
+        """
         try:
             return super().load()
         except IndexError:

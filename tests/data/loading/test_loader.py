@@ -245,7 +245,9 @@ def test_what_has_no_tower_is_not_read(make, settings):
 
 
 def test_captions_are_padded_to_the_longest_in_eights_and_never_beyond_the_tower(make, settings):
-    """Positions behind the end token of every caption are work for nothing; a long caption keeps its end token."""
+    """Positions behind the end token of every caption are work for nothing; a long caption keeps
+    its end token.
+    """
     for words, length in ((["one"], 8), (["one two three four five six seven eight"], 12)):
         manifest = make([{"text": text} for text in words * 8])
         loader = Loader(manifest, settings(2))  # its tower has 12 positions
@@ -418,7 +420,8 @@ def test_batches_that_groups_or_processes_cannot_share_are_refused(make, setting
         return Loader(manifest, replace(config, model=model, objective=objective))
 
     refused(r"a batch of 6 touches does not divide by --objective\.groups 4", load, 4, batch_size=6)
-    # Of the release a batch to match has half the rows; only where these are each other's negatives must they divide.
+    # Of the release a batch to match has half the rows; only where these are each other's negatives
+    # must they divide.
     refused(
         r"a batch of 2 touches does not divide by --objective\.groups 4",
         load,
@@ -435,7 +438,9 @@ def test_batches_that_groups_or_processes_cannot_share_are_refused(make, setting
 
 
 def _parts(batch):
-    """Arrays of a batch, pictures as the colour of one pixel: what does not depend on versions of the libraries."""
+    """Arrays of a batch, pictures as the colour of one pixel: what does not depend on versions of
+    the libraries.
+    """
     if batch is None:
         return
     for name, part in batch._asdict().items():

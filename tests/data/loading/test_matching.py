@@ -61,7 +61,8 @@ def test_no_anchor_where_there_is_no_pair_or_no_negative():
     assert not Matches(np.arange(3), _keys(touch=[0, 0, -1], sensor=[0, 1, 1])).anchors.size
     other = _keys(touch=[0, 0, -1], sensor=[0, 1, 1], object=[1, 1, 2])
     assert Matches(np.arange(3), other).anchors.tolist() == [0, 1]
-    # One known place, two objects named there: what has no place is elsewhere only for those of another object.
+    # One known place, two objects named there: what has no place is elsewhere only for those of
+    # another object.
     mixed = _keys(touch=[0, 0, 0, -1], sensor=[0, 1, 0, 1], object=[1, 1, 2, 2])
     assert Matches(np.arange(4), mixed).anchors.tolist() == [0, 1]
     assert Matches(np.array([3, 2, 1, 0]), mixed).anchors.tolist() == [2, 3]

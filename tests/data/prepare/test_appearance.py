@@ -8,7 +8,9 @@ from anytouch_jax.data.prepare.verify import verify
 
 
 def _recording(make, count=12, shape=(48, 64), seed=0):
-    """A recording of a coloured gel, darker to the right and to the bottom, with noise and a dent that moves."""
+    """A recording of a coloured gel, darker to the right and to the bottom, with noise and a dent
+    that moves.
+    """
     loose = make([{"sequence": "s", "frame_index": i, "unit": "u"} for i in range(count)])
     rng = np.random.default_rng(seed)
     ramp = np.add.outer(np.arange(shape[0]) / shape[0] * 40, np.arange(shape[1]) / shape[1] * 60)

@@ -47,7 +47,10 @@ FAILED = (captions._QuestionError, BadAnswer, AnnotateError)
 
 
 def _failed(answer, words, **options):
-    """Ask a server that always answers so. Return the sentence of the failure and how often it was asked."""
+    """Ask a server that always answers so.
+
+    Return the sentence of the failure and how often it was asked.
+    """
     with serve(lambda *_: answer) as server, pytest.raises(FAILED, match=words) as error:
         _ask(server, **options)
     return str(error.value), len(server.asked)
@@ -74,7 +77,10 @@ def _run(manifest, server, folder, **options):
 
 
 def _asked(manifest, folder, behave=None, **options):
-    """Annotate with a server that answers so. Return what was done, and the server, which has stopped."""
+    """Annotate with a server that answers so.
+
+    Return what was done, and the server, which has stopped.
+    """
     with serve(behave) if behave else serve() as server:
         return _run(manifest, server, folder, **options), server
 
@@ -379,7 +385,10 @@ def test_waits_for_a_server_are_bounded(monkeypatch):
 
 
 def test_an_unusable_endpoint_ends_the_waits_of_other_questions(make, tmp_path):
-    """The first question is told to wait for a minute. The second finds the key refused: the first is not repeated."""
+    """The first question is told to wait for a minute.
+
+    The second finds the key refused: the first is not repeated.
+    """
     behave = lambda number, _: (401, {}, b"") if number else (429, {"Retry-After-Ms": "60000"}, b"")  # noqa: E731
     with serve(behave) as server, pytest.raises(AnnotateError, match="the key is not accepted"):
         _run(make(_rows(2)), server, tmp_path / "answers", threads=2)
@@ -427,7 +436,9 @@ def test_a_run_of_failures_stops_the_spending(make, tmp_path):
 
 
 def test_the_key_is_in_no_file_and_no_message(make, tmp_path, capfd):
-    """A server that quotes the key in its answers and its errors, one of which is cut within the key."""
+    """A server that quotes the key in its answers and its errors, one of which is cut within the
+    key.
+    """
     said = []
     kinds = (
         (200, {}, chat({"object": KEY, "caption": f"Soft as the key {KEY} in your hand."})),

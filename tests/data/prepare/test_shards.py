@@ -29,7 +29,9 @@ def _closed():
 
 
 def _rows(sequences=4, length=6):
-    """Two sensors at the same places, with pictures (one shared by a sequence), captions and a background each."""
+    """Two sensors at the same places, with pictures (one shared by a sequence), captions and a
+    background each.
+    """
     return [
         {
             "path": f"touch {i}/ä{k}.png",

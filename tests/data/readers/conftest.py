@@ -11,7 +11,9 @@ from anytouch_jax.data.readers import IndexOptions, index
 
 @pytest.fixture
 def read(tmp_path: Path) -> Callable[..., Table]:
-    """read(name, root=tmp_path, out=None, **options): index a dataset, check the laws of every manifest."""
+    """read(name, root=tmp_path, out=None, **options): index a dataset, check the laws of every
+    manifest.
+    """
 
     def run(name: str, root: Path = tmp_path, out: Path | None = None, **options: object) -> Table:
         table = Table(index(name, root, out, options=IndexOptions(**options)))  # type: ignore[arg-type]

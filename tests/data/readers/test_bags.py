@@ -16,8 +16,13 @@ START = 5_000_000_000
 
 
 def ros_messages(store, *, ros1: bool):
-    """(topic, type, time, message): four pictures with a padded row, and a force that is late for the last."""
-    names = "sensor_msgs/Image std_msgs/Header builtin_interfaces/Time geometry_msgs/Wrench geometry_msgs/Vector3"
+    """(topic, type, time, message): four pictures with a padded row, and a force that is late for
+    the last.
+    """
+    names = (
+        "sensor_msgs/Image std_msgs/Header builtin_interfaces/Time geometry_msgs/Wrench "
+        "geometry_msgs/Vector3"
+    )
     types = [
         store.types[name.replace("/", "/msg/")]
         for name in [*names.split(), "geometry_msgs/WrenchStamped"]

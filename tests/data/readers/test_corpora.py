@@ -86,7 +86,9 @@ def test_rows_stay_in_their_shards_with_the_licence_of_their_source(corpus):
 
 
 def write_samples(file, samples):
-    """A tar with a file for each (name, data): numbers are pictures of that grey, others JSON or text."""
+    """A tar with a file for each (name, data): numbers are pictures of that grey, others JSON or
+    text.
+    """
     file.parent.mkdir(parents=True, exist_ok=True)
     with tarfile.open(file, "w") as archive:
         for name, value in samples:

@@ -55,7 +55,10 @@ def test_folders_that_lead_elsewhere_are_refused(tmp_path):
     assert not list((tmp_path / "root").glob("*.parquet"))
 
 
-EMPTY = "visgel cloth objectfolder_real ycb_slide octopi tacquad tvl ssvtp feel objectfolder real_touch touch_and_go"
+EMPTY = (
+    "visgel cloth objectfolder_real ycb_slide octopi tacquad tvl ssvtp feel objectfolder "
+    "real_touch touch_and_go"
+)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +88,9 @@ def test_a_renamed_or_empty_folder_is_an_error(tmp_path, read, name, renamed, sa
 
 @pytest.fixture
 def edited(tmp_path, read):
-    """edited(ending): the manifest of two objects, to which somebody added label.material and changed a split."""
+    """edited(ending): the manifest of two objects, to which somebody added label.material and
+    changed a split.
+    """
 
     def make(ending):
         fill(tmp_path, [f"{name}/{n}.png" for name in ("mug", "ball") for n in range(3)])

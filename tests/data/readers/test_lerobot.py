@@ -21,7 +21,9 @@ SCENE = "observation.images.front"
 
 
 def make(root):
-    """Three episodes in two Parquet files and two films: a gel in Parquet, a tactile film, a camera of the scene."""
+    """Three episodes in two Parquet files and two films: a gel in Parquet, a tactile film, a camera
+    of the scene.
+    """
     camera = {"shape": [32, 32, 3], "names": ["height", "width", "channels"]}
     features = {
         GEL: camera | {"dtype": "image"},
@@ -229,7 +231,9 @@ def test_what_is_not_a_data_set_of_this_version_is_one_sentence(root, tmp_path):
 
 
 def edit(root, change):
-    """Change the rows of each Parquet file of data, by a function of the row and its number in the data set."""
+    """Change the rows of each Parquet file of data, by a function of the row and its number in the
+    data set.
+    """
     for path in sorted((root / "data").glob("*/*.parquet")):
         rows = pa.parquet.read_table(path).to_pylist()
         pa.parquet.write_table(

@@ -248,7 +248,9 @@ def test_a_path_in_two_splits_is_refused_and_folders_outside_are_ranked(tmp_path
 
 
 def _presses(folder, names, seconds=0.0, film=False):
-    """Write pictures of presses at random places, or of one that moves on, and the times of their files."""
+    """Write pictures of presses at random places, or of one that moves on, and the times of their
+    files.
+    """
     rng = np.random.default_rng(list(folder.name.encode()))
     folder.mkdir(parents=True, exist_ok=True)
     for at, name in enumerate(names):

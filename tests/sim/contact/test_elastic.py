@@ -40,8 +40,10 @@ def test_convolution_is_the_sum(shape):
 
 
 def moved_by_a_wave(thickness, poisson):
-    """(along, into the layer) that a load cos(x) moves the surface of a bonded layer of E* = 1: plane strain's ODEs in
-    depth for (u, w, shear, normal stress), with shear and normal stress 0 and -1 above, and no motion below."""
+    """(along, into the layer) that a load cos(x) moves the surface of a bonded layer of E* = 1:
+    plane strain's ODEs in depth for (u, w, shear, normal stress), with shear and normal stress 0
+    and -1 above, and no motion below.
+    """
     modulus = 1 - poisson**2
     lame = modulus * poisson / (1 + poisson) / (1 - 2 * poisson)
     shear = modulus / 2 / (1 + poisson)
@@ -73,7 +75,9 @@ def surface_under(load, spectra, plan):
 
 
 def test_a_wide_load_confines_a_thin_layer():
-    """Under a load much wider than the layer: u = p h (1 + nu)(1 - 2 nu) / (E (1 - nu)) and shear u = q h / G."""
+    """Under a load much wider than the layer: u = p h (1 + nu)(1 - 2 nu) / (E (1 - nu)) and shear u
+    = q h / G.
+    """
     plan = Plan(60, 60)
     thickness = 4.0
     with jax.enable_x64(True):
@@ -104,7 +108,9 @@ def test_a_thick_layer_is_a_half_space_and_share_zero_too():
 
 
 def test_the_tangential_kernels_of_a_layer_are_those_of_its_symbols():
-    """A smooth traction along x moves a layer by the sum over waves of what each wave is moved by."""
+    """A smooth traction along x moves a layer by the sum over waves of what each wave is moved
+    by.
+    """
     n = 64
     pitch = 0.2
     poisson = 0.48
@@ -137,7 +143,9 @@ def test_the_tangential_kernels_of_a_layer_are_those_of_its_symbols():
 
 @pytest.mark.parametrize("poisson", [0.3, 0.48])
 def test_the_sideways_kernel_is_that_of_its_symbol(poisson):
-    """The gradient of its potential is the sum over waves of what each wave of a smooth load moves sideways."""
+    """The gradient of its potential is the sum over waves of what each wave of a smooth load moves
+    sideways.
+    """
     n = 64
     pitch = 0.2
     thickness = 2.0

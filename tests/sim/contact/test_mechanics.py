@@ -54,7 +54,9 @@ def rough(pitch, seed=0, spread=0.03):
 
 @pytest.mark.parametrize("depth", [0.01, 0.03, 0.1, 0.3, 1.0])
 def test_hertz_sphere(depth):
-    """Force, radius and peak pressure within 1 % over two decades of depth; the grid is chosen for each."""
+    """Force, radius and peak pressure within 1 % over two decades of depth; the grid is chosen for
+    each.
+    """
     radius = 8.0
     a = np.sqrt(radius * depth)
     pitch = 3.2 * a / N
@@ -92,7 +94,9 @@ def test_flat_punch():
 
 @pytest.mark.parametrize("shape", ["ball", "rough"])
 def test_force_is_the_slope_of_the_energy(shape):
-    """The sum of the pressure against the load that does the work: dU / dd, U = half of pressure times motion."""
+    """The sum of the pressure against the load that does the work: dU / dd, U = half of pressure
+    times motion.
+    """
     pitch = 0.1
     surface = ball(pitch) if shape == "ball" else rough(pitch)
     depths = (0.28, 0.3, 0.32)

@@ -65,7 +65,9 @@ def within_coulomb(state, contact, friction=MU):
 
 
 def mindlin(share):
-    """Force over the limit at displacement over that of full slip (Cattaneo 1938, Mindlin 1949; Johnson 7.42)."""
+    """Force over the limit at displacement over that of full slip (Cattaneo 1938, Mindlin 1949;
+    Johnson 7.42).
+    """
     return 1 - (1 - np.minimum(share, 1)) ** 1.5
 
 
@@ -85,7 +87,9 @@ def test_mindlin_force_and_stick_circle():
 
 
 def test_unloading_leaves_mindlin_and_deresiewicz():
-    """Back by the same way: Q = Q(d) - 2 Q(back / 2), not the path of the loading (Johnson 7.54)."""
+    """Back by the same way: Q = Q(d) - 2 Q(back / 2), not the path of the loading (Johnson
+    7.54).
+    """
     states = walk(exact, [(0.6 * FULL, 0, 0), (-0.4 * FULL, 0, 0), (-0.2 * FULL, 0, 0)])
     first, second, third = (state.force[0] / (MU * LOAD) for state in states)
     assert first == pytest.approx(mindlin(0.6), rel=0.01)
@@ -95,7 +99,9 @@ def test_unloading_leaves_mindlin_and_deresiewicz():
 
 
 def test_a_sticking_circle_has_mindlins_stiffness():
-    """No slip: Q = 8 a G* d, T = 16 / 3 G a^3 theta; this sees every tangential coefficient, x by y too."""
+    """No slip: Q = 8 a G* d, T = 16 / 3 G a^3 theta; this sees every tangential coefficient, x by y
+    too.
+    """
     inside = np.hypot(X, Y) <= 0.85 * A
     a = np.sqrt(inside.sum() * PITCH**2 / np.pi)
     punch = PressResult(jnp.asarray(inside, jnp.float32), jnp.zeros((N, N)), 1.0, True, 0, 0.0)
@@ -245,7 +251,9 @@ def test_friction_holds_back_what_pressing_squeezes_out(fidelity):
 
 @pytest.fixture(scope="module")
 def dragged():
-    """The force along x and the torque of three frames (dx, dy, turn, depth), as a function with its gradient."""
+    """The force along x and the torque of three frames (dx, dy, turn, depth), as a function with
+    its gradient.
+    """
     gel = Gel(MODULUS, 0.48, 4.0)
 
     def total(frames, surface, friction):

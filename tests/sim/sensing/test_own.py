@@ -1,4 +1,6 @@
-"""A user's own sensor: a folder that is taken like the name of a known one, and what is wrong with a damaged one."""
+"""A user's own sensor: a folder that is taken like the name of a known one, and what is wrong with
+a damaged one.
+"""
 
 import json
 

@@ -38,7 +38,8 @@ def test_the_place_is_in_the_middle_and_the_scale_is_right(seed):
     )
     # the object is what changes with its paint alone
     mask = np.abs(red - blue).max(-1) > 25
-    # The top of the ball is in the middle; from aside, its body leans away by at most its radius times the tilt.
+    # The top of the ball is in the middle; from aside, its body leans away by at most its radius
+    # times the tilt.
     assert np.hypot(*middle(mask)) < 8 * math.sin(math.radians(38)) / EXTENT[0]
     assert mask[44:52, 44:52].all()
     share = mask.mean()

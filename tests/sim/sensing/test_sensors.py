@@ -39,7 +39,9 @@ def test_an_untouched_gel_is_neither_black_nor_burnt_and_has_colours(name):
 
 
 def test_a_digit_shades_as_in_real_pictures():
-    """Real DIGITs show the flank that faces up orange, the one that faces down blue, the right one green."""
+    """Real DIGITs show the flank that faces up orange, the one that faces down blue, the right one
+    green.
+    """
     model = sensors.look(DIGIT)
     middle = jnp.zeros(1)
 

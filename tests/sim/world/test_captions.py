@@ -16,7 +16,8 @@ from anytouch_jax.sim.world.objects import (
 from anytouch_jax.sim.world.shapes import PRIMITIVES
 
 THINGS = catalogue(0, 300)
-# What a caption would give away: kinds of primitive and things, materials, and all about the touch itself.
+# What a caption would give away: kinds of primitive and things, materials, and all about the touch
+# itself.
 SECRET = {
     *PRIMITIVES,
     *(kind.noun for kind in PRIMITIVE_KINDS.values()),

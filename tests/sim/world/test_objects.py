@@ -52,7 +52,9 @@ def test_the_slopes_are_those_of_the_height_maps(texture):
 
 
 def test_no_two_objects_feel_alike():
-    """The closest two of 64 differ by 20 micrometres RMS where either is touched, however they are turned."""
+    """The closest two of 64 differ by 20 micrometres RMS where either is touched, however they are
+    turned.
+    """
     maps = []
     for thing in THINGS:
         z = relief(thing.shape, 48, 0.2)

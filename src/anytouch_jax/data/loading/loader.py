@@ -1,7 +1,9 @@
-"""From a manifest to batches: the content of a step is a function of (manifest, config, step) alone.
+"""From a manifest to batches: the content of a step is a function of (manifest, config, step)
+alone.
 
-Stills and clips each have a sequence of epochs. An epoch is a seeded permutation, and a batch takes the next B of it.
-A batch that reaches past the end of an epoch can hold a row twice, always if there are fewer rows than B.
+Stills and clips each have a sequence of epochs. An epoch is a seeded permutation, and a batch takes
+the next B of it. A batch that reaches past the end of an epoch can hold a row twice, always if
+there are fewer rows than B.
 """
 
 from __future__ import annotations
@@ -47,11 +49,12 @@ _GALLERY = 5
 class Loader:
     """Batches for `config.stage` from the split `config.data.split` of a manifest.
 
-    `notes` are sentences for the user (rows left out, no clips, no pairs). `tokenizer` is the one in use, or None.
-    The image and text slots are a multiple of `devices`. With `shard` (index, count) this process reads and returns
-    its part of every batch; the parts joined in order are the whole batch. `log` gets a sentence for each of the first
-    NAMED samples that are replaced. Raises UserError: ManifestError for an empty split or an unknown sensor,
-    SampleError (from `batch` and `stream`) for a bad sample.
+    `notes` are sentences for the user (rows left out, no clips, no pairs). `tokenizer` is the one
+    in use, or None. The image and text slots are a multiple of `devices`. With `shard` (index,
+    count) this process reads and returns its part of every batch; the parts joined in order are the
+    whole batch. `log` gets a sentence for each of the first NAMED samples that are replaced. Raises
+    UserError: ManifestError for an empty split or an unknown sensor, SampleError (from `batch` and
+    `stream`) for a bad sample.
     """
 
     def __init__(
@@ -78,7 +81,8 @@ class Loader:
         contrasted = [size, self._match_size] if self._in_batch_negatives else [size]
         if config.stage == 2 and (odd := [rows for rows in contrasted if rows % groups]):
             raise UserError(
-                f"a batch of {odd[0]} touches does not divide by --objective.groups {groups}; change one of them"
+                f"a batch of {odd[0]} touches does not divide by --objective.groups {groups}; "
+                "change one of them"
             )
         for name, number in (("devices", devices), ("batch_size", size)):
             self._shard.check(number, name)
@@ -103,7 +107,10 @@ class Loader:
     def __repr__(self) -> str:
         rows = len(self.manifest)
         data = self.config.data
-        return f"Loader(stage {self.config.stage}, split {data.split} of {rows:,} rows, batches of {data.batch_size})"
+        return (
+            f"Loader(stage {self.config.stage}, split {data.split} of {rows:,} rows, batches of "
+            f"{data.batch_size})"
+        )
 
     def kind(self, step: int) -> Literal["still", "clip"]:
         """Return whether the batch of `step` holds stills or clips."""
@@ -113,7 +120,9 @@ class Loader:
 
     @property
     def steps_per_epoch(self) -> int:
-        """Batches that hold every still and every clip once (and every anchor, if matching has separate steps)."""
+        """Batches that hold every still and every clip once (and every anchor, if matching has
+        separate steps).
+        """
         size = self.config.data.batch_size
         steps = sum(-(-pool.draws // size) for pool in self._drawn)
         if self.config.splits_steps:
@@ -130,21 +139,26 @@ class Loader:
         return [self.config.model.sensors[row] for row in rows]
 
     def batch(self, step: int) -> Batch:
-        """Return the batch of `step`, filled in this thread: TouchBatch in stage 1, Stage2Batch in stage 2."""
+        """Return the batch of `step`, filled in this thread: TouchBatch in stage 1, Stage2Batch in
+        stage 2.
+        """
         return run_jobs(self._plan(step))[0]
 
     def stream(self, start: int, stop: int) -> Iterator[tuple[int, Batch, Info]]:
-        """Yield (step, batch, info) for steps start .. stop - 1, filled ahead by `data.threads` threads.
+        """Yield (step, batch, info) for steps start .. stop - 1, filled ahead by `data.threads`
+        threads.
 
-        The bytes do not depend on the threads. `info` counts `skipped_samples` of this shard, and `images` and `texts`
-        of the whole batch. Close the iterator to stop early.
+        The bytes do not depend on the threads. `info` counts `skipped_samples` of this shard, and
+        `images` and `texts` of the whole batch. Close the iterator to stop early.
         """
         return prefetch_batches(
             self._plan, range(start, stop), self.config.data.threads, self.config.data.prefetch
         )
 
     def _share_of_align_steps(self) -> float:
-        """Return 1, or in separate steps (release) the share of align batches among all batches of an epoch."""
+        """Return 1, or in separate steps (release) the share of align batches among all batches of
+        an epoch.
+        """
         pools = self._drawn_matches
         if not self.config.splits_steps or not pools:
             return 1.0
@@ -193,7 +207,9 @@ class Loader:
         return BatchJobs(batch, jobs, align.info if align else {"images": 0, "texts": 0})
 
     def _plan_align(self, step: int, pool: Pool, rank: int) -> BatchJobs[AlignBatch]:
-        """Take rows of all strata in a seeded order; their images and texts fill the slots in that order."""
+        """Take rows of all strata in a seeded order; their images and texts fill the slots in that
+        order.
+        """
         before, now = pool.quota.at(rank)
         draws = [
             (stratum, *draw)
@@ -253,7 +269,8 @@ class Loader:
             if mine is None:
                 continue
             write = partial(self._write_match, batch, pool, mine, gallery)
-            # Slots of matching come after those of alignment, so that their replacements are drawn apart.
+            # Slots of matching come after those of alignment, so that their replacements are drawn
+            # apart.
             place = self.config.data.batch_size + slot
             size = len(pool.matches.anchors)
             jobs.append(
@@ -279,7 +296,9 @@ class Loader:
             self._log(f"{error}; another sample replaces it{more}")
 
     def _gallery_sensor(self, step: int, pool: MatchPool) -> int | None:
-        """Return the one sensor of all positives of a step, drawn as a partner is, for negatives of that sensor."""
+        """Return the one sensor of all positives of a step, drawn as a partner is, for negatives of
+        that sensor.
+        """
         if not (self._in_batch_negatives and self.config.data.negatives == "same_sensor"):
             return None
         rng = np.random.default_rng([self._seed, _GALLERY, step])
@@ -287,7 +306,9 @@ class Loader:
         return int(self._sensor[pool.windows[partner, -1]])
 
     def _caption_length(self) -> int:
-        """Return the padded length of captions: the longest in eights, as positions behind its end change nothing."""
+        """Return the padded length of captions: the longest in eights, as positions behind its end
+        change nothing.
+        """
         tower = self.config.model.text
         if tower is None or self.tokenizer is None:
             return 0
@@ -325,9 +346,12 @@ class Loader:
         index: int,
         epoch: int,
     ) -> None:
-        """Write sample `index` into the slots `touch`, `image` and `text`, None for those of other shards."""
+        """Write sample `index` into the slots `touch`, `image` and `text`, None for those of other
+        shards.
+        """
         rows = pool.windows[pool.members[stratum][index]]
-        # The replacement of a bad sample must not depend on the shard, so with "skip" every part is read.
+        # The replacement of a bad sample must not depend on the shard, so with "skip" every part is
+        # read.
         read_all = self.config.data.on_bad_sample == "skip"
         if read_all or touch is not None:
             self._reader.touch(rows, epoch, None if touch is None else batch.clip[touch])

@@ -1,7 +1,7 @@
 """Pools to draw from: the stills, clips and matching pairs of a split, cut into strata by modality.
 
-`find_pools` runs once before the first step. It selects the rows of the split, finds the clips among them, and gives
-each stratum a sampler. The loader then draws from the pools by step number.
+`find_pools` runs once before the first step. It selects the rows of the split, finds the clips
+among them, and gives each stratum a sampler. The loader then draws from the pools by step number.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ _FALSE_WORDS = ("", "0", "0.0", "false", "no", "none")
 
 
 class Pool(NamedTuple):
-    """Windows of rows i64 (M, T); for each stratum its ids in `windows` (`members`) and a sampler over these."""
+    """Windows of rows i64 (M, T); for each stratum its ids in `windows` (`members`) and a sampler
+    over these.
+    """
 
     windows: np.ndarray
     quota: StratumQuota
@@ -54,7 +56,9 @@ class Pool(NamedTuple):
 
 
 class MatchPool(NamedTuple):
-    """Windows of rows i64 (M, T) for matching, the matches among them, and a sampler over the anchors."""
+    """Windows of rows i64 (M, T) for matching, the matches among them, and a sampler over the
+    anchors.
+    """
 
     windows: np.ndarray
     matches: Matches
@@ -62,7 +66,9 @@ class MatchPool(NamedTuple):
 
 
 class Pools(NamedTuple):
-    """All pools of a run, None or absent if empty; `sensor` i32 (rows,) are sensor-table rows, -1 for rows left out."""
+    """All pools of a run, None or absent if empty; `sensor` i32 (rows,) are sensor-table rows, -1
+    for rows left out.
+    """
 
     touch: tuple[Pool, ...]
     match: tuple[MatchPool | None, MatchPool | None]
@@ -72,10 +78,11 @@ class Pools(NamedTuple):
 
 
 class _Usable(NamedTuple):
-    """Rows that a run may use: `rows` i64 ids that may be drawn; the other arrays have a value per manifest row.
+    """Rows that a run may use: `rows` i64 ids that may be drawn; the other arrays have a value per
+    manifest row.
 
-    `sensor` is as in `Pools`, `weights` f64 draws per epoch (None: 1), `ends` whether a clip may end there. `has_image`
-    and `has_text` are False without a tower.
+    `sensor` is as in `Pools`, `weights` f64 draws per epoch (None: 1), `ends` whether a clip may
+    end there. `has_image` and `has_text` are False without a tower.
     """
 
     sensor: np.ndarray
@@ -100,8 +107,9 @@ def find_pools(
 ) -> Pools:
     """Return the pools of the split `config.data.split`; `devices` sets the multiple of the slots.
 
-    `gels` are the pictures that are subtracted, if any are. Rows without one are left out if the model needs one.
-    Raises UserError for an empty split, an unknown sensor, an unfit tokenizer, and for data without a training signal.
+    `gels` are the pictures that are subtracted, if any are. Rows without one are left out if the
+    model needs one. Raises UserError for an empty split, an unknown sensor, an unfit tokenizer, and
+    for data without a training signal.
     """
     usable, notes = _usable_rows(manifest, config, gels)
     captioned = usable.rows[usable.has_text[usable.rows]]
@@ -115,7 +123,8 @@ def find_pools(
         and tokenizer.vocab_size > config.model.text.vocab
     ):
         raise UserError(
-            f"the tokenizer has {tokenizer.vocab_size} tokens but the text tower only {config.model.text.vocab}: "
+            f"the tokenizer has {tokenizer.vocab_size} tokens but the text tower only "
+            f"{config.model.text.vocab}: "
             f"set --model.text.vocab {tokenizer.vocab_size} or give another tokenizer"
         )
     if config.stage == 2 and config.model.text:
@@ -142,8 +151,10 @@ def find_pools(
     has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
     if config.stage == 2 and not (has_modality or any(match) or config.reconstructs):
         raise UserError(
-            f"stage 2 has nothing to learn from split {data.split!r}. It needs photographs (image_path), captions "
-            "(text), or places touched by two sensors (touch). Add one with its tower or head, or train stage 1."
+            f"stage 2 has nothing to learn from split {data.split!r}. It needs photographs "
+            "(image_path), captions "
+            "(text), or places touched by two sensors (touch). Add one with its tower or head, or "
+            "train stage 1."
         )
     return Pools(touch, match, usable.sensor, tokenizer, notes)
 
@@ -162,7 +173,9 @@ def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> 
 
 
 def _shards(manifest: Manifest) -> np.ndarray:
-    """Return the shard of each row, i64 (rows,): its manifest with its path without the entry, or its folder."""
+    """Return the shard of each row, i64 (rows,): its manifest with its path without the entry, or
+    its folder.
+    """
     folder = pc.replace_substring_regex(manifest.column("path").combine_chunks(), r"/[^/]*$", "")
     place = pc.replace_substring_regex(folder, r"\.parquet/[^/]*$", ".parquet")
     codes = np.asarray(place.dictionary_encode().indices).astype(np.int64)
@@ -254,7 +267,9 @@ def _match_pools(
 def _usable_rows(
     manifest: Manifest, config: Config, gels: UnitGels | None
 ) -> tuple[_Usable, list[str]]:
-    """Return the rows of the split with images of a known sensor, a weight, and all that is required; and notes."""
+    """Return the rows of the split with images of a known sensor, a weight, and all that is
+    required; and notes.
+    """
     split = config.data.split
     on_bad = config.data.on_bad_sample
     rows = manifest.rows_of(split)
@@ -271,12 +286,14 @@ def _usable_rows(
         missing = rows[~gels.has(rows)] if config.data.background == "subtract" else rows[:0]
         if len(missing) == len(rows):
             raise ManifestError(
-                f"{manifest.where(int(rows[0]))} and {len(rows) - 1} other rows have no picture of the untouched gel, "
+                f"{manifest.where(int(rows[0]))} and {len(rows) - 1} other rows have no picture of "
+                "the untouched gel, "
                 f"which --data.background subtract requires. {ADVICE}"
             )
         if len(missing):
             notes.append(
-                f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are left out"
+                f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are "
+                "left out"
             )
             sensor = sensor.copy()
             rows = np.setdiff1d(rows, missing)
@@ -302,14 +319,17 @@ def _usable_rows(
 def _required(
     manifest: Manifest, config: Config, rows: np.ndarray, has: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, list[str]]:
-    """Return which rows of the manifest `data.require` and `data.contact_only` allow, bool (rows,), and notes."""
+    """Return which rows of the manifest `data.require` and `data.contact_only` allow, bool (rows,),
+    and notes.
+    """
     wanted = [*config.data.require, *(["contact"] if config.data.contact_only else [])]
     if not wanted:
         return np.ones(len(manifest), bool), []
     if config.data.contact_only:
         if "label.contact" not in manifest.table.column_names:
             raise UserError(
-                "--data.contact-only needs the column 'label.contact', which `anytouch data contact` writes"
+                "--data.contact-only needs the column 'label.contact', which `anytouch data "
+                "contact` writes"
             )
         # rows of unknown contact stay
         has = {**has, "contact": known_contact(manifest) != 0}
@@ -328,7 +348,9 @@ def _required(
 def epoch_weights(
     manifest: Manifest, config: Config, rows: np.ndarray
 ) -> tuple[np.ndarray | None, list[str]]:
-    """Return how often an epoch draws each row of the manifest, f64 (rows,), None if each comes once; and notes."""
+    """Return how often an epoch draws each row of the manifest, f64 (rows,), None if each comes
+    once; and notes.
+    """
     column = manifest.column("dataset")
     split = config.data.split
     datasets = pc.unique(column.take(rows)).drop_null().to_pylist()
@@ -369,8 +391,8 @@ def epoch_weights(
 def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
     """Return the rows whose text is not trained on, bool (rows,).
 
-    These are in a test split of a downstream task (column `downstream_test`; paper, appendix), and without
-    `aligned_text` touches shared by sensors or units (Table 6, "w/o Text in TacQuad").
+    These are in a test split of a downstream task (column `downstream_test`; paper, appendix), and
+    without `aligned_text` touches shared by sensors or units (Table 6, "w/o Text in TacQuad").
     """
     tested = _in_downstream_test(manifest)
     if aligned_text:
@@ -399,7 +421,10 @@ def _withheld_notes(manifest: Manifest, config: Config, rows: np.ndarray) -> lis
             f"the text of {count} rows is withheld: they are in a test split of a downstream task"
         )
     if not config.data.aligned_text:
-        shared = f"the text of {int((text & _is_aligned(manifest)[rows]).sum())} of {int(text.sum())} rows is withheld"
+        shared = (
+            f"the text of {int((text & _is_aligned(manifest)[rows]).sum())} of {int(text.sum())} "
+            "rows is withheld"
+        )
         notes.append(f"{shared}: other sensors or units share the touch (data.aligned_text)")
     return notes
 
@@ -407,7 +432,9 @@ def _withheld_notes(manifest: Manifest, config: Config, rows: np.ndarray) -> lis
 def training_captions(
     manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True
 ) -> list[str]:
-    """Return the distinct captions of `rows` that may be trained on (see `withheld_text`), sorted."""
+    """Return the distinct captions of `rows` that may be trained on (see `withheld_text`),
+    sorted.
+    """
     allowed = rows[~withheld_text(manifest, aligned_text=aligned_text)[rows]]
     return sorted(pc.unique(manifest.column("text").take(allowed)).drop_null().to_pylist())
 
@@ -420,10 +447,11 @@ def choose_tokenizer(
     file: Path | None = None,
     vocabulary: int | None = None,
 ) -> tuple[Tokenizer | None, list[str]]:
-    """Return the tokenizer of a run, and notes: from `file`, else `data.tokenizer`, else trained on the captions.
+    """Return the tokenizer of a run, and notes: from `file`, else `data.tokenizer`, else trained on
+    the captions.
 
-    Captions are those of `rows` that may be trained on; without any it is None. A trained one has at most `vocabulary`
-    tokens, by default as many as the text tower. Raises UserError.
+    Captions are those of `rows` that may be trained on; without any it is None. A trained one has
+    at most `vocabulary` tokens, by default as many as the text tower. Raises UserError.
     """
     path = file or config.data.tokenizer
     if path is not None:

@@ -1,4 +1,5 @@
-"""Samples: the frames and photograph of a row, augmented, or resized in batches of given rows for evaluation.
+"""Samples: the frames and photograph of a row, augmented, or resized in batches of given rows for
+evaluation.
 
 Bad samples are errors, or are replaced or left out.
 """
@@ -34,12 +35,16 @@ Prepare = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 
 
 class SampleError(UserError):
-    """A sample that cannot be used; the message names the row, its manifest, the file and the reason."""
+    """A sample that cannot be used; the message names the row, its manifest, the file and the
+    reason.
+    """
 
 
 @dataclass(frozen=True)
 class SampleReader:
-    """Reads samples of `manifest` at the model's size, augmented as `config` says; the first frames are cached."""
+    """Reads samples of `manifest` at the model's size, augmented as `config` says; the first frames
+    are cached.
+    """
 
     manifest: Manifest
     config: Config
@@ -59,16 +64,19 @@ class SampleReader:
         out: np.ndarray | None = None,
         prepare: Prepare | None = None,
     ) -> np.ndarray:
-        """Return the frames of a window of rows, u8 (T, size, size, 3), not augmented if `epoch` is None.
+        """Return the frames of a window of rows, u8 (T, size, size, 3), not augmented if `epoch` is
+        None.
 
-        They are written into `out` once all could be read. The last row seeds the augmentation of the clip. A
-        background that is subtracted is augmented too: else the change of brightness would be stronger than the
-        contact. `prepare` replaces resizing and subtraction. Raises SampleError.
+        They are written into `out` once all could be read. The last row seeds the augmentation of
+        the clip. A background that is subtracted is augmented too: else the change of brightness
+        would be stronger than the contact. `prepare` replaces resizing and subtraction. Raises
+        SampleError.
         """
         size = self.config.model.image_size
         data = self.config.data
         plain = epoch is None or not (data.flip or any(data.affine) or any(data.jitter))
-        # Frames are resized once and cached, unless the background is subtracted at their original size.
+        # Frames are resized once and cached, unless the background is subtracted at their original
+        # size.
         gel = None if data.background == "keep" or self.gels is None else self.gels(int(rows[-1]))
         subtracts = self._subtracts(int(rows[-1]), epoch, gel)
         shapes: list[tuple[int, ...]] = []  # before resizing
@@ -114,7 +122,10 @@ class SampleReader:
         return np.stack(transforms.subtract_background(augmented, background), out=out)
 
     def _subtracts(self, row: int, epoch: int | None, gel: np.ndarray | None) -> bool:
-        """Return whether the background of a row is subtracted. "either" draws it, and always does in evaluation."""
+        """Return whether the background of a row is subtracted.
+
+        "either" draws it, and always does in evaluation.
+        """
         if self.config.data.background != "either":
             return self.config.data.background == "subtract"
         if gel is None and self.manifest.value(row, "background_path") is None:
@@ -125,7 +136,9 @@ class SampleReader:
         )
 
     def vision(self, row: int, epoch: int | None) -> np.ndarray:
-        """Return the photograph of a row, u8 (size, size, 3); `epoch` None means no augmentation."""
+        """Return the photograph of a row, u8 (size, size, 3); `epoch` None means no
+        augmentation.
+        """
         size = self.config.model.image_size
         image = read_image(self.manifest, row, "image_path")
         if epoch is None:
@@ -139,7 +152,10 @@ class SampleReader:
         return lru_cache(256)(decode)
 
     def _resized(self, file: Path, shapes: list[tuple[int, ...]]) -> np.ndarray:
-        """Return an image at the model's size, read-only, from the cache if it is there. Its shape goes to `shapes`."""
+        """Return an image at the model's size, read-only, from the cache if it is there.
+
+        Its shape goes to `shapes`.
+        """
         image, shape = self._cache.get(file, (None, ()))
         if image is None:
             decoded = decode(file)
@@ -158,7 +174,10 @@ def read_image(
     column: str = "path",
     load: Callable[[Path], np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Return the image in a path column, RGB u8 (h, w, 3), by `load` (`decode`). Raises SampleError with its place."""
+    """Return the image in a path column, RGB u8 (h, w, 3), by `load` (`decode`).
+
+    Raises SampleError with its place.
+    """
     try:
         return (load or decode)(manifest.file(row, column))
     except UserError as error:
@@ -175,10 +194,12 @@ def fill_slot(
     epoch: int,
     skipped: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Write sample `index` of `size` into a slot by `write(index, epoch)`, and return how many were skipped.
+    """Write sample `index` of `size` into a slot by `write(index, epoch)`, and return how many were
+    skipped.
 
-    With "skip" a bad sample is replaced by one drawn from (seed, step, slot, attempt), and `skipped` gets its error.
-    Raises SampleError at once with "error", else after TRIES bad samples in a row.
+    With "skip" a bad sample is replaced by one drawn from (seed, step, slot, attempt), and
+    `skipped` gets its error. Raises SampleError at once with "error", else after TRIES bad samples
+    in a row.
     """
     for attempt in range(TRIES):
         try:
@@ -210,13 +231,15 @@ def evaluation(
     skipped: list[str] | None = None,
     gels: UnitGels | None = None,
 ) -> Iterator[tuple[np.ndarray, TouchBatch]]:
-    """Yield (row ids i64 (n,), TouchBatch of B rows) over `rows` in order, with the same bytes every time.
+    """Yield (row ids i64 (n,), TouchBatch of B rows) over `rows` in order, with the same bytes
+    every time.
 
-    Stills have T = 1; clips are the `frames` (default `model.frames`) frames that end at each row. B is
-    `data.batch_size`, and only the first n rows of a batch are valid. With `data.on_bad_sample` "skip" bad rows are
-    left out, and `skipped` gets a sentence for the first NAMED. `unknown` "universal" gives unknown sensors the
-    universal tokens. `prepare` makes an array like `like` from a frame u8 (h, w, 3) and its background or None. `gels`
-    are the untouched gels, by default those of `data.gels`. Raises ManifestError for an unknown sensor, SampleError,
+    Stills have T = 1; clips are the `frames` (default `model.frames`) frames that end at each row.
+    B is `data.batch_size`, and only the first n rows of a batch are valid. With
+    `data.on_bad_sample` "skip" bad rows are left out, and `skipped` gets a sentence for the first
+    NAMED. `unknown` "universal" gives unknown sensors the universal tokens. `prepare` makes an
+    array like `like` from a frame u8 (h, w, 3) and its background or None. `gels` are the untouched
+    gels, by default those of `data.gels`. Raises ManifestError for an unknown sensor, SampleError,
     and UserError for a row that ends no clip.
     """
     rows = np.asarray(rows, np.int64)
@@ -288,7 +311,8 @@ def _clips_ending_at(manifest: Manifest, rows: np.ndarray, length: int) -> np.nd
         row = int(rows[~is_end][0])
         others = np.count_nonzero(~is_end) - 1
         raise UserError(
-            f"{manifest.where(row)} does not end a clip of {length} frames (nor do {others} other rows); "
+            f"{manifest.where(row)} does not end a clip of {length} frames (nor do {others} other "
+            "rows); "
             "choose rows by Manifest.clips, or use stills"
         )
     return clips[at]

@@ -1,6 +1,8 @@
-"""Stateless sampling: the draw of step k is a function of (data, seed, k), and no state passes from step to step.
+"""Stateless sampling: the draw of step k is a function of (data, seed, k), and no state passes from
+step to step.
 
-Cross-sensor matching (Sec. 3.4): the anchors of a pool of rows, and draws of their positives and negatives.
+Cross-sensor matching (Sec. 3.4): the anchors of a pool of rows, and draws of their positives and
+negatives.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ VISION, BOTH, TEXT, NEITHER = range(4)
 
 
 def uniform_per_step(seed: int, tag: int, steps: np.ndarray) -> np.ndarray:
-    """Return a number in [0, 1) for every step, f64 of the shape of `steps`: splitmix64 of (seed, tag, step)."""
+    """Return a number in [0, 1) for every step, f64 of the shape of `steps`: splitmix64 of (seed,
+    tag, step).
+    """
     # arrays overflow without a warning
     state = np.array([(seed ^ tag * 0xD1342543DE82EF95) % 2**64], np.uint64)
     x = _mix(state) + (steps.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
@@ -34,7 +38,9 @@ def _mix(x: np.ndarray) -> np.ndarray:
 
 
 class StepSchedule:
-    """The kind of each step's batch, and its rank in that kind; `choose` maps i64 (n,) steps to small codes (n,)."""
+    """The kind of each step's batch, and its rank in that kind; `choose` maps i64 (n,) steps to
+    small codes (n,).
+    """
 
     def __init__(self, choose: Callable[[np.ndarray], np.ndarray]) -> None:
         self._choose = choose
@@ -55,10 +61,12 @@ class StepSchedule:
 
 
 class EpochSampler:
-    """An endless sequence of item ids, epoch after epoch. Each epoch is a seeded permutation of `size` draws.
+    """An endless sequence of item ids, epoch after epoch.
 
-    `weights` f64 (items,) above 0 is how often an epoch draws each: floor(w) times, and a seeded choice of the items of
-    one weight once more.
+    Each epoch is a seeded permutation of `size` draws.
+
+    `weights` f64 (items,) above 0 is how often an epoch draws each: floor(w) times, and a seeded
+    choice of the items of one weight once more.
     """
 
     def __init__(self, items: int, seed: int, tag: int, weights: np.ndarray | None = None) -> None:
@@ -78,7 +86,10 @@ class EpochSampler:
         self._epochs: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
 
     def take(self, start: int, count: int) -> list[tuple[int, int]]:
-        """Return (item, pass) of positions. The pass is the epoch, with weights another for each draw of an item."""
+        """Return (item, pass) of positions.
+
+        The pass is the epoch, with weights another for each draw of an item.
+        """
         draws = []
         for position in range(start, start + count):
             epoch, position = divmod(position, self.size)
@@ -95,7 +106,9 @@ class EpochSampler:
         return self._epochs[epoch]
 
     def _permuted(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the draws of an epoch: items i64 (size,), and the copy number of each draw (None: all are 0)."""
+        """Return the draws of an epoch: items i64 (size,), and the copy number of each draw (None:
+        all are 0).
+        """
         if not self._groups:
             return rng.permutation(self.size), None
         parts = []
@@ -108,12 +121,13 @@ class EpochSampler:
 
 
 class PartSampler:
-    """An endless sequence of item ids in batches, whose slots draw from `parts` parts of whole shards.
+    """An endless sequence of item ids in batches, whose slots draw from `parts` parts of whole
+    shards.
 
-    `shard` i64 (items,) is the shard of each item. Shards go to the parts by size, each to the smallest. Slot i of a
-    batch draws from part i * parts // batch, which goes through its shards in a seeded order, MIXED at a time: all
-    items once, then again. So any number of hosts that divides `parts` reads the same batches. Raises UserError for too
-    few shards.
+    `shard` i64 (items,) is the shard of each item. Shards go to the parts by size, each to the
+    smallest. Slot i of a batch draws from part i * parts // batch, which goes through its shards in
+    a seeded order, MIXED at a time: all items once, then again. So any number of hosts that divides
+    `parts` reads the same batches. Raises UserError for too few shards.
     """
 
     MIXED = 4  # shards whose items are mixed
@@ -144,7 +158,9 @@ class PartSampler:
         self._orders = dict[tuple[int, int], np.ndarray]()
 
     def take(self, start: int, count: int) -> list[tuple[int, int]]:
-        """Return (item, epoch of its part) at positions start .. start + count - 1 of the sequence."""
+        """Return (item, epoch of its part) at positions start .. start + count - 1 of the
+        sequence.
+        """
         share = self._batch // len(self._parts)
         draws = []
         for position in range(start, start + count):
@@ -171,12 +187,14 @@ class PartSampler:
 
 
 class StratumQuota:
-    """How many rows of each stratum (vision, both, text, neither) a batch takes, so that its slots are full.
+    """How many rows of each stratum (vision, both, text, neither) a batch takes, so that its slots
+    are full.
 
-    `sizes` (4,) rows in each stratum. `images` and `texts` are the slots of a batch: the share of each modality,
-    rounded up, also to a multiple of the devices. The strata are intervals of a line of length `batch`, and a batch
-    takes the points u, u + 1, ... of it. So each count is its exact average rounded down or up. The offset u moves by
-    the golden section from batch to batch, so that rare strata come at even distances.
+    `sizes` (4,) rows in each stratum. `images` and `texts` are the slots of a batch: the share of
+    each modality, rounded up, also to a multiple of the devices. The strata are intervals of a line
+    of length `batch`, and a batch takes the points u, u + 1, ... of it. So each count is its exact
+    average rounded down or up. The offset u moves by the golden section from batch to batch, so
+    that rare strata come at even distances.
     """
 
     def __init__(self, sizes: Sequence[int], batch: int, multiple: int = 1) -> None:
@@ -195,7 +213,9 @@ class StratumQuota:
         self._table = np.zeros((1, 4), np.int64)
 
     def at(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows taken from each stratum before batch `k` and by batch `k`, i64 (4,) each."""
+        """Return the rows taken from each stratum before batch `k` and by batch `k`, i64 (4,)
+        each.
+        """
         if k + 1 >= len(self._table):
             u = np.cumsum(np.full(max(1024, 2 * k + 2), self._step) % self._unit) % self._unit
             # points below each edge: ceil((edge - u) / unit)
@@ -211,7 +231,9 @@ def _slots(share: Fraction, batch: int, multiple: int) -> int:
 
 
 def _fill(shares: list[Fraction], images: int, texts: int) -> list[Fraction]:
-    """Move rows to the strata that fill the slots; no stratum loses more than half of its natural share."""
+    """Move rows to the strata that fill the slots; no stratum loses more than half of its natural
+    share.
+    """
     shares, floor = list(shares), [share / 2 for share in shares]
 
     def move(source: int, target: int, wanted: Fraction) -> Fraction:
@@ -233,18 +255,23 @@ def _fill(shares: list[Fraction], images: int, texts: int) -> list[Fraction]:
 
 @dataclass(frozen=True)
 class Shard:
-    """Part `index` of `count` equal, contiguous parts of a batch: the slots that one process fills."""
+    """Part `index` of `count` equal, contiguous parts of a batch: the slots that one process
+    fills.
+    """
 
     index: int
     count: int
 
     def check(self, slots: int, name: str) -> None:
-        """Raise UserError unless `slots` divides into `count` equal parts and this part is one of them."""
+        """Raise UserError unless `slots` divides into `count` equal parts and this part is one of
+        them.
+        """
         if not 0 <= self.index < self.count:
             raise UserError(f"there is no shard {self.index} of {self.count}")
         if slots % self.count:
             raise UserError(
-                f"{name} {slots} cannot be shared by {self.count} processes; choose a multiple of them"
+                f"{name} {slots} cannot be shared by {self.count} processes; choose a multiple of "
+                "them"
             )
 
     def share(self, slots: int) -> int:
@@ -257,7 +284,9 @@ class Shard:
         return array[self.index * size : (self.index + 1) * size]
 
     def place(self, slot: int | None, slots: int) -> int | None:
-        """Return the position of `slot` of `slots` within this part, None if it is outside or None."""
+        """Return the position of `slot` of `slots` within this part, None if it is outside or
+        None.
+        """
         if slot is None:
             return None
         position = slot - self.index * self.share(slots)
@@ -271,7 +300,9 @@ _TRIES = 32  # uniform draws before the whole pool is searched
 
 
 class MatchKeys(NamedTuple):
-    """What distinguishes touches, codes (rows,), -1 for unknown: place, sensor, unit, object, data set."""
+    """What distinguishes touches, codes (rows,), -1 for unknown: place, sensor, unit, object, data
+    set.
+    """
 
     touch: np.ndarray
     sensor: np.ndarray
@@ -283,10 +314,11 @@ class MatchKeys(NamedTuple):
 class Matches:
     """The matches in a pool of rows (ids i64).
 
-    `anchors` are ids into `pool`: rows whose place another sensor, or else another unit, has touched too, and that have
-    a negative. `one_object` is True if all of the pool is one known object. With `same_sensor` negatives are of the
-    positive's sensor, which has another known place. With `other_object` negatives are of another object if there is
-    one (the release), else of "any other object or location".
+    `anchors` are ids into `pool`: rows whose place another sensor, or else another unit, has
+    touched too, and that have a negative. `one_object` is True if all of the pool is one known
+    object. With `same_sensor` negatives are of the positive's sensor, which has another known
+    place. With `other_object` negatives are of another object if there is one (the release), else
+    of "any other object or location".
     """
 
     def __init__(
@@ -315,14 +347,17 @@ class Matches:
         order = np.argsort(touch, kind="stable")
         self._order = order.astype(np.int32) if len(order) < 1 << 31 else order
         self._sorted = touch[self._order]
-        # With a single place, a row of an unknown place may be on it; a usable partner's sensor has another place.
+        # With a single place, a row of an unknown place may be on it; a usable partner's sensor has
+        # another place.
         known = same_sensor or np.searchsorted(self._sorted, 0) < np.searchsorted(
             self._sorted, touch.max(initial=-1)
         )
         self.anchors = anchors if known else anchors[self._have_negatives(anchors)]
 
     def _have_negatives(self, anchors: np.ndarray) -> np.ndarray:
-        """Return which of these anchors, all at one place, have a negative; each object and data set is tried once."""
+        """Return which of these anchors, all at one place, have a negative; each object and data
+        set is tried once.
+        """
         rows = self.pool[anchors]
         things = np.stack([self._keys.object[rows], self._keys.dataset[rows]], 1)
         _, first, thing = np.unique(things, axis=0, return_index=True, return_inverse=True)
@@ -337,7 +372,9 @@ class Matches:
     def draw(
         self, anchor: int, rng: np.random.Generator, sensor: int | None = None
     ) -> tuple[int, int]:
-        """Return (positive, negative) ids for `anchor`: other sensor (`sensor` if there) or unit; other place."""
+        """Return (positive, negative) ids for `anchor`: other sensor (`sensor` if there) or unit;
+        other place.
+        """
         keys = self._keys
         row = self.pool[anchor]
         low, high = np.searchsorted(self._sorted, keys.touch[row] + np.array([0, 1]))
@@ -378,7 +415,9 @@ class Matches:
         return self._rows_of_sensor[sensor]
 
     def _elsewhere(self, anchor: int, ids: np.ndarray) -> np.ndarray:
-        """Return which `ids` are surely at another place, and on another object with `other_object`, bool."""
+        """Return which `ids` are surely at another place, and on another object with
+        `other_object`, bool.
+        """
         keys = self._keys
         rows = self.pool[ids]
         row = self.pool[anchor]
@@ -394,12 +433,16 @@ class Matches:
 
 
 def is_shared_touch(touch: np.ndarray, sensor: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return the rows whose touch (codes i64 (rows,)) two or more known sensors or units share, bool (rows,)."""
+    """Return the rows whose touch (codes i64 (rows,)) two or more known sensors or units share,
+    bool (rows,).
+    """
     return (_distinct(touch, sensor) > 1) | (_distinct(touch, unit) > 1)
 
 
 def _has_partner(keys: MatchKeys, usable: np.ndarray) -> np.ndarray:
-    """Return which rows have a usable partner of another sensor at their place, or else of another unit."""
+    """Return which rows have a usable partner of another sensor at their place, or else of another
+    unit.
+    """
     sensors = _distinct(keys.touch, keys.sensor)
     units = _distinct(keys.touch, keys.unit)
     others = _distinct(keys.touch, np.where(usable, keys.sensor, -1)) - usable
@@ -407,7 +450,9 @@ def _has_partner(keys: MatchKeys, usable: np.ndarray) -> np.ndarray:
 
 
 def _distinct(group: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return for every row how many known values (>= 0) its group has, 0 without a group (-1): i64 (rows,)."""
+    """Return for every row how many known values (>= 0) its group has, 0 without a group (-1): i64
+    (rows,).
+    """
     known = (value >= 0) & (group >= 0)
     # the last group is that of -1
     width = int(value.max(initial=0)) + 1

@@ -38,8 +38,8 @@ def prefetch_batches(
 ) -> Iterator[tuple[int, Batch, dict[str, int]]]:
     """Yield (step, batch, info) of every step in order, at most `prefetch` batches ahead.
 
-    The content does not depend on `threads` (0: the caller's). The first failing job raises in the caller. All threads
-    have ended when the iterator ends.
+    The content does not depend on `threads` (0: the caller's). The first failing job raises in the
+    caller. All threads have ended when the iterator ends.
     """
     if threads < 1:
         for step in steps:
@@ -65,7 +65,10 @@ def bounded_map(
     threads: int,
     ahead: int | None = None,
 ) -> Generator[Result, None, None]:
-    """Yield `function(item)` in order, `ahead` items ahead (4 per thread). The first error raises; all threads end."""
+    """Yield `function(item)` in order, `ahead` items ahead (4 per thread).
+
+    The first error raises; all threads end.
+    """
     if threads < 1:
         yield from map(function, items)
         return

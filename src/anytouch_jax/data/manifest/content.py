@@ -1,7 +1,8 @@
 """What a table of frames contains, from its columns in blocks: digest, counts, recordings, clips.
 
-Every column is passed once or twice, and no value becomes a Python object. So 20 million rows take some hundred MB.
-Clips are windows over rows, exactly one stride apart in one sequence, which are found without a loop over rows.
+Every column is passed once or twice, and no value becomes a Python object. So 20 million rows take
+some hundred MB. Clips are windows over rows, exactly one stride apart in one sequence, which are
+found without a loop over rows.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ _SHOWN = 20
 
 
 class Summary(NamedTuple):
-    """Numbers of a manifest: `filled` rows by column, `counts` of split and sensor (first values, number of all)."""
+    """Numbers of a manifest: `filled` rows by column, `counts` of split and sensor (first values,
+    number of all).
+    """
 
     rows: int
     recordings: int
@@ -94,7 +97,10 @@ def summarise(
     length: int,
     repeat: Callable[[int, int, int, str], Exception],
 ) -> Summary:
-    """Return the numbers of a table. Raises `repeat(rows.., frame_index, sequence)` if a sequence repeats a frame."""
+    """Return the numbers of a table.
+
+    Raises `repeat(rows.., frame_index, sequence)` if a sequence repeats a frame.
+    """
     parts: dict[str, list[Any]] = {
         name: [] for name in ("sequence", "frame_index", "stride", "split", "sensor")
     }
@@ -163,11 +169,13 @@ def clip_windows(
     repeat_error: Callable[[int, int], Exception] | None = None,
     ends: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered by t's row id.
+    """Return row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered
+    by t's row id.
 
-    The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` (of row t) are i64 (rows,). A row
-    with a gap, or not in `ends` bool (rows,), has no window. Raises `repeat_error(first row, second row)` if a sequence
-    repeats a frame, and OverflowError for a length above 10^12.
+    The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` (of row t) are
+    i64 (rows,). A row with a gap, or not in `ends` bool (rows,), has no window. Raises
+    `repeat_error(first row, second row)` if a sequence repeats a frame, and OverflowError for a
+    length above 10^12.
     """
     order, key, blocks = _blocks(sequence, frame, stride, length, repeat_error, ends)
     # there can be millions of windows
@@ -193,7 +201,10 @@ def _blocks(
     repeat_error: Callable[[int, int], Exception] | None,
     ends: np.ndarray | None = None,
 ) -> tuple[np.ndarray | None, np.ndarray, Iterator[np.ndarray]]:
-    """Return (order, key) of `_sorted_keys`, and windows as positions in them, in blocks. Raises as `clip_windows`."""
+    """Return (order, key) of `_sorted_keys`, and windows as positions in them, in blocks.
+
+    Raises as `clip_windows`.
+    """
     if length < 1:
         raise ValueError(f"a clip has at least one frame, not {length}")
     if length > _LONGEST:
@@ -225,7 +236,9 @@ def _blocks(
 def _windows_ending_at(
     last: np.ndarray, key: np.ndarray, spread: int, stride: np.ndarray, length: int
 ) -> np.ndarray:
-    """Return the whole windows that end at the positions `last` of `key`, as positions i64 (windows, length)."""
+    """Return the whole windows that end at the positions `last` of `key`, as positions i64
+    (windows, length).
+    """
     windows = np.empty((len(last), length), np.int64)
     windows[:, -1] = last
     is_whole = np.ones(len(last), bool)
@@ -247,8 +260,9 @@ def _windows_ending_at(
 def _sorted_keys(
     sequence: np.ndarray, frame: np.ndarray
 ) -> tuple[np.ndarray | None, np.ndarray, int]:
-    """Return (order, key, spread): row ids i64 sorted by sequence and frame (None if sorted), and their keys. A key i64
-    is sequence * spread + frame. Frames count from 0 and are below `spread`."""
+    """Return (order, key, spread): row ids i64 sorted by sequence and frame (None if sorted), and
+    their keys. A key i64 is sequence * spread + frame. Frames count from 0 and are below `spread`.
+    """
     if not len(frame):
         return None, np.arange(0), 1
     low = int(frame.min())

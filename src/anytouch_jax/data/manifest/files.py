@@ -1,12 +1,14 @@
 """Files of a manifest: their bytes, loose, in a shard, or in an object store with a local cache.
 
-* `touch/00000.zip/17` is file 17 of a shard of `pack`: a ZIP file without compression, so a random file costs one read.
+* `touch/00000.zip/17` is file 17 of a shard of `pack`: a ZIP file without compression, so a random
+  file costs one read.
 * `data-000000.tar/17` is regular file 17 of a tar without compression, as WebDataset writes it.
-* `train-00000.parquet/image/17` is the cell of row 17 in a column of bytes, or of pictures of Hugging Face.
+* `train-00000.parquet/image/17` is the cell of row 17 in a column of bytes, or of pictures of
+  Hugging Face.
 * `touch/00000.parquet/17` is a shard of version 1 with its index next to it.
-* `s3://bucket/train-00000.parquet/image/17` is in an object store. A shard is copied whole on its first use, and the
-  copies that were not used for the longest leave first. `ANYTOUCH_CACHE` names the folder of the copies, and
-  `ANYTOUCH_CACHE_GB` their largest size (20).
+* `s3://bucket/train-00000.parquet/image/17` is in an object store. A shard is copied whole on its
+  first use, and the copies that were not used for the longest leave first. `ANYTOUCH_CACHE` names
+  the folder of the copies, and `ANYTOUCH_CACHE_GB` their largest size (20).
 """
 
 from __future__ import annotations
@@ -50,7 +52,10 @@ class ShardError(ValueError):
 
 
 def read_file(path: Path) -> bytes:
-    """Return the bytes of a file, loose or packed. Raises OSError, or ValueError (ShardError) if it is unfit."""
+    """Return the bytes of a file, loose or packed.
+
+    Raises OSError, or ValueError (ShardError) if it is unfit.
+    """
     place = split_shard_path(path)
     if place is None:
         return _read_loose(path)
@@ -138,13 +143,17 @@ class _Shard:
         if not valid:
             fault = "cut short" if length < size else "damaged (its checksum does not match)"
             raise ShardError(
-                f"row {row} of the shard is {fault}; copy the shard again from where the data were packed"
+                f"row {row} of the shard is {fault}; copy the shard again from where the data were "
+                "packed"
             )
         return data
 
 
 def read_shard_index(path: Path) -> np.ndarray:
-    """Return where the files of a shard lie in it, SHARD_INDEX (n,). Raises ShardError if it cannot be read."""
+    """Return where the files of a shard lie in it, SHARD_INDEX (n,).
+
+    Raises ShardError if it cannot be read.
+    """
     if path.suffix == ".parquet":
         return _parquet_index(path.with_suffix(".index"))
     if path.suffix == ".tar":
@@ -174,7 +183,10 @@ def read_shard_index(path: Path) -> np.ndarray:
 
 
 def tar_members(path: Path, file: BinaryIO | None = None) -> list[tuple[str, int, int]]:
-    """Return (name, offset, size) of the files in a plain tar, or in `file`, by its headers. Raises ShardError."""
+    """Return (name, offset, size) of the files in a plain tar, or in `file`, by its headers.
+
+    Raises ShardError.
+    """
     try:
         with tarfile.open(path, "r:", fileobj=file) as archive:
             members = [
@@ -194,7 +206,10 @@ def tar_members(path: Path, file: BinaryIO | None = None) -> list[tuple[str, int
 
 
 class _Column:
-    """A column of files in a Parquet file. The row groups that were read last stay in memory, up to _HELD bytes."""
+    """A column of files in a Parquet file.
+
+    The row groups that were read last stay in memory, up to _HELD bytes.
+    """
 
     def __init__(self, path: Path, name: str) -> None:
         try:
@@ -260,7 +275,10 @@ def _parquet_index(path: Path) -> np.ndarray:
 
 
 def unpack_npy(data: bytes) -> np.ndarray:
-    """Return a .npy as a view of its bytes, so that it cannot declare more than there is. Raises ValueError."""
+    """Return a .npy as a view of its bytes, so that it cannot declare more than there is.
+
+    Raises ValueError.
+    """
     stream = io.BytesIO(data)
     try:
         is_old = np.lib.format.read_magic(stream) == (1, 0)
@@ -296,7 +314,10 @@ def is_remote(path: str) -> bool:
 
 
 def local_copy(address: str) -> Path:
-    """Return the local path of an address or of an entry of a shard, copied if needed. Raises UserError."""
+    """Return the local path of an address or of an entry of a shard, copied if needed.
+
+    Raises UserError.
+    """
     file, entry = _split(address)
     name = file.rpartition("/")[2]
     target = _folder() / hashlib.sha256(file.encode()).hexdigest()[:24] / name

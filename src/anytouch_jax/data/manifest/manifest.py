@@ -1,7 +1,9 @@
-"""Manifests: tables of tactile frames, to read, join, edit and write, and to look up rows, clips and files.
+"""Manifests: tables of tactile frames, to read, join, edit and write, and to look up rows, clips
+and files.
 
-One row is one tactile frame (the columns are in `schema.py`), and row numbers count from 0. The keys `sequence` and
-`touch` belong to their file: two joined manifests never share a sequence or a touch by accident.
+One row is one tactile frame (the columns are in `schema.py`), and row numbers count from 0. The
+keys `sequence` and `touch` belong to their file: two joined manifests never share a sequence or a
+touch by accident.
 """
 
 from __future__ import annotations
@@ -42,8 +44,8 @@ KEYS = ("sequence", "touch", "grasp_group")  # columns whose values belong to th
 class Manifest:
     """A checked table of touch frames, from one file or several joined files.
 
-    `table` has typed columns, and `files` are the absolute manifest files. `source` i32 (rows,) is the file of each
-    row, and `number` i64 (rows,) its row number there.
+    `table` has typed columns, and `files` are the absolute manifest files. `source` i32 (rows,) is
+    the file of each row, and `number` i64 (rows,) its row number there.
     """
 
     table: pa.Table
@@ -76,7 +78,10 @@ class Manifest:
         return schema.place_of(self.files[self.source[row]], int(self.number[row]))
 
     def column(self, name: str) -> pa.ChunkedArray:
-        """Return the column `name`, all null for an optional one that is absent. Raises ManifestError for others."""
+        """Return the column `name`, all null for an optional one that is absent.
+
+        Raises ManifestError for others.
+        """
         if name in self.table.column_names:
             return self.table[name]
         if name in SCHEMA:
@@ -104,7 +109,10 @@ class Manifest:
         )
 
     def number_column(self, name: str) -> np.ndarray:
-        """Return a column as f64 (rows,), NaN where it is empty or missing. Raises ManifestError for text."""
+        """Return a column as f64 (rows,), NaN where it is empty or missing.
+
+        Raises ManifestError for text.
+        """
         if name not in self.table.column_names:
             return np.full(len(self), np.nan)
         try:
@@ -113,7 +121,9 @@ class Manifest:
             raise ManifestError(f"Column {name!r} contains text. It must have numbers.") from None
 
     def codes(self, name: str, *, own: bool = False) -> np.ndarray:
-        """Return a text column as codes i64 (rows,), -1 for null; with `own` files differ (see KEYS)."""
+        """Return a text column as codes i64 (rows,), -1 for null; with `own` files differ (see
+        KEYS).
+        """
         indices = self.column(name).combine_chunks().dictionary_encode().indices
         codes = np.asarray(pc.fill_null(indices, -1)).astype(np.int64)
         if own and len(self.files) > 1:
@@ -125,11 +135,17 @@ class Manifest:
         return group_rows(np.arange(len(self)), np.stack([self.codes(name) for name in names], 1))
 
     def file(self, row: int, name: str = "path") -> Path:
-        """Return the absolute file in a path column. Raises ManifestError if it is outside the manifest's folder."""
+        """Return the absolute file in a path column.
+
+        Raises ManifestError if it is outside the manifest's folder.
+        """
         return resolve_path(self._roots[self.source[row]], self.value(row, name))
 
     def rows_of(self, split: str) -> np.ndarray:
-        """Return the row ids i64 of one split, in order. Raises ManifestError if it is unknown or empty."""
+        """Return the row ids i64 of one split, in order.
+
+        Raises ManifestError if it is unknown or empty.
+        """
         if split not in SPLITS:
             raise ManifestError(f"unknown split {split!r}; use one of {', '.join(SPLITS)}")
         rows = np.flatnonzero(np.asarray(pc.equal(self.table["split"], split)))
@@ -141,10 +157,12 @@ class Manifest:
         return rows
 
     def clips(self, length: int, split: str | None = None) -> np.ndarray:
-        """Return all clips of `length` frames: row ids i64 (clips, length), oldest first, ordered by their last row.
+        """Return all clips of `length` frames: row ids i64 (clips, length), oldest first, ordered
+        by their last row.
 
-        A clip is rows of one sequence and one split whose frame_index values are exactly `stride` (of the last row)
-        apart. `split` selects the clips of that split. Raises ManifestError if a sequence repeats a frame.
+        A clip is rows of one sequence and one split whose frame_index values are exactly `stride`
+        (of the last row) apart. `split` selects the clips of that split. Raises ManifestError if a
+        sequence repeats a frame.
         """
         table = self.table
         ends = None if split is None else np.zeros(len(self), bool)
@@ -172,7 +190,9 @@ class Manifest:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 over every column's name and values: equal tables in CSV and Parquet have equal hashes."""
+        """SHA-256 over every column's name and values: equal tables in CSV and Parquet have equal
+        hashes.
+        """
         return content_digest(self.table.column_names, table_blocks(self.table))
 
     @cached_property
@@ -195,12 +215,16 @@ class Manifest:
 
 def _repeats(first: str, second: str, frame: int, sequence: str) -> ManifestError:
     return ManifestError(
-        f"{second} repeats frame_index {frame} of sequence {sequence!r}, as in {first}; a sequence has one row a frame"
+        f"{second} repeats frame_index {frame} of sequence {sequence!r}, as in {first}; a sequence "
+        "has one row a frame"
     )
 
 
 def read(paths: str | Path | Sequence[str | Path]) -> Manifest:
-    """Read one manifest (.csv or .parquet), or several joined in order; rows keep their files. Raises ManifestError."""
+    """Read one manifest (.csv or .parquet), or several joined in order; rows keep their files.
+
+    Raises ManifestError.
+    """
     several = [paths] if isinstance(paths, str | Path) else list(paths)
     if not several:
         raise ManifestError("no manifest is given; name a .csv or .parquet file")
@@ -211,7 +235,10 @@ def read(paths: str | Path | Sequence[str | Path]) -> Manifest:
 
 
 def summarise_file(path: str | Path, length: int = 3) -> Summary:
-    """Return the numbers of a manifest, with its clips; Parquet is read in blocks. Raises ManifestError as `read`."""
+    """Return the numbers of a manifest, with its clips; Parquet is read in blocks.
+
+    Raises ManifestError as `read`.
+    """
     file = _real_file(Path(path).expanduser())
     if file.is_file() and file.suffix.lower() == ".parquet":
         names, blocks = schema.parquet_blocks(file)
@@ -232,18 +259,25 @@ def summarise_file(path: str | Path, length: int = 3) -> Summary:
 
 
 def _real_file(path: Path) -> Path:
-    """Return the resolved path. Raises ManifestError for a link into the Hub's cache, to a name without an ending."""
+    """Return the resolved path.
+
+    Raises ManifestError for a link into the Hub's cache, to a name without an ending.
+    """
     file = path.resolve()
     if path.is_symlink() and path.suffix and not file.suffix:
         raise ManifestError(
-            f"{path} is a link into a cache, as its pictures may be; download the data into a separate folder "
+            f"{path} is a link into a cache, as its pictures may be; download the data into a "
+            "separate folder "
             "(hf download --local-dir)"
         )
     return file
 
 
 def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
-    """Return a manifest from columns of equal length, as if read from `path`. Raises ManifestError as `read` does."""
+    """Return a manifest from columns of equal length, as if read from `path`.
+
+    Raises ManifestError as `read` does.
+    """
     file = Path(path).expanduser().resolve()
     try:
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
@@ -283,10 +317,11 @@ def _with_column(table: pa.Table, name: str, column: Any) -> pa.Table:
 
 
 def write(manifest: Manifest, path: str | Path) -> None:
-    """Write a manifest as .csv or .parquet, atomically; its paths become relative to the new folder.
+    """Write a manifest as .csv or .parquet, atomically; its paths become relative to the new
+    folder.
 
-    Keys that two joined manifests share become different. Raises ManifestError for another ending, for a file outside
-    the new folder, and for a column that the format cannot hold.
+    Keys that two joined manifests share become different. Raises ManifestError for another ending,
+    for a file outside the new folder, and for a column that the format cannot hold.
     """
     target, table = placed(manifest, path)
     table = with_distinct_keys(manifest, table)
@@ -301,7 +336,10 @@ def write(manifest: Manifest, path: str | Path) -> None:
 
 
 def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
-    """Return the path of a manifest to be written, and its table for that folder. Raises ManifestError."""
+    """Return the path of a manifest to be written, and its table for that folder.
+
+    Raises ManifestError.
+    """
     target = Path(path).expanduser().resolve()
     table = manifest.table
     schema.table_suffix(target)
@@ -313,7 +351,8 @@ def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
         file = os.path.normpath(manifest.files[manifest.source[row]].parent / cell)
         if not Path(file).is_relative_to(folder):
             raise ManifestError(
-                f"{manifest.where(row)}: {file} is not inside {folder}, where the manifest is to be written; "
+                f"{manifest.where(row)}: {file} is not inside {folder}, where the manifest is to "
+                "be written; "
                 "write it above its files"
             )
         return Path(file).relative_to(folder).as_posix()
@@ -328,7 +367,9 @@ def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
 
 
 def with_distinct_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
-    """Return `table` with a prefix on keys that two files share, because in one file equal keys would be one."""
+    """Return `table` with a prefix on keys that two files share, because in one file equal keys
+    would be one.
+    """
     for name in KEYS if len(manifest.files) > 1 else ():
         if name not in table.column_names:
             continue
@@ -356,10 +397,12 @@ def sensor_rows(
     *,
     unknown: Literal["error", "skip", "universal"] = "error",
 ) -> tuple[np.ndarray, list[str]]:
-    """Return the sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out, and notes.
+    """Return the sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out, and
+    notes.
 
-    Only `rows` (default: all) are considered. Force fields are left out. A sensor outside `model.sensors` is an error,
-    is left out (`skip`), or uses the universal tokens (`universal`). Raises ManifestError, which names the first row.
+    Only `rows` (default: all) are considered. Force fields are left out. A sensor outside
+    `model.sensors` is an error, is left out (`skip`), or uses the universal tokens (`universal`).
+    Raises ManifestError, which names the first row.
     """
     ids = np.full(len(manifest), -1, np.int32)
     rows = np.arange(len(manifest)) if rows is None else np.unique(rows)
@@ -371,7 +414,8 @@ def sensor_rows(
         except ConfigError as error:
             if name in FIELD_SENSORS:
                 notes.append(
-                    f"left out {len(same)} rows of {name}: it measures a force field and has no images"
+                    f"left out {len(same)} rows of {name}: it measures a force field and has no "
+                    "images"
                 )
             elif unknown == "error" or isinstance(error, SpellingError):
                 raise ManifestError(
@@ -382,7 +426,8 @@ def sensor_rows(
             else:
                 ids[same] = model.universal_row
                 notes.append(
-                    f"sensor {shown(name)} is unknown: its {len(same)} rows use the universal sensor tokens"
+                    f"sensor {shown(name)} is unknown: its {len(same)} rows use the universal "
+                    "sensor tokens"
                 )
     return ids, notes
 
@@ -390,7 +435,10 @@ def sensor_rows(
 def misspelt_sensors(
     manifest: Manifest,
 ) -> Iterator[tuple[Literal["error", "warning"], str, np.ndarray]]:
-    """Yield (level, sentence, row ids i64) for sensor names that are nearly known names. New names are no fault."""
+    """Yield (level, sentence, row ids i64) for sensor names that are nearly known names.
+
+    New names are no fault.
+    """
     for rows in sorted(
         manifest.groups("sensor"), key=lambda rows: str(manifest.value(rows[0], "sensor"))
     ):
@@ -401,7 +449,10 @@ def misspelt_sensors(
 
 
 def resolve_path(root: str | Path, relative: str | None) -> Path:
-    """Return the file inside `root`, or the local copy of an address. Raises ManifestError if it leaves the folder."""
+    """Return the file inside `root`, or the local copy of an address.
+
+    Raises ManifestError if it leaves the folder.
+    """
     if not relative:
         raise ManifestError("the path is empty")
     if is_remote(relative):
@@ -417,7 +468,8 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
         path = os.path.realpath(path)
     if ("\\" in relative or relative[1:3] == ":/") and not os.path.lexists(path):
         raise ManifestError(
-            f"the path {text} is written as on Windows; write it relative to the manifest's folder, with forward "
+            f"the path {text} is written as on Windows; write it relative to the manifest's "
+            "folder, with forward "
             "slashes (touch/0.png)"
         )
     if relative[0] == "/":
@@ -427,7 +479,8 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
     if not path.startswith(root if root[-1] == "/" else f"{root}/"):
         link = ", by a link; put the files there, or move the manifest next to them"
         raise ManifestError(
-            f"the path {text} leaves the folder of the manifest, {root}{'' if '..' in relative.split('/') else link}"
+            f"the path {text} leaves the folder of the manifest, "
+            f"{root}{'' if '..' in relative.split('/') else link}"
         )
     return Path(path)
 
@@ -441,7 +494,9 @@ def _real_folder(root: str, head: str) -> str:
 
 
 def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
-    """Return the manifest of `rows` (ids i64) in the order given; errors still name the rows of the original files."""
+    """Return the manifest of `rows` (ids i64) in the order given; errors still name the rows of the
+    original files.
+    """
     rows = np.asarray(rows, np.int64)
     return Manifest(
         manifest.table.take(pa.array(rows)),
@@ -454,7 +509,9 @@ def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
 def group_rows(
     rows: np.ndarray, keys: np.ndarray, order: np.ndarray | None = None
 ) -> list[np.ndarray]:
-    """Return `rows` (ids i64) by equal `keys` (rows,) or (rows, k), in the order of keys, then of `order` and row."""
+    """Return `rows` (ids i64) by equal `keys` (rows,) or (rows, k), in the order of keys, then of
+    `order` and row.
+    """
     if not len(rows):
         return []
     group = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
@@ -473,7 +530,9 @@ def replace_column(manifest: Manifest, name: str, values: Any) -> Manifest:
 
 
 class Files(NamedTuple):
-    """Distinct files i < n: `code[column]` i64 (rows,), -1 for null, and the first `row` i64 (n,) and `column` (n,)."""
+    """Distinct files i < n: `code[column]` i64 (rows,), -1 for null, and the first `row` i64 (n,)
+    and `column` (n,).
+    """
 
     code: dict[str, np.ndarray]
     row: np.ndarray
@@ -484,7 +543,9 @@ class Files(NamedTuple):
 
 
 def distinct_files(manifest: Manifest, columns: Sequence[str] = PATHS) -> Files:
-    """Return the files of the path columns `columns`, each once (by its written path and its manifest)."""
+    """Return the files of the path columns `columns`, each once (by its written path and its
+    manifest).
+    """
     columns = [name for name in columns if name in manifest.table.column_names]
     rows = len(manifest)
     cells = pa.chunked_array(

@@ -49,11 +49,15 @@ Cast = Callable[[pa.ChunkedArray], pa.ChunkedArray]
 
 
 class ManifestError(UserError):
-    """A manifest that cannot be used; the message names the file, the column, and the line or row (`place_of`)."""
+    """A manifest that cannot be used; the message names the file, the column, and the line or row
+    (`place_of`).
+    """
 
 
 def is_manifest(path: Path) -> bool:
-    """Return whether the file in `path` has the columns of a manifest; its values are not checked."""
+    """Return whether the file in `path` has the columns of a manifest; its values are not
+    checked.
+    """
     try:
         names = (
             pa.parquet.read_schema(path).names
@@ -66,7 +70,10 @@ def is_manifest(path: Path) -> bool:
 
 
 def table_suffix(path: Path, name: str = "a manifest") -> str:
-    """Return ".csv" or ".parquet". Raises ManifestError for any other ending; `name` is for the message."""
+    """Return ".csv" or ".parquet".
+
+    Raises ManifestError for any other ending; `name` is for the message.
+    """
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".parquet"):
         raise ManifestError(f"{path}: {name} ends in .csv or .parquet")
@@ -74,7 +81,10 @@ def table_suffix(path: Path, name: str = "a manifest") -> str:
 
 
 def load_table(path: Path) -> pa.Table:
-    """Load the table in `path` (.csv or .parquet), checked and typed by `typed`. Raises ManifestError."""
+    """Load the table in `path` (.csv or .parquet), checked and typed by `typed`.
+
+    Raises ManifestError.
+    """
     if path.is_dir():
         raise ManifestError(f"{path} is a folder; give the .csv or .parquet file in it")
     if not path.is_file():
@@ -102,7 +112,9 @@ def shown(value: object) -> str:
 
 
 def listed(names: Sequence[str], count: int | None = None) -> str:
-    """Return the first twenty of `count` names for a message, each with 50 characters at most, and how many follow."""
+    """Return the first twenty of `count` names for a message, each with 50 characters at most, and
+    how many follow.
+    """
     count = len(names) if count is None else count
     more = f" and {count - 20:,} more" if count > 20 else ""
     return ", ".join(name[:50] for name in names[:20]) + more
@@ -124,7 +136,10 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def read_text_csv(path: Path) -> pa.Table:
-    """Return a CSV file as a table of text columns, where an empty cell is null. Raises ManifestError."""
+    """Return a CSV file as a table of text columns, where an empty cell is null.
+
+    Raises ManifestError.
+    """
     with reading(path):
         names = _csv_names(path)
         types = dict.fromkeys(names, _TEXT)
@@ -147,7 +162,8 @@ def read_text_csv(path: Path) -> pa.Table:
             if not line:
                 raise
     raise ManifestError(
-        f"{path}, line {line}: {len(cells)} cells for {len(names)} columns, in {shown(','.join(cells))}; quote cells "
+        f"{path}, line {line}: {len(cells)} cells for {len(names)} columns, in "
+        f"{shown(','.join(cells))}; quote cells "
         "with commas, and close each quote"
     )
 
@@ -157,7 +173,9 @@ def _csv_names(path: Path) -> list[str]:
 
 
 def place_of(path: Path, row: int) -> str:
-    """Return "line 5 of m.csv", as an editor counts lines, or "row 3 of m.parquet", counted from 0, for errors."""
+    """Return "line 5 of m.csv", as an editor counts lines, or "row 3 of m.parquet", counted from 0,
+    for errors.
+    """
     if path.suffix.lower() == ".csv":
         with suppress(OSError, UnicodeDecodeError, csv.Error, IndexError):
             return f"line {_csv_line_numbers(path, path.stat().st_mtime_ns)[row + 1]} of {path}"
@@ -166,7 +184,10 @@ def place_of(path: Path, row: int) -> str:
 
 @lru_cache(4)
 def _csv_line_numbers(path: Path, changed: int) -> np.ndarray:
-    """Return the first line of each row of a CSV file, i64 (1 + rows,). `changed` is the time of its last change."""
+    """Return the first line of each row of a CSV file, i64 (1 + rows,).
+
+    `changed` is the time of its last change.
+    """
     return np.fromiter((line for line, _ in csv_lines(path)), np.int64)
 
 
@@ -195,7 +216,10 @@ def _load_parquet(path: Path) -> pa.Table:
 
 
 def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.Array]]]:
-    """Return the columns of a Parquet file, and a function that yields one in checked blocks. Raises ManifestError."""
+    """Return the columns of a Parquet file, and a function that yields one in checked blocks.
+
+    Raises ManifestError.
+    """
     with reading(path):
         file = pa.parquet.ParquetFile(path, pre_buffer=False)
         names = file.schema_arrow.names
@@ -215,9 +239,9 @@ def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.A
 def typed(table: pa.Table, path: Path) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
-    Other columns stay unchanged. Raises ManifestError, which names the place in `path`, for a missing column or value,
-    a wrong type, an unknown split, and a stride below 1. So it does for text that is not UTF-8 or too long, and for too
-    many rows or none.
+    Other columns stay unchanged. Raises ManifestError, which names the place in `path`, for a
+    missing column or value, a wrong type, an unknown split, and a stride below 1. So it does for
+    text that is not UTF-8 or too long, and for too many rows or none.
     """
     _check_names(table.column_names, table.num_rows, path)
     return pa.table(
@@ -228,10 +252,11 @@ def typed(table: pa.Table, path: Path) -> pa.Table:
 def typed_label(
     column: pa.ChunkedArray, name: str = "", where: Callable[[int], str] | None = None
 ) -> pa.ChunkedArray:
-    """Return a text column as numbers or truth values if all cells are; 007 stays text, because its zeros matter.
+    """Return a text column as numbers or truth values if all cells are; 007 stays text, because its
+    zeros matter.
 
-    With `where`, which names a row, raises ManifestError for a class in two spellings, or a text among nine times as
-    many numbers.
+    With `where`, which names a row, raises ManifestError for a class in two spellings, or a text
+    among nine times as many numbers.
     """
     column = clean_text(column)
     kinds = (_WHOLE, pa.float64(), pa.bool_())
@@ -244,7 +269,9 @@ def typed_label(
 
 
 def clean_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a text column in Unicode form NFC with single spaces, where every spelling of EMPTY is null."""
+    """Return a text column in Unicode form NFC with single spaces, where every spelling of EMPTY is
+    null.
+    """
     column = pc.utf8_trim(
         pc.replace_substring_regex(pc.utf8_normalize(column, "NFC"), _SPACES, " "), " "
     )
@@ -266,7 +293,8 @@ def _check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]
     for first, other, *_ in spellings(column.unique().drop_null().to_pylist()):
         places = [where(pc.index(column, text).as_py()) for text in (other, first)]
         raise ManifestError(
-            f"{places[0]}: column {name!r} has {shown(other)}, and {places[1]} has {shown(first)}; write one class in "
+            f"{places[0]}: column {name!r} has {shown(other)}, and {places[1]} has {shown(first)}; "
+            "write one class in "
             "one way"
         )
     is_number = np.asarray(pc.fill_null(pc.match_substring_regex(column, NUMBER), False))
@@ -276,7 +304,8 @@ def _check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]
     if words.size and is_number.sum() >= 9 * words.size and not is_name:
         cell = shown(column[int(words[0])].as_py())
         raise ManifestError(
-            f"{where(words[0])}: column {name!r} has {cell} among numbers; write a number or nothing"
+            f"{where(words[0])}: column {name!r} has {cell} among numbers; write a number or "
+            "nothing"
         )
 
 
@@ -307,7 +336,10 @@ def is_text(kind: pa.DataType) -> bool:
 
 
 def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> pa.ChunkedArray:
-    """Return a column in its type, checked, from row `first` of the file. Raises ManifestError with a place."""
+    """Return a column in its type, checked, from row `first` of the file.
+
+    Raises ManifestError with a place.
+    """
 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
         row = pc.index(bad, True).as_py()
@@ -377,7 +409,10 @@ def _cast_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 
 def _decimal(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a text column. Raises ArrowInvalid for a cell like 0x10, which a cast would take for 16."""
+    """Return a text column.
+
+    Raises ArrowInvalid for a cell like 0x10, which a cast would take for 16.
+    """
     if pc.any(pc.match_substring_regex(column, r"^0[xX]")).as_py():
         raise pa.ArrowInvalid("a number in hexadecimal")
     return column

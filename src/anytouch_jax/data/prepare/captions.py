@@ -1,7 +1,8 @@
-"""Captions from a vision-language model, one for each touch (AnyTouch, appendix: annotation by GPT-4o).
+"""Captions from a vision-language model, one for each touch (AnyTouch, appendix: annotation by
+GPT-4o).
 
-Answers are stored in `answers.jsonl` under a hash of the model, the prompt and the image bytes. The same call
-therefore continues after an interruption, and no question is paid for twice.
+Answers are stored in `answers.jsonl` under a hash of the model, the prompt and the image bytes. The
+same call therefore continues after an interruption, and no question is paid for twice.
 """
 
 from __future__ import annotations
@@ -50,14 +51,17 @@ _REFUSED = {
 }
 _SHEET_SIDE = 256
 _SHEET_STYLE = (
-    "body{font:15px/1.4 sans-serif;max-width:1000px;margin:2em auto}article{display:flex;gap:1em;margin:1em 0;"
+    "body{font:15px/1.4 sans-serif;max-width:1000px;margin:2em "
+    "auto}article{display:flex;gap:1em;margin:1em 0;"
     "border-top:1px solid #ccc;padding-top:1em}figure{margin:0}img{max-width:200px;display:block}"
     "figcaption,small{color:#666}"
 )
 
 
 class CostEstimate(NamedTuple):
-    """The questions to ask, those answered before, their tokens, and their price if prices are known."""
+    """The questions to ask, those answered before, their tokens, and their price if prices are
+    known.
+    """
 
     questions: int
     cached: int
@@ -68,7 +72,8 @@ class CostEstimate(NamedTuple):
     def __str__(self) -> str:
         price = "no prices given" if self.cost is None else f"about {self.cost:.2f}"
         return (
-            f"{self.questions} questions ({self.cached} answered before), about {self.tokens_in} tokens in and "
+            f"{self.questions} questions ({self.cached} answered before), about {self.tokens_in} "
+            "tokens in and "
             f"{self.tokens_out} out: {price}"
         )
 
@@ -82,7 +87,9 @@ class Caption(NamedTuple):
 
 
 class CaptionFailure(NamedTuple):
-    """A missing caption: its first row, the number of rows that share it, the reason, and the question's key."""
+    """A missing caption: its first row, the number of rows that share it, the reason, and the
+    question's key.
+    """
 
     where: str
     rows: int
@@ -91,7 +98,9 @@ class CaptionFailure(NamedTuple):
 
 
 class CaptionResult(NamedTuple):
-    """The manifest with its captions, the failures, rows left out by reason, and the requests and tokens used."""
+    """The manifest with its captions, the failures, rows left out by reason, and the requests and
+    tokens used.
+    """
 
     manifest: Manifest
     captions: tuple[Caption, ...]
@@ -112,7 +121,10 @@ class _QuestionError(Exception):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An OpenAI-compatible chat endpoint, see `anytouch data annotate --help`. Raises AnnotateError for a bad one."""
+    """An OpenAI-compatible chat endpoint, see `anytouch data annotate --help`.
+
+    Raises AnnotateError for a bad one.
+    """
 
     url: str
     model: str
@@ -146,7 +158,8 @@ class Endpoint:
             )
         if parts.username or parts.password:
             raise AnnotateError(
-                f"Set the environment variable {self.key_variable} to the key. Remove it from --url."
+                f"Set the environment variable {self.key_variable} to the key. Remove it from "
+                "--url."
             )
 
     @property
@@ -164,7 +177,10 @@ class Endpoint:
         )
 
     def read_key(self) -> str:
-        """Return the key, "" if a local endpoint has none. Raises AnnotateError for a wrong key, and without openai."""
+        """Return the key, "" if a local endpoint has none.
+
+        Raises AnnotateError for a wrong key, and without openai.
+        """
         key = os.environ.get(self.key_variable, "").strip()
         if not key and not self.is_local:
             raise AnnotateError(
@@ -176,7 +192,8 @@ class Endpoint:
             import openai  # noqa: F401
         except ImportError:
             raise AnnotateError(
-                "captions need the package openai: install it with pip install 'anytouch_jax[annotate]'"
+                "captions need the package openai: install it with pip install "
+                "'anytouch_jax[annotate]'"
             ) from None
         return key
 
@@ -210,7 +227,10 @@ class _Client:
     async def ask(
         self, connection: openai.AsyncOpenAI, messages: list[dict[str, Any]]
     ) -> tuple[str, str, int, int]:
-        """Return text, finish reason, tokens in and out. Raises _QuestionError, BadAnswer or AnnotateError."""
+        """Return text, finish reason, tokens in and out.
+
+        Raises _QuestionError, BadAnswer or AnnotateError.
+        """
         import openai
 
         end = self.endpoint
@@ -224,7 +244,8 @@ class _Client:
         if end.json_mode:
             body["response_format"] = {"type": "json_object"}
         try:
-            # The client's timeout is for one read: a server that sends a byte now and then would hold us for ever.
+            # The client's timeout is for one read: a server that sends a byte now and then would
+            # hold us for ever.
             async with asyncio.timeout(end.tries * end.timeout + (end.tries - 1) * _LONGEST_WAIT):
                 reply = await connection.post("/chat/completions", body=body, cast_to=object)
         except (TimeoutError, openai.APITimeoutError):
@@ -247,7 +268,10 @@ class _Client:
         return text
 
     def _judge(self, error: openai.APIStatusError) -> str:
-        """Return the reason of an error status. Raises AnnotateError for one that concerns every question."""
+        """Return the reason of an error status.
+
+        Raises AnnotateError for one that concerns every question.
+        """
         code = error.status_code
         try:
             content = parse_json(error.response.content)["error"]
@@ -318,10 +342,11 @@ def annotate(
 ) -> CaptionResult:
     """Ask `endpoint` for every missing caption and return the manifest with all captions.
 
-    Each touch, or each sequence without a touch, is one question; `threads` are open at a time. Answers and failures
-    are stored in `folder`. `confirm` is always called with the estimate, and prices are for a million tokens. A phrase
-    that was expanded moves to the column `phrase`. Raises AnnotateError if `confirm` returns False, if the first
-    questions all fail, or if the endpoint cannot be used, and UserError if no caption is missing.
+    Each touch, or each sequence without a touch, is one question; `threads` are open at a time.
+    Answers and failures are stored in `folder`. `confirm` is always called with the estimate, and
+    prices are for a million tokens. A phrase that was expanded moves to the column `phrase`. Raises
+    AnnotateError if `confirm` returns False, if the first questions all fail, or if the endpoint
+    cannot be used, and UserError if no caption is missing.
     """
     jobs, left_out = prompts.find_caption_jobs(
         manifest, split=split, families=families, overwrite=overwrite, second_image=second_image
@@ -414,7 +439,9 @@ class _Run:
         return keys
 
     def _images(self, job: prompts.CaptionJob) -> tuple[str, list[bytes]]:
-        """Return the key of a job's answer, and its images as JPEG. Raises UserError for an unreadable image."""
+        """Return the key of a job's answer, and its images as JPEG. Raises UserError for an
+        unreadable image.
+        """
         end = self.endpoint
         jpegs = []
         parts = [end.model, job.prompt.fingerprint(), self.side, end.max_tokens]
@@ -525,12 +552,16 @@ class _AnswerStore:
 
     @contextmanager
     def exclusive(self) -> Iterator[None]:
-        """Lock the folder while the block runs. Raises AnnotateError if another process holds it."""
+        """Lock the folder while the block runs.
+
+        Raises AnnotateError if another process holds it.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         with lock(self.folder / ".lock") as free:
             if not free:
                 raise AnnotateError(
-                    f"another process asks for {self.folder}: wait for it, or name another --answers"
+                    f"another process asks for {self.folder}: wait for it, or name another "
+                    "--answers"
                 )
             self._read_answers()
             yield
@@ -550,7 +581,9 @@ class _AnswerStore:
         self.answers[key] = entry
 
     def write_failures(self, failures: list[CaptionFailure], keys: list[str]) -> None:
-        """Write failures.jsonl: the new failures, and earlier ones among `keys` that are still open."""
+        """Write failures.jsonl: the new failures, and earlier ones among `keys` that are still
+        open.
+        """
         closed = {failure.key for failure in failures} | self.answers.keys() | {""}
         lines = [json.dumps(failure._asdict(), ensure_ascii=False) for failure in failures]
         lines += [
@@ -592,7 +625,10 @@ def _attach(manifest: Manifest, captions: tuple[Caption, ...]) -> Manifest:
 def sample_sheet(
     manifest: Manifest, captions: Sequence[Caption], path: str | Path, *, count: int = 40
 ) -> Path:
-    """Write an HTML page of `count` random captions with their images. Raises UserError without captions."""
+    """Write an HTML page of `count` random captions with their images.
+
+    Raises UserError without captions.
+    """
     if not captions:
         raise UserError("there are no captions to look at; leave out --sheet, or ask for some")
     chosen = np.sort(np.random.default_rng(0).permutation(len(captions))[:count])
@@ -630,7 +666,8 @@ def _article(manifest: Manifest, caption: Caption, number: int) -> str:
         f"{manifest.value(row, 'dataset')}, {manifest.where(row)}, {len(job.rows)} rows share it"
     ]
     parts += [
-        f"<div><p><label><input type=checkbox> {number}. <b>{html.escape(caption.object)}</b></label></p>"
+        f"<div><p><label><input type=checkbox> {number}. "
+        f"<b>{html.escape(caption.object)}</b></label></p>"
     ]
     parts += [
         f"<p>{html.escape(caption.text)}</p>",

@@ -1,12 +1,14 @@
-"""Contact filter: which frames are touched, by difference from the background image (AnyTouch, appendix A.1).
+"""Contact filter: which frames are touched, by difference from the background image (AnyTouch,
+appendix A.1).
 
-The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched gel, in an image of
-160 pixels on its long side. Marker dots, which shear moves, are closed in both images if the gel has them. A change of
-light is subtracted as a plane for each colour.
+The score of a frame is the 98th percentile of its colour difference (0 to 255) from the untouched
+gel, in an image of 160 pixels on its long side. Marker dots, which shear moves, are closed in both
+images if the gel has them. A change of light is subtracted as a plane for each colour.
 
-The untouched gel of a row is its `background_path`, the rows of split `background` of its unit (or else sequence), or a
-picture that the user names. Otherwise it is estimated from the frames of its recording, and compared with the estimates
-of other recordings of the unit. Where these are undecided, it is the median of the unit's frames, if that is free.
+The untouched gel of a row is its `background_path`, the rows of split `background` of its unit (or
+else sequence), or a picture that the user names. Otherwise it is estimated from the frames of its
+recording, and compared with the estimates of other recordings of the unit. Where these are
+undecided, it is the median of the unit's frames, if that is free.
 """
 
 from __future__ import annotations
@@ -52,8 +54,9 @@ _MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
 _Scored = tuple[int, float, str]  # row, score, reason
 _Pictures = Callable[[np.ndarray], list[np.ndarray]]  # some frames of rows
 
-# Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without dots), gelslim and
-# gelsight. The one of 9dtact is below its one light press. The default of the other sensors is untested.
+# Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without
+# dots), gelslim and gelsight. The one of 9dtact is below its one light press. The default of the
+# other sensors is untested.
 DEFAULT_THRESHOLD = 6.5
 THRESHOLDS: Mapping[str, float] = {
     "gelsight_mini": 6.5,
@@ -75,11 +78,14 @@ PER_ROW = 10
 
 @dataclass(frozen=True, eq=False)
 class ContactScores:
-    """Scores f32 (rows,), NaN if unknown. `reasons` (rows,) names the source of the background, or why it failed.
+    """Scores f32 (rows,), NaN if unknown.
 
-    `recordings` have no background picture, and for `decided` of them the untouched gel was estimated. `gels` holds
-    the rows without a background picture whose untouched gel was given otherwise or estimated. `faults` holds a
-    sentence for each of the first rows whose pictures cannot be used.
+    `reasons` (rows,) names the source of the background, or why it failed.
+
+    `recordings` have no background picture, and for `decided` of them the untouched gel was
+    estimated. `gels` holds the rows without a background picture whose untouched gel was given
+    otherwise or estimated. `faults` holds a sentence for each of the first rows whose pictures
+    cannot be used.
     """
 
     score: np.ndarray
@@ -97,7 +103,9 @@ class ContactScores:
 
 @dataclass(frozen=True)
 class ContactReport:
-    """Numbers of rows by result, of rows dropped, and of rows labelled before, with the scores and thresholds."""
+    """Numbers of rows by result, of rows dropped, and of rows labelled before, with the scores and
+    thresholds.
+    """
 
     scores: ContactScores
     contact: int
@@ -131,11 +139,13 @@ class ContactReport:
         if all_of := self.scores.recordings:
             decided = self.scores.decided
             lines += [
-                f"untouched gel estimated for {decided:,} of {all_of:,} recordings ({decided / all_of:.0%})"
+                f"untouched gel estimated for {decided:,} of {all_of:,} recordings "
+                f"({decided / all_of:.0%})"
             ]
             if decided < all_of:
                 lines[-1] += (
-                    ". The labels of the others stay empty. To decide them, pass --background with a picture of the "
+                    ". The labels of the others stay empty. To decide them, pass --background with "
+                    "a picture of the "
                     "untouched gel"
                 )
         return [*lines, f"contact is a score above: {limits}{labelled}"]
@@ -143,11 +153,12 @@ class ContactReport:
 
 @dataclass(frozen=True)
 class ContactQuality:
-    """The filter compared with a reference column: precision and recall of contact, NaN without any contact.
+    """The filter compared with a reference column: precision and recall of contact, NaN without any
+    contact.
 
-    `rows` were compared. `positives` have contact by the reference, `predicted` by the filter, `hits` by both.
-    `correlation` is Pearson's, of score and reference. `parts` holds (rows, precision, recall) by sensor and by source
-    of the background.
+    `rows` were compared. `positives` have contact by the reference, `predicted` by the filter,
+    `hits` by both. `correlation` is Pearson's, of score and reference. `parts` holds (rows,
+    precision, recall) by sensor and by source of the background.
     """
 
     reference: str
@@ -165,8 +176,10 @@ class ContactQuality:
     def lines(self) -> list[str]:
         """Return the figures as lines of text."""
         return [
-            f"contact by {self.reference} > {self.above:g} on {self.positives:,} of {self.rows:,} rows "
-            f"({self.skipped:,} without reference or score): precision {self.precision:.3f}, recall {self.recall:.3f}, "
+            f"contact by {self.reference} > {self.above:g} on {self.positives:,} of {self.rows:,} "
+            "rows "
+            f"({self.skipped:,} without reference or score): precision {self.precision:.3f}, "
+            f"recall {self.recall:.3f}, "
             f"correlation {self.correlation:.3f}",
             *(
                 f"  {name}: {rows:,} rows, precision {precision:.3f}, recall {recall:.3f}"
@@ -185,8 +198,8 @@ def contact_scores(
 ) -> ContactScores:
     """Return the score of every row, or of `rows` only. Frames are read by `workers` threads.
 
-    `backgrounds` are pictures from `read_backgrounds` for rows without one. With `gels`, the pictures of the rule in
-    `data.gels` serve all rows. A frame or background that cannot be read,
+    `backgrounds` are pictures from `read_backgrounds` for rows without one. With `gels`, the
+    pictures of the rule in `data.gels` serve all rows. A frame or background that cannot be read,
     or an untouched gel that cannot be decided, gives the score NaN and a reason. It raises nothing.
     """
     if workers < 1:
@@ -234,7 +247,10 @@ def contact_scores(
 
 
 def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -> Manifest:
-    """Write the estimated gels as PNG, and return the manifest with them as background_path. Raises OSError."""
+    """Write the estimated gels as PNG, and return the manifest with them as background_path.
+
+    Raises OSError.
+    """
     cells = manifest.column("background_path").to_pylist()
     is_free = manifest.text_column("split") == "background"
     for rows, gel in scores.gels:
@@ -248,7 +264,10 @@ def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -
 
 
 def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, UntouchedGel]:
-    """Return the pictures of --background, FILE (unit "") or UNIT=FILE words, by unit. Raises UserError."""
+    """Return the pictures of --background, FILE (unit "") or UNIT=FILE words, by unit.
+
+    Raises UserError.
+    """
     waiting = np.flatnonzero(~manifest.present("background_path"))
     units = manifest.text_column("unit")
     sensors = manifest.codes("sensor")
@@ -258,7 +277,8 @@ def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, Unto
         unit, _, file = ("", "", word) if is_file else word.partition("=")
         if unit in gels or (not unit and len(words) > 1):
             raise UserError(
-                f"--background {word}: give one picture for all recordings, or one UNIT=FILE for each unit"
+                f"--background {word}: give one picture for all recordings, or one UNIT=FILE for "
+                "each unit"
             )
         gel = gels[unit] = UntouchedGel(decode(Path(file).expanduser()))
         rows = waiting[units[waiting] == unit] if unit else waiting
@@ -304,7 +324,9 @@ def _score_row(
 
 
 def _groups(manifest: Manifest, rows: np.ndarray) -> list[np.ndarray]:
-    """Return `rows` by unit of one dataset and sensor if a unit is named, else by sequence, each in row order."""
+    """Return `rows` by unit of one dataset and sensor if a unit is named, else by sequence, each in
+    row order.
+    """
     unit = manifest.codes("unit", own=True)
     sequence = manifest.codes("sequence", own=True)
     no_unit = unit < 0
@@ -335,7 +357,9 @@ def _gel_of_group(
 def _estimates(
     manifest: Manifest, group: np.ndarray, pictures: _Pictures
 ) -> Iterator[tuple[np.ndarray, UntouchedGel | None, str]]:
-    """Yield rows, untouched gel and reason of each recording; stills are one, and others of the unit decide too."""
+    """Yield rows, untouched gel and reason of each recording; stills are one, and others of the
+    unit decide too.
+    """
 
     def estimate(rows: np.ndarray) -> tuple[UntouchedGel | None, str, tuple[int, ...]]:
         frames = pictures(rows)
@@ -368,7 +392,9 @@ def _estimates(
 def _pictures(
     manifest: Manifest, pool: ThreadPoolExecutor, faults: dict[int, str], rows: np.ndarray
 ) -> list[np.ndarray]:
-    """Return at most _MAX_FRAMES evenly spaced frames from `scale_picture`, those of the most common shape."""
+    """Return at most _MAX_FRAMES evenly spaced frames from `scale_picture`, those of the most
+    common shape.
+    """
     loaded = pool.map(partial(_load_or_none, manifest, faults), spread(rows, _MAX_FRAMES).tolist())
     pictures = [
         picture
@@ -396,12 +422,14 @@ def mark_contact(
     share: float = 0.0,
     drop: bool = False,
 ) -> tuple[Manifest, ContactReport]:
-    """Return the manifest with `label.contact_score` and `label.contact` (1, 0 or null if unknown), and a report.
+    """Return the manifest with `label.contact_score` and `label.contact` (1, 0 or null if unknown),
+    and a report.
 
-    An existing `label.contact` is kept. An existing score column is renamed to `<name>_given`. `thresholds` replaces
-    entries of THRESHOLDS. With `share`, contact also needs this share of the highest score of its sequence, which
-    excludes the start and the end of contact. `drop` removes frames without contact, but never the split `background`
-    nor frames of unknown contact. Raises UserError if nothing would be left.
+    An existing `label.contact` is kept. An existing score column is renamed to `<name>_given`.
+    `thresholds` replaces entries of THRESHOLDS. With `share`, contact also needs this share of the
+    highest score of its sequence, which excludes the start and the end of contact. `drop` removes
+    frames without contact, but never the split `background` nor frames of unknown contact. Raises
+    UserError if nothing would be left.
     """
     limits = threshold_of_rows(manifest, thresholds, share)
     known = known_contact(manifest)
@@ -450,7 +478,10 @@ def mark_contact(
 def threshold_of_rows(
     manifest: Manifest, thresholds: Mapping[str, float] | None, share: float
 ) -> np.ndarray:
-    """Return the threshold of every row, f64. Raises UserError for thresholds or a `share` that cannot be used."""
+    """Return the threshold of every row, f64.
+
+    Raises UserError for thresholds or a `share` that cannot be used.
+    """
     if not 0 <= share <= 1:
         raise UserError(
             f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}"
@@ -460,7 +491,8 @@ def threshold_of_rows(
     for name in thresholds or {}:
         if name not in sensors:
             raise UserError(
-                f"a threshold is given for the sensor {name!r}, which the manifest does not have; leave it out"
+                f"a threshold is given for the sensor {name!r}, which the manifest does not have; "
+                "leave it out"
             )
         if not np.isfinite(table[name]):
             raise UserError(f"the threshold of {name} must be a number, not {table[name]}")
@@ -468,7 +500,10 @@ def threshold_of_rows(
 
 
 def known_contact(manifest: Manifest) -> np.ndarray:
-    """Return `label.contact` of every row, f64 (rows,), NaN if unknown. Raises UserError for another word."""
+    """Return `label.contact` of every row, f64 (rows,), NaN if unknown.
+
+    Raises UserError for another word.
+    """
     contact = np.full(len(manifest), np.nan)
     cells = (
         manifest.table["label.contact"].to_pylist()
@@ -488,12 +523,16 @@ def known_contact(manifest: Manifest) -> np.ndarray:
 def reference_contact(
     manifest: Manifest, reference: str | None = None
 ) -> tuple[str, npt.NDArray[np.float64]]:
-    """Return the column that reports contact (default: first of REFERENCES) and its numbers. Raises UserError."""
+    """Return the column that reports contact (default: first of REFERENCES) and its numbers.
+
+    Raises UserError.
+    """
     columns = manifest.table.column_names
     name = reference or next((column for column in REFERENCES if column in columns), None)
     if name is None or name not in columns:
         raise UserError(
-            f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact filter with; "
+            f"the manifest has no column {name or ' or '.join(REFERENCES)} to compare the contact "
+            "filter with; "
             "name one with --reference"
         )
     return name, known_contact(manifest) if name == "label.contact" else manifest.number_column(
@@ -509,10 +548,11 @@ def contact_quality(
     above: float | None = None,
     thresholds: Mapping[str, float] | None = None,
 ) -> ContactQuality:
-    """Compare the filter with column `reference` > `above` (default: the first existing one of REFERENCES).
+    """Compare the filter with column `reference` > `above` (default: the first existing one of
+    REFERENCES).
 
-    Rows with a value and a score are compared, except the split `background`. `thresholds` replaces entries of
-    THRESHOLDS. Raises UserError if there is no such column or row.
+    Rows with a value and a score are compared, except the split `background`. `thresholds` replaces
+    entries of THRESHOLDS. Raises UserError if there is no such column or row.
     """
     name, truth = reference_contact(manifest, reference)
     limit = REFERENCES.get(name, 0.0) if above is None else above
@@ -520,7 +560,8 @@ def contact_quality(
     used = np.flatnonzero(relevant & ~np.isnan(truth) & ~np.isnan(scores.score))
     if not used.size:
         raise UserError(
-            f"no row has both a value in {name} and a score; name another column with --reference, or give a picture "
+            f"no row has both a value in {name} and a score; name another column with --reference, "
+            "or give a picture "
             "of the untouched gel with --background"
         )
     score = scores.score[used]
@@ -567,10 +608,11 @@ def contact_sheet(
     thresholds: Mapping[str, float] | None = None,
     rows: int = 4,
 ) -> Path:
-    """Write a PNG with `rows` rows of frames without contact (red) and as many with contact (green), by rising score.
+    """Write a PNG with `rows` rows of frames without contact (red) and as many with contact
+    (green), by rising score.
 
-    Frames are spread evenly over the scores of each side, so the doubtful ones are next to each other. Raises
-    UserError if no row has a score.
+    Frames are spread evenly over the scores of each side, so the doubtful ones are next to each
+    other. Raises UserError if no row has a score.
     """
     is_scored = ~np.isnan(scores.score) & (manifest.text_column("split") != "background")
     if not is_scored.any():

@@ -1,8 +1,10 @@
-"""Captions of a manifest: prompts for each family of datasets, rows that need a caption, and tables of captions.
+"""Captions of a manifest: prompts for each family of datasets, rows that need a caption, and tables
+of captions.
 
-The paper lets GPT-4o write the captions (AnyTouch, appendix). The wording of the prompts is ours, the inputs are the
-paper's. Touch and Go and TacQuad send one photograph. ObjectFolder Real sends two photographs and the tactile image,
-because the photographs can hide the touched place. TVL, SSVTP and Octopi send a photograph and a phrase.
+The paper lets GPT-4o write the captions (AnyTouch, appendix). The wording of the prompts is ours,
+the inputs are the paper's. Touch and Go and TacQuad send one photograph. ObjectFolder Real sends
+two photographs and the tactile image, because the photographs can hide the touched place. TVL,
+SSVTP and Octopi send a photograph and a phrase.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ SECOND_IMAGE = "image2_path"  # a manifest need not have this column
 _MIN_WORDS = 3
 _MAX_WORDS = 60
 
-# Answers are stored under a hash of the prompt: another wording asks, and pays for, every question again.
+# Answers are stored under a hash of the prompt: another wording asks, and pays for, every question
+# again.
 FAMILIES: dict[str, Family] = {
     "touch_and_go": "photograph",
     "tacquad": "photograph",
@@ -51,8 +54,10 @@ FAMILIES: dict[str, Family] = {
 }
 
 _SYSTEM = (
-    "You describe how surfaces feel to the touch. You look at what you are given, name the material, and say what a "
-    "fingertip would feel: texture, roughness, hardness, shape of edges and bumps, elasticity. You do not mention "
+    "You describe how surfaces feel to the touch. You look at what you are given, name the "
+    "material, and say what a "
+    "fingertip would feel: texture, roughness, hardness, shape of edges and bumps, elasticity. You "
+    "do not mention "
     "colours, cameras, sensors, images or who is touching."
 )
 _FORM = (
@@ -61,19 +66,26 @@ _FORM = (
 )
 _TEXTS: dict[Family, str] = {
     "photograph": (
-        "The photograph shows an object or a surface at the moment when it is touched. Decide what is touched, near "
+        "The photograph shows an object or a surface at the moment when it is touched. Decide what "
+        "is touched, near "
         "where the finger or the sensor is, and describe the tactile properties of that place."
     ),
     "object": (
         "{views} The place that is touched may be hidden there. The last picture "
-        "is the imprint of the touched place on a soft gel with coloured light from its sides: it shows the local "
-        "shape (edges, bumps, grooves, grain) of a patch about as large as a fingertip, and its colours mean nothing. "
-        "Take the object and the material from the photographs and the local shape from the imprint, and describe the "
-        "tactile properties of the touched place. Where they disagree, trust the imprint for shape and texture."
+        "is the imprint of the touched place on a soft gel with coloured light from its sides: it "
+        "shows the local "
+        "shape (edges, bumps, grooves, grain) of a patch about as large as a fingertip, and its "
+        "colours mean nothing. "
+        "Take the object and the material from the photographs and the local shape from the "
+        "imprint, and describe the "
+        "tactile properties of the touched place. Where they disagree, trust the imprint for shape "
+        "and texture."
     ),
     "phrase": (
-        "A person described how this touch feels by the words: {phrase}. {view}Expand these words into a full "
-        "description of the tactile properties. Keep every property that is named, contradict none, and add only what "
+        "A person described how this touch feels by the words: {phrase}. {view}Expand these words "
+        "into a full "
+        "description of the tactile properties. Keep every property that is named, contradict "
+        "none, and add only what "
         "follows from the material."
     ),
 }
@@ -106,7 +118,10 @@ class Prompt(NamedTuple):
 
 
 def family_of(dataset: str | None, families: Mapping[str, str] | None = None) -> Family | None:
-    """Return the family of a dataset, by `families` or else FAMILIES, or None. Raises UserError for an unknown one."""
+    """Return the family of a dataset, by `families` or else FAMILIES, or None.
+
+    Raises UserError for an unknown one.
+    """
     family = (families or {}).get(dataset or "") or FAMILIES.get(dataset or "")
     if family is not None and family not in _TEXTS:
         raise UserError(f"There is no prompt family {family!r}. Use one of {', '.join(_TEXTS)}.")
@@ -114,7 +129,9 @@ def family_of(dataset: str | None, families: Mapping[str, str] | None = None) ->
 
 
 def make_prompt(family: Family, photographs: int, phrase: str | None = None) -> Prompt:
-    """Return the prompt of a family for a number of photographs and, in family phrase, the words to expand."""
+    """Return the prompt of a family for a number of photographs and, in family phrase, the words to
+    expand.
+    """
     views = "The first two pictures are photographs of the same object from two sides."
     if photographs == 1:
         views = "The first picture is a photograph of the object."
@@ -129,7 +146,10 @@ class BadAnswer(ValueError):
 
 
 def parse_caption(text: str, finish: str) -> tuple[str, str]:
-    """Return (caption, object) of an answer. Raises BadAnswer if it is empty, cut off, refused, or unfit."""
+    """Return (caption, object) of an answer.
+
+    Raises BadAnswer if it is empty, cut off, refused, or unfit.
+    """
     if finish in ("refusal", "content_filter") or _REFUSAL.search(text):
         raise BadAnswer("refused")
     if not text.strip():
@@ -155,7 +175,9 @@ def parse_caption(text: str, finish: str) -> tuple[str, str]:
 
 
 class CaptionJob(NamedTuple):
-    """One caption to get: the rows i64 that share it, the prompt, and its images as (row, column)."""
+    """One caption to get: the rows i64 that share it, the prompt, and its images as (row,
+    column).
+    """
 
     rows: np.ndarray
     prompt: Prompt
@@ -173,9 +195,9 @@ def find_caption_jobs(
 ) -> tuple[list[CaptionJob], dict[str, int]]:
     """Return the captions to get, and the number of rows left out for each reason.
 
-    Rows of one touch share a caption. Rows without a touch share it by sequence. The photograph of a group is that of
-    its middle frame. Backgrounds and datasets without a prompt family are left out. Raises UserError if no caption is
-    missing.
+    Rows of one touch share a caption. Rows without a touch share it by sequence. The photograph of
+    a group is that of its middle frame. Backgrounds and datasets without a prompt family are left
+    out. Raises UserError if no caption is missing.
     """
     names = manifest.table.column_names
     if second_image not in (SECOND_IMAGE, *names):
@@ -206,7 +228,9 @@ def find_caption_jobs(
 def _rows_to_ask(
     manifest: Manifest, split: str | None, families: Mapping[str, str] | None, overwrite: bool
 ) -> tuple[np.ndarray, np.ndarray, Counter[str]]:
-    """Return the row ids i64 to ask for, the family of every row, and the number of other rows by reason."""
+    """Return the row ids i64 to ask for, the family of every row, and the number of other rows by
+    reason.
+    """
     left_out: Counter[str] = Counter()
     selected = np.asarray(pc.not_equal(manifest.table["split"], "background"))
     if split is not None:
@@ -269,7 +293,10 @@ def image_bytes(manifest: Manifest, row: int, column: str) -> bytes:
 
 
 def small_jpeg(data: bytes, name: str, side: int) -> bytes:
-    """Return an encoded image as JPEG with no side longer than `side`. Raises ImageError (a UserError)."""
+    """Return an encoded image as JPEG with no side longer than `side`.
+
+    Raises ImageError (a UserError).
+    """
     pixels = decode_bytes(data, name)
     pixels = scale_picture(pixels, side) if max(pixels.shape[:2]) > side else pixels
     return encode(pixels, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
@@ -283,10 +310,12 @@ def attach_text(
     text: str = "text",
     overwrite: bool = False,
 ) -> tuple[Manifest, list[str]]:
-    """Add captions from a table (.csv or .parquet) with a key column and the column `text`; also return notes.
+    """Add captions from a table (.csv or .parquet) with a key column and the column `text`; also
+    return notes.
 
-    `key` is a column of both (default: the one other column of the table). Rows with a caption keep it unless
-    `overwrite`. Raises UserError for a table that lacks a column, has different captions for a key, or matches no row.
+    `key` is a column of both (default: the one other column of the table). Rows with a caption keep
+    it unless `overwrite`. Raises UserError for a table that lacks a column, has different captions
+    for a key, or matches no row.
     """
     path = Path(captions).expanduser()
     caption_of, key = _read_captions(path, key, text)
@@ -297,7 +326,8 @@ def attach_text(
     matched = len(at) - at.null_count
     if not matched:
         raise UserError(
-            f"{path}: no key {key!r} of it is in the manifest; its first one is {shown(next(iter(caption_of), None))}; "
+            f"{path}: no key {key!r} of it is in the manifest; its first one is "
+            f"{shown(next(iter(caption_of), None))}; "
             "name the right column with --key"
         )
     kept = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()

@@ -1,8 +1,9 @@
-"""File scan: existence, decoding, size, hash and colours of every file of a manifest; wrong pictures.
+"""File scan: existence, decoding, size, hash and colours of every file of a manifest; wrong
+pictures.
 
-Some copies of a dataset (TVL among them) hold touch images where the photographs should be. Touch images of one sensor
-look alike and photographs do not, so colours raise a suspicion. A background image of the sensor confirms it: images
-that resemble it are touch images.
+Some copies of a dataset (TVL among them) hold touch images where the photographs should be. Touch
+images of one sensor look alike and photographs do not, so colours raise a suspicion. A background
+image of the sensor confirms it: images that resemble it are touch images.
 """
 
 from __future__ import annotations
@@ -41,10 +42,11 @@ _MAX_REASONS = 1000  # a million broken files must not fill the memory
 class Scan(NamedTuple):
     """The state of every distinct file i of n.
 
-    `state` u8 (n,) indexes STATES. `size` i32 (n, 2) is width and height, 0 if not decoded. `digest` S32 (n,) is the
-    first half of the SHA-256 in hex. `colours` is u8 (n, 48). `looks` f32 (n, 5) are the measures of `_looks`, and
-    `pixels` u32 (n,) is a checksum of the pixels. `bits` u8 (n,) are those that a picture of 16 bits uses, else 0.
-    `reasons` explains the first thousand bad files.
+    `state` u8 (n,) indexes STATES. `size` i32 (n, 2) is width and height, 0 if not decoded.
+    `digest` S32 (n,) is the first half of the SHA-256 in hex. `colours` is u8 (n, 48). `looks` f32
+    (n, 5) are the measures of `_looks`, and `pixels` u32 (n,) is a checksum of the pixels. `bits`
+    u8 (n,) are those that a picture of 16 bits uses, else 0. `reasons` explains the first thousand
+    bad files.
     """
 
     files: Files
@@ -72,7 +74,9 @@ Level = Literal["error", "warning", "info"]
 
 
 class Finding(NamedTuple):
-    """One kind of fault: the row ids i64 that it concerns, sentences about the first few, and the first files."""
+    """One kind of fault: the row ids i64 that it concerns, sentences about the first few, and the
+    first files.
+    """
 
     kind: str
     level: Level
@@ -92,10 +96,13 @@ def finding(
     *columns: str,
     column: str | None = None,
 ) -> Iterator[Finding]:
-    """Yield a finding of `rows` if there are any: their number and `words`, with their values in `columns`."""
+    """Yield a finding of `rows` if there are any: their number and `words`, with their values in
+    `columns`.
+    """
     if rows.size:
         examples = (
-            f"{manifest.where(row)}: {', '.join(shown(manifest.value(row, name)) for name in columns)}"
+            f"{manifest.where(row)}: "
+            f"{', '.join(shown(manifest.value(row, name)) for name in columns)}"
             for row in rows[:EXAMPLES]
         )
         yield Finding(
@@ -115,7 +122,10 @@ class _FileState(NamedTuple):
 
 
 def scan(manifest: Manifest, *, decode: bool = True, threads: int = 4) -> Scan:
-    """Read every distinct file, in some 100 bytes of memory each. Without `decode`, it must exist and not be empty."""
+    """Read every distinct file, in some 100 bytes of memory each.
+
+    Without `decode`, it must exist and not be empty.
+    """
     files = distinct_files(manifest)
     count = len(files)
     result = Scan(
@@ -191,9 +201,9 @@ def _judge(data: bytes, path: Path, is_image: bool) -> _FileState:
 def _looks(pixels: np.ndarray) -> np.ndarray:
     """Return measures of RGB u8 (h, w, 3) as f32 (5,).
 
-    In order: the standard deviation, and the share of rows at the bottom of one colour other than black. The share of
-    the largest black border. The mean range of a pixel's channels. The share of the variance that is noise from pixel
-    to pixel.
+    In order: the standard deviation, and the share of rows at the bottom of one colour other than
+    black. The share of the largest black border. The mean range of a pixel's channels. The share of
+    the variance that is noise from pixel to pixel.
     """
     # OpenCV needs a tenth of NumPy's time for these.
     rows, columns = (cv2.reduce(pixels, dim, cv2.REDUCE_MAX).reshape(-1, 3) for dim in (1, 0))
@@ -227,8 +237,9 @@ def _leading(flags: np.ndarray) -> float:
     return float(np.argmin(flags)) / len(flags)
 
 
-# Pictures that decode but cannot be right: of one colour, cut, noise, repeated, turned, or unlike their recording.
-# Cameras, disks and scripts leave them behind. A picture is judged alone, or by the other frames of its sequence.
+# Pictures that decode but cannot be right: of one colour, cut, noise, repeated, turned, or unlike
+# their recording. Cameras, disks and scripts leave them behind. A picture is judged alone, or by
+# the other frames of its sequence.
 _FEWEST = 5  # frames of a sequence that show what is usual in it
 _NARROW = 14  # bits of 16: more may be all that a dark picture uses
 _FROZEN = 3  # equal pictures in a row: cameras have noise
@@ -262,7 +273,10 @@ def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
             if (bits := int(scanned.bits[files].max())) <= _NARROW:
                 narrow[files] = True
                 scaled = f"cv2.imread(file, cv2.IMREAD_UNCHANGED) * {2 ** (16 - bits)}"
-                words = f"rows whose {column} has values that use {bits} of 16 bits, and looks black. Scale it: "
+                words = (
+                    f"rows whose {column} has values that use {bits} of 16 bits, and looks black. "
+                    "Scale it: "
+                )
                 words += f"cv2.imwrite(file, {scaled})"
                 yield from finding(manifest, "bits", "warning", group, words, column)
     flat = (looks[:, SPREAD] < 1) & ~narrow
@@ -292,7 +306,9 @@ def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 
 
 def _faults_of_sequence(scanned: Scan, files: np.ndarray) -> dict[str, np.ndarray]:
-    """Return which frames of a sequence have each fault, bool (frames,); `files` are in the order of the frames."""
+    """Return which frames of a sequence have each fault, bool (frames,); `files` are in the order
+    of the frames.
+    """
     pixels = scanned.pixels[files]
     runs = np.split(np.arange(len(files)), np.flatnonzero(np.diff(pixels.astype(np.int64))) + 1)
     frozen = np.zeros(len(files), bool)
@@ -322,7 +338,9 @@ def _faults_of_sequence(scanned: Scan, files: np.ndarray) -> dict[str, np.ndarra
 
 
 def _alternates(colours: np.ndarray) -> bool:
-    """Return whether neighbours differ much more than frames further apart, for colours f32 (frames, 48)."""
+    """Return whether neighbours differ much more than frames further apart, for colours f32
+    (frames, 48).
+    """
     if len(colours) < 2 * _FEWEST - 2:
         return False
     step = np.median(np.abs(np.diff(colours, axis=0)).mean(axis=1))
@@ -351,8 +369,9 @@ _CERTAIN = 0.95
 
 
 class SwapVerdict(NamedTuple):
-    """A dataset with its rows that have both images, those that look swapped, whether all do, and whether a background
-    image confirms it."""
+    """A dataset with its rows that have both images, those that look swapped, whether all do, and
+    whether a background image confirms it.
+    """
 
     dataset: str | None
     rows: np.ndarray
@@ -387,7 +406,9 @@ def swap_verdicts(manifest: Manifest, scanned: Scan) -> list[SwapVerdict]:
 
 
 def in_touch_folder(manifest: Manifest, column: str) -> np.ndarray:
-    """Return which rows name a file in `column` that lies in the folder of their touch image, bool (rows,)."""
+    """Return which rows name a file in `column` that lies in the folder of their touch image, bool
+    (rows,).
+    """
     folders = [
         pc.replace_substring_regex(manifest.column(name), r"[^/]*$", "")
         for name in (column, "path")
@@ -400,8 +421,8 @@ def _background_colours(
 ) -> np.ndarray:
     """Return the colours f32 (k, 48) of the sensor's background images, k = 0 if it has none.
 
-    They are of `others`, background rows without a photograph, and of `rows`, but for those in the folder of the touch
-    images.
+    They are of `others`, background rows without a photograph, and of `rows`, but for those in the
+    folder of the touch images.
     """
     code = scanned.files.code
     files = [code["path"][others]]
@@ -421,7 +442,9 @@ def _judge_swap(
     vision: np.ndarray,
     backgrounds: np.ndarray,
 ) -> tuple[np.ndarray, bool]:
-    """Return the rows that look swapped, and whether the whole dataset does; `touch` and `vision` are their files."""
+    """Return the rows that look swapped, and whether the whole dataset does; `touch` and `vision`
+    are their files.
+    """
     if len(backgrounds):
         bad = _distance(colours[vision], backgrounds) < _distance(colours[touch], backgrounds)
         whole = bool(bad.mean() >= _CERTAIN)
@@ -441,7 +464,9 @@ def _judge_swap(
 
 
 def _distance(colours: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the mean absolute difference f32 (n,) of colours u8 (n, 48) to the nearest of centres (k, 48)."""
+    """Return the mean absolute difference f32 (n,) of colours u8 (n, 48) to the nearest of centres
+    (k, 48).
+    """
     return np.min(
         [np.abs(colours.astype(np.float32) - centre).mean(axis=1) for centre in centres], axis=0
     )

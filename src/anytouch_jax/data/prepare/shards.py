@@ -1,4 +1,5 @@
-"""Shards: millions of small files as a few uncompressed ZIP files, and a manifest that points into them.
+"""Shards: millions of small files as a few uncompressed ZIP files, and a manifest that points into
+them.
 
 * OUT/manifest.parquet: the manifest with paths such as `touch/00000.zip/17` (entry 17)
 * OUT/touch/00000.zip: touch images by sequence and frame
@@ -63,11 +64,12 @@ def pack(
     threads: int = 4,
     log: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Store all files of a manifest in shards of about `shard_bytes` in the folder `out`, and return its manifest.
+    """Store all files of a manifest in shards of about `shard_bytes` in the folder `out`, and
+    return its manifest.
 
-    Files are stored unchanged and once each, so a loader reads the same batches. The same call continues after an
-    interruption, and a finished pack is not changed. Raises PackError for a missing or empty file, and for a folder
-    `out` with other contents.
+    Files are stored unchanged and once each, so a loader reads the same batches. The same call
+    continues after an interruption, and a finished pack is not changed. Raises PackError for a
+    missing or empty file, and for a folder `out` with other contents.
     """
     folder = Path(out).expanduser().resolve()
     if shard_bytes < 1:
@@ -141,7 +143,10 @@ def _pack(
 
 
 def _fingerprint(manifest: Manifest, files: Files) -> str:
-    """Return a digest of the paths, sizes and times of all files. Raises PackError for the first missing one."""
+    """Return a digest of the paths, sizes and times of all files.
+
+    Raises PackError for the first missing one.
+    """
     digest = hashlib.sha256()
     for row, column in zip(files.row, files.column, strict=True):
         try:
@@ -159,7 +164,8 @@ def _fingerprint(manifest: Manifest, files: Files) -> str:
 
 def _cannot_pack(manifest: Manifest, row: int, column: str, reason: str) -> PackError:
     return PackError(
-        f"{manifest.where(row)}, column {column!r}: {manifest.value(row, column)!r} cannot be packed: {reason}; "
+        f"{manifest.where(row)}, column {column!r}: {manifest.value(row, column)!r} cannot be "
+        f"packed: {reason}; "
         "run anytouch data verify with --repair first"
     )
 
@@ -167,7 +173,10 @@ def _cannot_pack(manifest: Manifest, row: int, column: str, reason: str) -> Pack
 def _is_same_pack(
     folder: Path, plan: dict[str, object], fingerprint: str | None, finished: bool
 ) -> bool:
-    """Return whether the folder holds this pack, finished or not. Raises PackError if it cannot be taken for it."""
+    """Return whether the folder holds this pack, finished or not.
+
+    Raises PackError if it cannot be taken for it.
+    """
     record = folder / "pack.json"
     if record.is_file():
         try:
@@ -183,10 +192,12 @@ def _is_same_pack(
         if any([*folder.rglob("*.zip"), *folder.rglob("*.parquet")]):
             if old != plan:
                 raise PackError(
-                    f"{folder} holds a pack of another manifest or shard size; choose another folder"
+                    f"{folder} holds a pack of another manifest or shard size; choose another "
+                    "folder"
                 )
             raise PackError(
-                f"the files of the manifest have changed since {folder} was begun; choose another folder"
+                f"the files of the manifest have changed since {folder} was begun; choose another "
+                "folder"
             )
     elif folder.exists() and (
         not folder.is_dir() or any(entry.name[0] != "." for entry in folder.iterdir())
@@ -214,7 +225,9 @@ def _group_files(manifest: Manifest, files: Files) -> dict[str, np.ndarray]:
 def _write_shards(
     manifest: Manifest, files: Files, ids: np.ndarray, folder: Path, shard_bytes: int, threads: int
 ) -> Iterator[int]:
-    """Yield the number of files of each shard in order: first the existing ones, then each new one when it is whole."""
+    """Yield the number of files of each shard in order: first the existing ones, then each new one
+    when it is whole.
+    """
     number = done = 0
     while (path := folder / f"{number:05d}.zip").is_file():
         try:
@@ -267,7 +280,8 @@ def _readme(packed: Manifest) -> str:
     )
     return (
         f"{len(packed)} tactile frames, content {packed.content_hash}.\n\n"
-        "`manifest.parquet` is the manifest for `anytouch`. Its paths name a ZIP file and the number of an entry.\n"
+        "`manifest.parquet` is the manifest for `anytouch`. Its paths name a ZIP file and the "
+        "number of an entry.\n"
         "The ZIP files are not compressed. Any tool can read them.\n\n"
         f"| licence | rows | datasets |\n|---|---|---|\n{terms}"
     )

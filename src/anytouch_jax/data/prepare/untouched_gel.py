@@ -1,8 +1,10 @@
-"""Pictures of the untouched gel: background images, and estimates of them from the frames of a recording.
+"""Pictures of the untouched gel: background images, and estimates of them from the frames of a
+recording.
 
-Frames of the untouched gel are alike, and have less structure than frames in which something presses. The estimate is
-the group of alike frames that has less structure than all frames that differ from it, however long the press lasts.
-Where no group stands out, or it shows a light press itself, the background cannot be known from the frames.
+Frames of the untouched gel are alike, and have less structure than frames in which something
+presses. The estimate is the group of alike frames that has less structure than all frames that
+differ from it, however long the press lasts. Where no group stands out, or it shows a light press
+itself, the background cannot be known from the frames.
 """
 
 from __future__ import annotations
@@ -61,7 +63,9 @@ def has_dots(picture: np.ndarray) -> bool:
 
 
 def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BLUR) -> np.ndarray:
-    """Return the colour difference f32 (h, w) of two pictures u8 (h, w, 3), without light, tint and noise."""
+    """Return the colour difference f32 (h, w) of two pictures u8 (h, w, 3), without light, tint and
+    noise.
+    """
     change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
     change -= change_of_light(change)
     red, green, blue = cv2.split(np.abs(cv2.GaussianBlur(change, (0, 0), blur)))
@@ -69,7 +73,9 @@ def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BL
 
 
 def change_of_light(change: np.ndarray) -> np.ndarray:
-    """Return the change of light f32 (h, w, 3), a plane a colour: lamps drift, and a press covers little."""
+    """Return the change of light f32 (h, w, 3), a plane a colour: lamps drift, and a press covers
+    little.
+    """
     small = cv2.resize(change, (FIT, FIT), interpolation=cv2.INTER_AREA).reshape(-1, 3)
     most = int(0.6 * len(small))
     fits = np.arange(len(small))
@@ -86,7 +92,10 @@ def change_of_light(change: np.ndarray) -> np.ndarray:
 
 
 class UntouchedGel:
-    """A picture of the untouched gel u8 (h, w, 3), which scores frames. Dots are closed only on a gel that has some."""
+    """A picture of the untouched gel u8 (h, w, 3), which scores frames.
+
+    Dots are closed only on a gel that has some.
+    """
 
     def __init__(self, picture: np.ndarray) -> None:
         self.picture = scale_picture(picture)
@@ -94,11 +103,17 @@ class UntouchedGel:
         self._compared = close_dots(self.picture) if self.has_dots else self.picture
 
     def score(self, frame: np.ndarray) -> float:
-        """Return the difference, 0 to 255, of a frame u8 (h, w, 3) from the gel. Raises ValueError for its shape."""
+        """Return the difference, 0 to 255, of a frame u8 (h, w, 3) from the gel.
+
+        Raises ValueError for its shape.
+        """
         return contact_score(self.difference(frame))
 
     def difference(self, frame: np.ndarray) -> np.ndarray:
-        """Return the difference image f32 (h, w) of a frame at the gel's size. Raises ValueError as `score`."""
+        """Return the difference image f32 (h, w) of a frame at the gel's size.
+
+        Raises ValueError as `score`.
+        """
         frame = scale_picture(frame)
         if max(abs(a - b) for a, b in zip(frame.shape, self.picture.shape, strict=True)) > 2:
             raise ValueError("its background has other proportions")
@@ -110,7 +125,9 @@ class UntouchedGel:
 
 
 def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel | None, str]:
-    """Return the untouched gel of scaled frames u8 (h, w, 3) of one recording, or None, and the reason."""
+    """Return the untouched gel of scaled frames u8 (h, w, 3) of one recording, or None, and the
+    reason.
+    """
     group, reason = free_frames(pictures)
     if group is None:
         return (None, reason)
@@ -118,7 +135,9 @@ def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel
 
 
 def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]:
-    """Return the numbers of the frames that show the untouched gel, or None, and the reason; `pictures` as above."""
+    """Return the numbers of the frames that show the untouched gel, or None, and the reason;
+    `pictures` as above.
+    """
     reason = ""
     for marked in (False, True):
         frames = [close_dots(picture) for picture in pictures] if marked else list(pictures)
@@ -131,7 +150,9 @@ def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]
 
 
 def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
-    """Return the median of frames of one unit; None if it shows a press, or if all are alike and may be pressed."""
+    """Return the median of frames of one unit; None if it shows a press, or if all are alike and
+    may be pressed.
+    """
     free = _median(pictures) if len(pictures) else np.zeros(0)
     others = [picture for picture in pictures if _distance(free, picture) >= DIFFERENT]
     if not others or np.median([_press_of(free, other) for other in others]) >= ALIKE:
@@ -140,7 +161,9 @@ def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
 
 
 def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:
-    """Return the gel that most estimates of one unit agree on; None if fewer than two do, or as many on another."""
+    """Return the gel that most estimates of one unit agree on; None if fewer than two do, or as
+    many on another.
+    """
     if len(gels) < 2:
         return None
     groups = _alike([gel.score(other.picture) for gel, other in combinations(gels, 2)])
@@ -170,7 +193,9 @@ def _alike(distances: Sequence[float]) -> list[np.ndarray]:
 
 
 def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None, str]:
-    """Return the frame numbers of the group that has less structure than all frames that differ from it."""
+    """Return the frame numbers of the group that has less structure than all frames that differ
+    from it.
+    """
     halves = [
         cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for frame in frames
     ]
@@ -199,7 +224,8 @@ def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None
         return None, "no frames stand out as the untouched gel"
     free = _median([frames[i] for i in best])
     presses = [_press_of(free, other) for other in centres if _distance(free, other) >= DIFFERENT]
-    # Measured: below 0.5 for untouched gel, 3 for a faint touch (score 5), 11 for a bar that is pressed all the time.
+    # Measured: below 0.5 for untouched gel, 3 for a faint touch (score 5), 11 for a bar that is
+    # pressed all the time.
     if np.median(presses) >= ALIKE:
         return None, "the frames with the least structure are pressed themselves"
     return best, ""
@@ -223,9 +249,11 @@ def _excess_structure(free: np.ndarray, pressed: np.ndarray) -> float:
 
 
 def _press_of(free: np.ndarray, pressed: np.ndarray) -> float:
-    """Return the score of the press that `free` shows itself: its share of the edges that change, times their score.
+    """Return the score of the press that `free` shows itself: its share of the edges that change,
+    times their score.
 
-    A press that gets deeper strengthens edges that are there already. Edges of the untouched gel are others.
+    A press that gets deeper strengthens edges that are there already. Edges of the untouched gel
+    are others.
     """
     region = _changed(free, pressed)
     before, after = (

@@ -52,7 +52,9 @@ _YES = re.compile(
 
 
 class Licence(NamedTuple):
-    """Rows under one licence: its name or None, YES, NO or UNKNOWN, the datasets, the number of rows."""
+    """Rows under one licence: its name or None, YES, NO or UNKNOWN, the datasets, the number of
+    rows.
+    """
 
     name: str | None
     commercial: int
@@ -71,7 +73,10 @@ class Commercial(NamedTuple):
 @shown_short
 @dataclass(frozen=True)
 class VerifyReport:
-    """The result of `verify`. `shares` has, by dataset and column, the share of rows with a value; `labels` counts."""
+    """The result of `verify`.
+
+    `shares` has, by dataset and column, the share of rows with a value; `labels` counts.
+    """
 
     rows: int
     files: int
@@ -91,7 +96,9 @@ class VerifyReport:
         return not any(finding.level == "error" for finding in self.findings)
 
     def to_json(self) -> str:
-        """Return the report as JSON, with the row numbers and files of the first thousand rows of each finding."""
+        """Return the report as JSON, with the row numbers and files of the first thousand rows of
+        each finding.
+        """
         names = (
             "rows",
             "files",
@@ -123,7 +130,8 @@ class VerifyReport:
         ]
         if self.labels:
             lines += [
-                f"values of labels: {', '.join(f'{name} {count}' for name, count in self.labels.items())}",
+                "values of labels: "
+                f"{', '.join(f'{name} {count}' for name, count in self.labels.items())}",
                 "",
             ]
         for one in self.findings:
@@ -158,8 +166,8 @@ def verify(
 ) -> VerifyReport:
     """Check a manifest and every file that it names.
 
-    Without `decode`, files must only exist and not be empty. With `objects`, an object in two learning splits is an
-    error.
+    Without `decode`, files must only exist and not be empty. With `objects`, an object in two
+    learning splits is an error.
     """
     scanned = scans.scan(manifest, decode=decode, threads=threads)
     findings = [
@@ -212,7 +220,9 @@ def _with_files(manifest: Manifest, one: Finding) -> Finding:
 
 
 def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding]:
-    """Yield the faults that need no file: leaks between splits, frame order, licence conflicts, spellings."""
+    """Yield the faults that need no file: leaks between splits, frame order, licence conflicts,
+    spellings.
+    """
     for column in ("sequence", "touch", "grasp_group", "object"):
         if column in manifest.table.column_names:
             level: Level = "info" if column == "object" and not objects else "error"
@@ -229,7 +239,9 @@ def row_faults(manifest: Manifest, *, objects: bool = False) -> Iterator[Finding
 
 
 def split_hash(manifest: Manifest) -> str:
-    """Return the SHA-256 of which frame (_FRAME) is in which split, in any order of rows and with any paths."""
+    """Return the SHA-256 of which frame (_FRAME) is in which split, in any order of rows and with
+    any paths.
+    """
     table = manifest.table
     nulls = pa.nulls(table.num_rows, pa.string())
     columns = [
@@ -257,7 +269,9 @@ def _bad_files(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 
 
 def _wrong_sizes(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
-    """Yield touch images of another size than most of their dataset, sensor and unit, or than their sequence."""
+    """Yield touch images of another size than most of their dataset, sensor and unit, or than their
+    sequence.
+    """
     size = scanned.size[scanned.files.code["path"]]
     rows = np.flatnonzero(size[:, 0] > 0)
     usual = size.copy()
@@ -282,7 +296,10 @@ def _wrong_sizes(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 
 
 def content_ids(scanned: Scan, column: str = "path") -> np.ndarray:
-    """Return equal numbers i64 (rows,) for equal bytes, -1 for null. A file without a hash goes by its path."""
+    """Return equal numbers i64 (rows,) for equal bytes, -1 for null.
+
+    A file without a hash goes by its path.
+    """
     code = scanned.files.code[column]
     count = len(scanned.digest)
     names = np.where(scanned.digest == b"", np.arange(count).astype("S32"), scanned.digest)
@@ -290,7 +307,9 @@ def content_ids(scanned: Scan, column: str = "path") -> np.ndarray:
 
 
 def repeated_rows(manifest: Manifest, same: np.ndarray) -> np.ndarray:
-    """Return the rows i64 that repeat an earlier one: equal bytes of the touch image, and equal other columns."""
+    """Return the rows i64 that repeat an earlier one: equal bytes of the touch image, and equal
+    other columns.
+    """
     _, inverse, counts = np.unique(same, return_inverse=True, return_counts=True)
     rows = np.flatnonzero(counts[inverse] > 1)
     if not rows.size:
@@ -334,7 +353,9 @@ def _background_forms(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 
 
 def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
-    """Yield touch images that occur more than once, and touch images that are also the row's photograph."""
+    """Yield touch images that occur more than once, and touch images that are also the row's
+    photograph.
+    """
     same = content_ids(scanned)
     repeats = repeated_rows(manifest, same)
     words = "rows repeat an earlier row, touch image and all"
@@ -357,7 +378,10 @@ def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 def _leak(
     manifest: Manifest, codes: np.ndarray, kind: str, level: Level, what: str, column: str
 ) -> Iterator[Finding]:
-    """Yield values (codes i64, -1 for null) that occur in two of the learning splits. Examples show `column`."""
+    """Yield values (codes i64, -1 for null) that occur in two of the learning splits.
+
+    Examples show `column`.
+    """
     split = np.asarray(pc.index_in(manifest.table["split"], value_set=pa.array(SPLITS)))
     rows = np.flatnonzero((codes >= 0) & (split < len(_LEARNING)))
     value = np.unique(codes[rows], return_inverse=True)[1]
@@ -372,12 +396,17 @@ def _leak(
             SPLITS[side] for side in np.unique(split[rows[codes[rows] == codes[row]]])
         )
         examples.append(f"{what} {shown(manifest.value(row, column))} is in {sides}")
-    sentence = f"{len(first)} values of {what} are in more than one of {', '.join(_LEARNING)} ({rows.size} rows)"
+    sentence = (
+        f"{len(first)} values of {what} are in more than one of {', '.join(_LEARNING)} "
+        f"({rows.size} rows)"
+    )
     yield Finding(kind, level, sentence, rows, tuple(examples))
 
 
 def _frame_order(manifest: Manifest) -> Iterator[Finding]:
-    """Yield sequences that repeat a frame, which allows no clips, or whose rows are not in frame order."""
+    """Yield sequences that repeat a frame, which allows no clips, or whose rows are not in frame
+    order.
+    """
     sequence = manifest.codes("sequence", own=True) * len(SPLITS) + manifest.codes("split")
     frame = np.asarray(manifest.table["frame_index"])
     by_frame = np.lexsort((frame, sequence))
@@ -400,7 +429,9 @@ def _frame_order(manifest: Manifest) -> Iterator[Finding]:
 
 
 def _label_spellings(manifest: Manifest) -> Iterator[Finding]:
-    """Yield labels, objects and units in several spellings, labels with words among numbers, and lists."""
+    """Yield labels, objects and units in several spellings, labels with words among numbers, and
+    lists.
+    """
     for name in manifest.table.column_names:
         column = manifest.table[name]
         if name.startswith("label.") and pa.types.is_nested(column.type):
@@ -455,7 +486,9 @@ def allows(licence: str | None) -> int:
 
 
 def commercial_use(manifest: Manifest) -> np.ndarray:
-    """Return YES, NO or UNKNOWN, i8 (rows,): a NO by flag or licence decides, then the flag, then the licence."""
+    """Return YES, NO or UNKNOWN, i8 (rows,): a NO by flag or licence decides, then the flag, then
+    the licence.
+    """
     codes = manifest.codes("license")
     names = pc.unique(manifest.column("license")).drop_null().to_pylist()
     # code -1 is the last one
@@ -469,14 +502,18 @@ def commercial_use(manifest: Manifest) -> np.ndarray:
 
 
 def commercial_only(manifest: Manifest) -> Commercial:
-    """Return the rows that may certainly be used commercially. Raises UserError if there is none."""
+    """Return the rows that may certainly be used commercially.
+
+    Raises UserError if there is none.
+    """
     use = commercial_use(manifest)
     non_commercial = int((use == NO).sum())
     unknown = int((use == UNKNOWN).sum())
     if not (use == YES).any():
         files = ", ".join(map(str, manifest.files))
         raise UserError(
-            f"{files}: no row may certainly be used commercially ({non_commercial} may not, {unknown} do not say). "
+            f"{files}: no row may certainly be used commercially ({non_commercial} may not, "
+            f"{unknown} do not say). "
             "Fill in the columns 'license' and 'commercial'."
         )
     return Commercial(select_rows(manifest, np.flatnonzero(use == YES)), non_commercial, unknown)
@@ -510,7 +547,9 @@ _OF_ROWS |= {"repeated_frame", "frame_order", "licence_conflict", "spelling"}
 
 
 class Repaired(NamedTuple):
-    """The repaired manifest, a sentence for each repair, and a sentence for each fault that is left to the user."""
+    """The repaired manifest, a sentence for each repair, and a sentence for each fault that is left
+    to the user.
+    """
 
     manifest: Manifest
     done: tuple[str, ...]
@@ -520,10 +559,10 @@ class Repaired(NamedTuple):
 def repair(manifest: Manifest, report: VerifyReport, *, swap: Collection[str] = ()) -> Repaired:
     """Make the repairs that need no guess, based on the `report` of this manifest.
 
-    Rows with an unusable touch image and repeated rows are dropped. An unusable photograph, background or field file
-    becomes null. Touch images and photographs are exchanged in datasets that a background image confirms to be
-    swapped as a whole, and in those named in `swap`. Raises UserError if no touch image is usable, and for an unknown
-    name in `swap`.
+    Rows with an unusable touch image and repeated rows are dropped. An unusable photograph,
+    background or field file becomes null. Touch images and photographs are exchanged in datasets
+    that a background image confirms to be swapped as a whole, and in those named in `swap`. Raises
+    UserError if no touch image is usable, and for an unknown name in `swap`.
     """
     scanned = report.scan
     done: list[str] = []
@@ -581,7 +620,9 @@ def _empty_cells(manifest: Manifest, column: str, rows: np.ndarray) -> Manifest:
 def _exchange(
     manifest: Manifest, report: VerifyReport, swap: Collection[str], done: list[str]
 ) -> tuple[Manifest, np.ndarray]:
-    """Return the manifest with touch image and photograph exchanged where needed, and which rows those are."""
+    """Return the manifest with touch image and photograph exchanged where needed, and which rows
+    those are.
+    """
     exchanged = np.zeros(len(manifest), bool)
     check_swap(manifest, swap)
     for verdict in scans.swap_verdicts(manifest, report.scan):
@@ -589,7 +630,8 @@ def _exchange(
             exchanged[verdict.rows] = True
             exchanged |= _background_rows(manifest, verdict.rows)
             done.append(
-                f"exchanged touch image and photograph in {verdict.rows.size} rows of dataset {verdict.dataset!r}: "
+                f"exchanged touch image and photograph in {verdict.rows.size} rows of dataset "
+                f"{verdict.dataset!r}: "
                 "its photographs resemble the background frames, its touch images do not"
             )
     if swap:
@@ -598,7 +640,8 @@ def _exchange(
         exchanged |= chosen
         rows = int(chosen.sum())
         done.append(
-            f"exchanged touch image and photograph in {rows} rows of {', '.join(sorted(swap))}, as requested"
+            f"exchanged touch image and photograph in {rows} rows of {', '.join(sorted(swap))}, as "
+            "requested"
         )
     if not exchanged.any():
         return manifest, exchanged
@@ -616,13 +659,17 @@ def _exchange(
     if photographs.any():
         result = _empty_cells(result, "background_path", photographs)
         done.append(
-            f"emptied background_path in {int(photographs.sum())} of them: it lay among the photographs"
+            f"emptied background_path in {int(photographs.sum())} of them: it lay among the "
+            "photographs"
         )
     return result, exchanged
 
 
 def _background_rows(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
-    """Return the background rows with a photograph of the dataset and sensor of `rows`. They are swapped too."""
+    """Return the background rows with a photograph of the dataset and sensor of `rows`.
+
+    They are swapped too.
+    """
     selected = np.asarray(pc.equal(manifest.table["split"], "background")) & manifest.present(
         "image_path"
     )

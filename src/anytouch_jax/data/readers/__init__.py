@@ -43,7 +43,9 @@ _FROM_FILES = ("path", "sequence", "frame_index", "stride")
 
 @dataclass(frozen=True)
 class IndexReport:
-    """One run of `index`: its manifest `out`, the skipped files (reason -> count, example), sentences for the user."""
+    """One run of `index`: its manifest `out`, the skipped files (reason -> count, example),
+    sentences for the user.
+    """
 
     reader: DatasetReader
     out: Path
@@ -91,9 +93,11 @@ class IndexReport:
             else "no commercial use unless its owner allows it"
         )
         return [
-            f"{self.out}: {len(manifest):,} rows of {manifest.codes('sequence').max() + 1:,} sequences ({splits})",
+            f"{self.out}: {len(manifest):,} rows of {manifest.codes('sequence').max() + 1:,} "
+            f"sequences ({splits})",
             "sensors: " + ", ".join(f"{name} {count:,}" for name, count in self.sensors.items()),
-            f"frames read {len(manifest) + self.left_out:,}, rows {len(manifest):,}, without a row {self.left_out:,}",
+            f"frames read {len(manifest) + self.left_out:,}, rows {len(manifest):,}, without a row "
+            f"{self.left_out:,}",
             f"touch frames {self.frames:,}; {paper}",
             f"with photograph {image:,}, with text {text:,}, in a touch pair {touch:,}",
             *([f"labels found: {found}"] if found else []),
@@ -116,11 +120,13 @@ def index(
     options: IndexOptions | None = None,
     keep: bool = False,
 ) -> IndexReport:
-    """Read the dataset `name` in the folder `root` and write its manifest to `out` (default: ROOT/<name>.parquet).
+    """Read the dataset `name` in the folder `root` and write its manifest to `out` (default:
+    ROOT/<name>.parquet).
 
-    `out` must be in `root` or above it, because a manifest's paths may not leave its folder. With `keep` an edited
-    manifest at `out` keeps its columns and values. Raises UserError for a folder that is not the dataset and for an
-    option that the reader does not use. It also does so if the manifest cannot be written, or if edits would be lost.
+    `out` must be in `root` or above it, because a manifest's paths may not leave its folder. With
+    `keep` an edited manifest at `out` keeps its columns and values. Raises UserError for a folder
+    that is not the dataset and for an option that the reader does not use. It also does so if the
+    manifest cannot be written, or if edits would be lost.
     """
     if name not in READERS:
         near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)
@@ -153,8 +159,10 @@ def index(
             f"{reason}: {count} (first: {first})" for reason, (count, first) in rows.skipped.items()
         )
         raise DatasetError(
-            f"{base} has no frame of {name} that could be used: expected {reader.layout} in it; is ROOT "
-            f"the folder that holds {reader.layout.split('/')[0]!r}? Left out: {reasons or 'nothing'}"
+            f"{base} has no frame of {name} that could be used: expected {reader.layout} in it; is "
+            "ROOT "
+            f"the folder that holds {reader.layout.split('/')[0]!r}? Left out: "
+            f"{reasons or 'nothing'}"
         )
     constant = {"dataset": name, "license": reader.license, "commercial": reader.commercial}
     columns |= {key: [value] * size for key, value in constant.items() if key not in columns}
@@ -186,7 +194,8 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
     table_suffix(target)
     if not base.is_relative_to(target.parent):
         raise UserError(
-            f"the manifest {target} must lie in {base} or in a folder above it, because its paths may not "
+            f"the manifest {target} must lie in {base} or in a folder above it, because its paths "
+            "may not "
             "leave its folder; leave out --out, or move the data"
         )
     if name == "real_touch" and target == base / "manifest.csv":
@@ -203,7 +212,9 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
 
 
 def _check_links(manifest: Manifest, base: Path) -> None:
-    """Raise UserError for a folder that is a link out of ROOT, because none of its rows could be read."""
+    """Raise UserError for a folder that is a link out of ROOT, because none of its rows could be
+    read.
+    """
     root = manifest.files[0].parent
     paths = (
         path for name in PATHS for path in manifest.column(name).unique().drop_null().to_pylist()
@@ -212,18 +223,21 @@ def _check_links(manifest: Manifest, base: Path) -> None:
         place = (root / folder).resolve()
         if not place.is_relative_to(root.resolve()):
             raise UserError(
-                f"{root / folder} leads out of {base}, to {place}; give the folder that really holds it"
+                f"{root / folder} leads out of {base}, to {place}; give the folder that really "
+                "holds it"
             )
 
 
 def _carry_over(
     new: Manifest, target: Path, notes: list[str], *, keep: bool, groups: Collection[str]
 ) -> Manifest:
-    """Return the manifest to write over `target`: `new`, with the values of `target` by `path` if `keep`.
+    """Return the manifest to write over `target`: `new`, with the values of `target` by `path` if
+    `keep`.
 
-    A row that still exists keeps every value except those of _FROM_FILES. Empty cells and new rows get the reader's
-    values, but a new row gets the split of its group (columns `groups`) if the kept rows of it agree. Without `keep`,
-    raises UserError for an edited `target`: it has a column that `new` lacks, or another value in a row of one path.
+    A row that still exists keeps every value except those of _FROM_FILES. Empty cells and new rows
+    get the reader's values, but a new row gets the split of its group (columns `groups`) if the
+    kept rows of it agree. Without `keep`, raises UserError for an edited `target`: it has a column
+    that `new` lacks, or another value in a row of one path.
     """
     if not target.exists():
         return new
@@ -255,7 +269,8 @@ def _carry_over(
             merged = replace_column(merged, name, pc.coalesce(before, now))
     if edits and not keep:
         raise UserError(
-            f"{target} has {', '.join(edits)}, which index does not write: give another --out, pass --keep "
+            f"{target} has {', '.join(edits)}, which index does not write: give another --out, "
+            "pass --keep "
             "to carry them over by path, or remove it"
         )
     if edits:
@@ -268,7 +283,9 @@ def _carry_over(
 def _with_splits_of_groups(
     merged: Manifest, is_old: np.ndarray, groups: Collection[str]
 ) -> Manifest:
-    """Give new rows of a group the one split of its old rows, so that no group comes to be in two splits."""
+    """Give new rows of a group the one split of its old rows, so that no group comes to be in two
+    splits.
+    """
     split = np.array(merged.column("split").to_pylist(), object)
     is_open = ~is_old
     for group in groups:

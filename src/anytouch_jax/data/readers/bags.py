@@ -1,4 +1,6 @@
-"""Recordings of robots in MCAP files and in ROS 1 and ROS 2 bags: topics of images become sequences."""
+"""Recordings of robots in MCAP files and in ROS 1 and ROS 2 bags: topics of images become
+sequences.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ class BagError(DatasetError):
 
 
 class Message(NamedTuple):
-    """A message: topic, time of its log in nanoseconds, type, and content, None for an encoding that is not read."""
+    """A message: topic, time of its log in nanoseconds, type, and content, None for an encoding
+    that is not read.
+    """
 
     topic: str
     time: int
@@ -68,11 +72,13 @@ class Message(NamedTuple):
 
 
 def _bags(index: DatasetIndex) -> None:
-    """MCAP files, ROS 1 bags and folders of ROS 2 (with metadata.yaml): topics of images become sequences of PNG.
+    """MCAP files, ROS 1 bags and folders of ROS 2 (with metadata.yaml): topics of images become
+    sequences of PNG.
 
-    The time of a frame is that of its header, else that of the log, in nanoseconds (column `time`). Labels are the
-    values of other topics that are nearest in time, at most a tenth of a second away. Their `values` read
-    NAME=TOPIC:FIELD. What is no picture that can be read is left out, and counted by topic.
+    The time of a frame is that of its header, else that of the log, in nanoseconds (column `time`).
+    Labels are the values of other topics that are nearest in time, at most a tenth of a second
+    away. Their `values` read NAME=TOPIC:FIELD. What is no picture that can be read is left out, and
+    counted by topic.
     """
     index.need_sensor()
     places = _labels_wanted(index.options.values)
@@ -146,7 +152,8 @@ def _add_recording(index: DatasetIndex, path: str, places: dict[str, tuple[str, 
                 known = np.array([time for time, _ in one])
                 away = min(float(np.abs(known - stamps[at]).min()) for at in empty) / 1e9
                 index.skip(
-                    f"frame without label.{name}: no value of {places[name][0]} within {FAR / 1e9:g} s of it (the "
+                    f"frame without label.{name}: no value of {places[name][0]} within "
+                    f"{FAR / 1e9:g} s of it (the "
                     f"nearest is {away:.3g} s away)",
                     f"{path}, topic {topic}, frame {empty[0]}",
                     len(empty),
@@ -164,7 +171,9 @@ def _add_recording(index: DatasetIndex, path: str, places: dict[str, tuple[str, 
 
 
 def nearest_values(times: np.ndarray, series: list[tuple[int, Any]]) -> list[Any]:
-    """Return the value of a series (time, value) that is nearest to each time, None if all are further than FAR."""
+    """Return the value of a series (time, value) that is nearest to each time, None if all are
+    further than FAR.
+    """
     if not series:
         return [None] * len(times)
     order = sorted(series, key=lambda one: one[0])
@@ -194,7 +203,9 @@ def _labels_wanted(values: tuple[str, ...]) -> dict[str, tuple[str, str]]:
 
 
 def _bag_files(index: DatasetIndex) -> Iterator[str]:
-    """Yield the paths of recordings below ROOT: files .mcap and .bag, and folders with metadata.yaml."""
+    """Yield the paths of recordings below ROOT: files .mcap and .bag, and folders with
+    metadata.yaml.
+    """
     for folder, _, files in index.walk():
         if "metadata.yaml" in files:
             yield folder
@@ -205,7 +216,10 @@ def _bag_files(index: DatasetIndex) -> Iterator[str]:
 
 
 def read_messages(path: Path, topics: set[str] | None = None) -> Iterator[Message]:
-    """Yield the messages of a recording in the order of their times, of some topics or of all. Raises BagError."""
+    """Yield the messages of a recording in the order of their times, of some topics or of all.
+
+    Raises BagError.
+    """
     try:
         if path.suffix == ".mcap":
             yield from _mcap_messages(path, topics)
@@ -282,7 +296,10 @@ def _mcap_messages(path: Path, topics: set[str] | None) -> Iterator[Message]:
 
 
 def picture_of(message: Message) -> np.ndarray | None:
-    """Return the picture RGB u8 of a message of sensor_msgs or foxglove, None for another. Raises UserError."""
+    """Return the picture RGB u8 of a message of sensor_msgs or foxglove, None for another.
+
+    Raises UserError.
+    """
     kind = message.kind.rsplit("/", 1)[-1].rsplit(".", 1)[-1]
     content = message.content
     if not re.search(r"Image|Video", kind):
@@ -335,7 +352,10 @@ def _time(message: Message) -> int:
 
 
 def _field(content: Any, field: str, topic: str) -> Any:
-    """Return a number or text in a message, by its names and places, as position[2]. Raises DatasetError."""
+    """Return a number or text in a message, by its names and places, as position[2].
+
+    Raises DatasetError.
+    """
     value = content
     try:
         for name, place in re.findall(r"(\w+)|\[(\d+)\]", field):

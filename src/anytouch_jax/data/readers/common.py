@@ -1,7 +1,9 @@
-"""Helpers of the dataset readers: folder listings, frame numbers, contact lists, splits, counts of skipped files.
+"""Helpers of the dataset readers: folder listings, frame numbers, contact lists, splits, counts of
+skipped files.
 
-No reader opens or stats a frame. Each folder is listed once, and frames are known by their names.
-A folder is its path below the root with a slash at the end, "" for the root itself, so that paths are joined as text.
+No reader opens or stats a frame. Each folder is listed once, and frames are known by their names. A
+folder is its path below the root with a slash at the end, "" for the root itself, so that paths are
+joined as text.
 """
 
 from __future__ import annotations
@@ -72,12 +74,17 @@ _ALLOWED = {  # names in a pickle
 
 
 class DatasetError(UserError):
-    """A folder that is not the expected dataset, or a broken list in it; the message names the file."""
+    """A folder that is not the expected dataset, or a broken list in it; the message names the
+    file.
+    """
 
 
 @dataclass(frozen=True)
 class IndexOptions:
-    """Options of the readers, as `anytouch data index --help` explains them. Each reader names those that it uses."""
+    """Options of the readers, as `anytouch data index --help` explains them.
+
+    Each reader names those that it uses.
+    """
 
     val: float = 0.05
     test: float = 0.05
@@ -98,13 +105,16 @@ class IndexOptions:
     def __post_init__(self) -> None:
         if not (0 <= self.val <= 1 and 0 <= self.test <= 1 and self.val + self.test <= 1):
             raise UserError(
-                f"val {self.val} and test {self.test} are shares: both at least 0, together at most 1"
+                f"val {self.val} and test {self.test} are shares: both at least 0, together at "
+                "most 1"
             )
 
 
 @dataclass(frozen=True)
 class DatasetReader:
-    """How to read a dataset, and facts: `layout` of a frame for an error, `paper` its contact frames in the paper."""
+    """How to read a dataset, and facts: `layout` of a frame for an error, `paper` its contact
+    frames in the paper.
+    """
 
     read: Callable[[DatasetIndex], None]
     layout: str
@@ -124,8 +134,8 @@ class DatasetReader:
 class DatasetIndex:
     """The manifest rows of a dataset while its folder is read, and what was left out.
 
-    `root` is absolute; all paths of rows are relative to it. `table` maps a column to a value for each row, `skipped` a
-    reason to (count, first example), and `notes` are sentences for the user.
+    `root` is absolute; all paths of rows are relative to it. `table` maps a column to a value for
+    each row, `skipped` a reason to (count, first example), and `notes` are sentences for the user.
     """
 
     def __init__(self, name: str, root: Path, options: IndexOptions | None = None) -> None:
@@ -167,7 +177,9 @@ class DatasetIndex:
         self.skip(reason, example, count)
 
     def find_folder(self, *choices: str, inside: Sequence[str] = ("",)) -> str | None:
-        """Return the first of the folders `choices` that exists and holds one of `inside` (if any), else None."""
+        """Return the first of the folders `choices` that exists and holds one of `inside` (if any),
+        else None.
+        """
         for choice in choices:
             folder = self.root / choice
             if folder.is_dir() and any((folder / name).exists() for name in inside):
@@ -177,13 +189,17 @@ class DatasetIndex:
         return None
 
     def find_file(self, names: Collection[str], *folders: str) -> Path | None:
-        """Return the first file called one of `names` in `options.lists` or `folders` (default: the root)."""
+        """Return the first file called one of `names` in `options.lists` or `folders` (default: the
+        root).
+        """
         places = [self.options.lists, *(self.root / folder for folder in folders or ("",))]
         files = (folder / name for folder in places if folder is not None for name in names)
         return next((file for file in files if file.is_file()), None)
 
     def listing(self, folder: str, *, count: bool = True) -> tuple[list[str], list[str]]:
-        """Return the names of folders (2 before 10) and files in a folder, if any, without links and system files."""
+        """Return the names of folders (2 before 10) and files in a folder, if any, without links
+        and system files.
+        """
         folders: list[str] = []
         files: list[str] = []
         try:
@@ -225,7 +241,9 @@ class DatasetIndex:
         return [f"{base}{path}" for path in found if path.endswith(suffix)]
 
     def shards(self, suffix: str) -> Iterator[tuple[str, Callable[[], BinaryIO]]]:
-        """Yield the path of every shard below ROOT, or its address below the option `url`, and how to open it."""
+        """Yield the path of every shard below ROOT, or its address below the option `url`, and how
+        to open it.
+        """
         if self.options.url is None:
             for path in tracked(self.paths(suffix), "shards read"):
                 opened: Callable[[], Any] = partial((self.root / path).open, "rb")
@@ -247,13 +265,16 @@ class DatasetIndex:
         known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
         if self.options.sensor is None or self.options.sensor in (*FIELD_SENSORS, UNIVERSAL):
             raise UserError(
-                f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new name"
+                f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new "
+                "name"
             )
         check_spelling(self.options.sensor)
         return self.options.sensor
 
     def need_export(self, what: str) -> None:
-        """Raise DatasetError without the option `export`: the pictures of `what` must be written as files."""
+        """Raise DatasetError without the option `export`: the pictures of `what` must be written as
+        files.
+        """
         if not self.options.export:
             raise DatasetError(
                 f"{self.root} has {what}; add --export to write their pictures next to them"
@@ -267,7 +288,10 @@ class DatasetIndex:
         *,
         count: bool = True,
     ) -> Frames:
-        """Return the files whose whole name matches, by the number in its first group. Others are skipped."""
+        """Return the files whose whole name matches, by the number in its first group.
+
+        Others are skipped.
+        """
         files = self.listing(folder)[1] if files is None else files
         match = re.compile(pattern, re.IGNORECASE).fullmatch
         frames: Frames = {}
@@ -284,7 +308,9 @@ class DatasetIndex:
     def photographs(
         self, folder: str, names: Iterable[str], on_disk: Collection[str]
     ) -> list[str | None]:
-        """Return the path of each of `names` in `folder`, None for those that are not `on_disk`, which are counted."""
+        """Return the path of each of `names` in `folder`, None for those that are not `on_disk`,
+        which are counted.
+        """
         paths = [f"{folder}/{name}" if name in on_disk else None for name in names]
         self.skip("photograph missing (kept without)", folder, paths.count(None))
         return paths
@@ -296,7 +322,9 @@ class DatasetIndex:
     def read_captions(
         self, folder: str, key: Callable[[str], str]
     ) -> tuple[set[str], dict[str, str]]:
-        """Return the frames of test.csv, and the captions of train.csv and test.csv, by `key` of their `tactile`."""
+        """Return the frames of test.csv, and the captions of train.csv and test.csv, by `key` of
+        their `tactile`.
+        """
         tests: set[str] = set()
         captions: dict[str, str] = {}
         for split in ("train", "test"):
@@ -314,7 +342,9 @@ class DatasetIndex:
         return tests, captions
 
     def read_contact_list(self, names: Collection[str], marker: str) -> None:
-        """Read the authors' list of contact frames, if any: `contact` is by the path behind the last `marker`/."""
+        """Read the authors' list of contact frames, if any: `contact` is by the path behind the
+        last `marker`/.
+        """
         path = self.find_file(names)
         if path is not None:
             rows = ((row[0].replace("\\", "/"), row) for _, row in read_lines(path))
@@ -326,7 +356,9 @@ class DatasetIndex:
         return [row[cell] if len(row) > cell else "" for row in rows]
 
     def add(self, paths: Sequence[str], **cells: Any) -> None:
-        """Add a row for each path; a cell is a list (a value for each row) or one value for all rows (None: null)."""
+        """Add a row for each path; a cell is a list (a value for each row) or one value for all
+        rows (None: null).
+        """
         before = len(self.table["path"])
         size = len(paths)
         for name, value in {"path": list(paths), **cells}.items():
@@ -340,7 +372,9 @@ class DatasetIndex:
     def add_recording(
         self, frames: Frames, folder: str, *, split: str, key: str = "", **cells: Any
     ) -> None:
-        """Add the frames of a recording; those that a contact list lacks, by `key`/name, get the split `unused`."""
+        """Add the frames of a recording; those that a contact list lacks, by `key`/name, get the
+        split `unused`.
+        """
         cells["split"] = split
         if self.contact is not None:
             is_contact = [f"{key}/{name}" in self.contact for name in frames.values()]
@@ -354,7 +388,9 @@ class DatasetIndex:
         )
 
     def columns(self) -> Columns:
-        """Return the columns, without optional ones that are all null; report what was not matched."""
+        """Return the columns, without optional ones that are all null; report what was not
+        matched.
+        """
         if self.contact is not None:
             missing = len(self.contact) - self._contact_rows
             self.skip("listed contact frame that is not on disk", "see the contact list", missing)
@@ -373,13 +409,18 @@ class DatasetIndex:
 
 
 def split_word(name: str) -> str | None:
-    """Return the split that a folder's name says, in any case: Training, valid, test_set; None for others."""
+    """Return the split that a folder's name says, in any case: Training, valid, test_set; None for
+    others.
+    """
     match = _SPLIT.fullmatch(name)
     return match and _WORDS[match[1].lower()]
 
 
 def label_cells(name: str, values: list[Any]) -> dict[str, list[Any]]:
-    """Return values by label: NAME, NAME_0.. of vectors, NAME_key of objects. Raises DatasetError above MOST_LABELS."""
+    """Return values by label: NAME, NAME_0.. of vectors, NAME_key of objects.
+
+    Raises DatasetError above MOST_LABELS.
+    """
     rows = [dict(_flat(value)) for value in values]
     places = dict.fromkeys(place for row in rows for place in row)
     if len(places) > MOST_LABELS:
@@ -399,7 +440,10 @@ def _flat(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
 
 
 def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
-    """Return val, test or train by the share of SHA-256(dataset/group) in its range. Other groups move none."""
+    """Return val, test or train by the share of SHA-256(dataset/group) in its range.
+
+    Other groups move none.
+    """
     digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
     share = int.from_bytes(digest[:8], "big") / 2**64
     if share < options.val:
@@ -412,7 +456,10 @@ def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
 def published_splits(
     path: Path, lists: Mapping[str, Iterable[Any]], key: Callable[[Any], Any] = str
 ) -> dict[Any, str]:
-    """Return `key` of member -> split from the lists train, val, test of a file. Raises DatasetError for overlaps."""
+    """Return `key` of member -> split from the lists train, val, test of a file.
+
+    Raises DatasetError for overlaps.
+    """
     splits: dict[Any, str] = {}
     for part in PARTS:
         try:
@@ -426,7 +473,10 @@ def published_splits(
 
 
 def read_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Return (number of its first line, from 1, cells) of each row of a CSV file. Raises DatasetError."""
+    """Return (number of its first line, from 1, cells) of each row of a CSV file.
+
+    Raises DatasetError.
+    """
     try:
         lines = [(line, [cell.strip() for cell in cells]) for line, cells in csv_lines(path)]
         return [(line, row) for line, row in lines if any(row)]
@@ -435,7 +485,10 @@ def read_lines(path: Path) -> list[tuple[int, list[str]]]:
 
 
 def read_table(path: Path, column: str) -> list[dict[str, str]]:
-    """Return the rows of a CSV file with a header as dicts. Raises DatasetError, also if a row has no `column`."""
+    """Return the rows of a CSV file with a header as dicts.
+
+    Raises DatasetError, also if a row has no `column`.
+    """
     rows = [row for _, row in read_lines(path)]
     table = [dict(zip(rows[0], row, strict=False)) for row in rows[1:]]
     if any(column not in row for row in table):
@@ -467,7 +520,10 @@ class _Unpickler(pickle.Unpickler):
 
 
 def read_pickle(path: Path) -> Any:
-    """Return plain values and arrays of a pickle, or behind a .npy header. No code is run. Raises DatasetError."""
+    """Return plain values and arrays of a pickle, or behind a .npy header.
+
+    No code is run. Raises DatasetError.
+    """
     try:
         data = path.read_bytes()
         return _Unpickler(

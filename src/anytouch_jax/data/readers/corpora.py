@@ -1,8 +1,9 @@
-"""Corpora in shards that stay unchanged, Parquet and WebDataset tars, and small packs that need no layout.
+"""Corpora in shards that stay unchanged, Parquet and WebDataset tars, and small packs that need no
+layout.
 
-Layouts are those of public code: the schema and the read-me of gelsight-mini-pretrain (github.com/Yuxiang-Ma), and
-`WdsWriter` and the loader of T3 (github.com/alanzjl/t3) with the data set card of FoTa. With `url` the shards stay in
-an object store, and only their metadata are read.
+Layouts are those of public code: the schema and the read-me of gelsight-mini-pretrain
+(github.com/Yuxiang-Ma), and `WdsWriter` and the loader of T3 (github.com/alanzjl/t3) with the data
+set card of FoTa. With `url` the shards stay in an object store, and only their metadata are read.
 """
 
 from __future__ import annotations
@@ -92,10 +93,12 @@ _SENSORS = {
 
 
 def _gelsight_mini(index: DatasetIndex) -> None:
-    """GelSight Mini touches of 13 public sources, one schema of 30 columns: <source>/<split>-<n>.parquet.
+    """GelSight Mini touches of 13 public sources, one schema of 30 columns:
+    <source>/<split>-<n>.parquet.
 
-    The licence is that of the source. A frame of a film (`frame_idx`) belongs to its capture, any other is a sequence.
-    Splits called test* are test, and those of no usual name are by hash of the capture.
+    The licence is that of the source. A frame of a film (`frame_idx`) belongs to its capture, any
+    other is a sequence. Splits called test* are test, and those of no usual name are by hash of the
+    capture.
     """
     for path, opened in index.shards(".parquet"):
         with opened() as file:
@@ -150,18 +153,21 @@ def _gelsight_mini(index: DatasetIndex) -> None:
 
 
 def _webdataset(index: DatasetIndex) -> None:
-    """Tars of WebDataset: a sample is the files of one key, which ends at the first point of their names.
+    """Tars of WebDataset: a sample is the files of one key, which ends at the first point of their
+    names.
 
-    Pictures are touches, photographs or backgrounds by their field. Values of .json and .cls become labels, `object`
-    the object, .txt the caption. Every touch is a sequence. The split is that of a folder or shard called train or val,
-    or `split` of the JSON, or the hash of object or key.
+    Pictures are touches, photographs or backgrounds by their field. Values of .json and .cls become
+    labels, `object` the object, .txt the caption. Every touch is a sequence. The split is that of a
+    folder or shard called train or val, or `split` of the JSON, or the hash of object or key.
     """
     sensor = index.need_sensor()
     _tars(index, lambda path: sensor)
 
 
 def _fota(index: DatasetIndex) -> None:
-    """FoTa, 13 sensors, by the name of the data set or else --sensor: <data set>/{train,val}/data-000000.tar."""
+    """FoTa, 13 sensors, by the name of the data set or else --sensor: <data
+    set>/{train,val}/data-000000.tar.
+    """
 
     def sensor_of(path: str) -> str:
         name = "/".join(path.lower().split("/")[:-2]) or path.lower()
@@ -231,7 +237,9 @@ def _add_sample(
     key: str,
     **cells: Any,
 ) -> None:
-    """Add a row for each tactile picture of a sample; its other files are photographs, captions and labels."""
+    """Add a row for each tactile picture of a sample; its other files are photographs, captions and
+    labels.
+    """
     pictures = {
         field: kind_of_picture(field, index.options.keys)
         for field in fields
@@ -291,7 +299,10 @@ def _add_sample(
 
 
 def kind_of_picture(field: str, keys: Sequence[str] = ()) -> str:
-    """Return touch, photo, background or other for a field. No name, as jpg, and a side, as left.jpg, are touch."""
+    """Return touch, photo, background or other for a field.
+
+    No name, as jpg, and a side, as left.jpg, are touch.
+    """
     name = field.rpartition(".")[0]
     if keys:
         if field in keys or name in keys:
@@ -312,7 +323,10 @@ def kind_of_picture(field: str, keys: Sequence[str] = ()) -> str:
 
 
 def _read_text(file: Any, path: str, member: tuple[str, int, int]) -> Any:
-    """Return the values of a JSON file of a tar, or its text as a number if it is one. Raises DatasetError."""
+    """Return the values of a JSON file of a tar, or its text as a number if it is one.
+
+    Raises DatasetError.
+    """
     name, offset, size = member
     file.seek(offset)
     data = file.read(size)
@@ -344,7 +358,9 @@ def _parsed(data: bytes, where: str) -> dict[str, Any]:
 
 
 def _one_type(index: DatasetIndex) -> None:
-    """Make labels that are a number in one data set and text in another text in all, and whole numbers floats."""
+    """Make labels that are a number in one data set and text in another text in all, and whole
+    numbers floats.
+    """
     for name, column in index.table.items():
         kinds = {type(value) for value in column} - {type(None)}
         if name.startswith("label.") and len(kinds) > 1:
@@ -353,7 +369,9 @@ def _one_type(index: DatasetIndex) -> None:
 
 
 def _real_touch(index: DatasetIndex) -> None:
-    """Real frames from public repositories, with their own manifest.csv; label.contact_score is computed."""
+    """Real frames from public repositories, with their own manifest.csv; label.contact_score is
+    computed.
+    """
     if not (index.root / "manifest.csv").is_file():
         return
     table = manifests.read(index.root / "manifest.csv").table
@@ -376,11 +394,13 @@ def _real_touch(index: DatasetIndex) -> None:
 
 
 def _taxim_presses(index: DatasetIndex) -> None:
-    """Presses of a steel ball on a GelSight and a GelSight Mini, in the package `taxim` (1.4.1), which is not imported.
+    """Presses of a steel ball on a GelSight and a GelSight Mini, in the package `taxim` (1.4.1),
+    which is not imported.
 
-    `calib/<sensor>/dataPack.npz` has `f0`, the untouched gel, `imgs`, BGR u8 480 x 640, `touch_center` and
-    `touch_radius` in pixels. Pictures are written into ROOT/taxim_presses. `lists` may name another `calib` folder.
-    Every press is a sequence, split by hash. Raises DatasetError without the package.
+    `calib/<sensor>/dataPack.npz` has `f0`, the untouched gel, `imgs`, BGR u8 480 x 640,
+    `touch_center` and `touch_radius` in pixels. Pictures are written into ROOT/taxim_presses.
+    `lists` may name another `calib` folder. Every press is a sequence, split by hash. Raises
+    DatasetError without the package.
     """
     calib = index.options.lists
     if calib is None:
@@ -444,7 +464,8 @@ READERS = {
     "fota": DatasetReader(
         _fota,
         "<data set>/train/data-000000.tar",
-        "Zhao et al., Transferable Tactile Transformers for Representation Learning Across Diverse Sensors and Tasks, "
+        "Zhao et al., Transferable Tactile Transformers for Representation Learning Across Diverse "
+        "Sensors and Tasks, "
         "CoRL 2024",
         "MIT",
         "https://huggingface.co/datasets/alanz-mit/FoundationTactile",
@@ -463,7 +484,8 @@ READERS = {
     "taxim_presses": DatasetReader(
         _taxim_presses,
         "dataPack.npz in the folder calib of the package taxim",
-        "Si and Yuan, Taxim: An Example-Based Simulation Model for GelSight Tactile Sensors, RA-L 2022",
+        "Si and Yuan, Taxim: An Example-Based Simulation Model for GelSight Tactile Sensors, RA-L "
+        "2022",
         "MIT",
         "https://pypi.org/project/taxim",
         uses=("val", "test", "lists"),

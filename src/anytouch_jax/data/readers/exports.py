@@ -1,7 +1,9 @@
-"""Pictures that readers write: each folder of them belongs to one stream of one source, by a record in it.
+"""Pictures that readers write: each folder of them belongs to one stream of one source, by a record
+in it.
 
-The record names the stream, the files of its source with size, time and SHA-256, and the pictures. A changed source
-replaces its old pictures. Folders without a record, or with one of another stream, are never changed.
+The record names the stream, the files of its source with size, time and SHA-256, and the pictures.
+A changed source replaces its old pictures. Folders without a record, or with one of another stream,
+are never changed.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ _TRIES = 1000  # folders of one name
 
 
 class Export:
-    """The pictures of a stream in `folder`, which is final when `exported` ends; `is_new` if they must be written."""
+    """The pictures of a stream in `folder`, which is final when `exported` ends; `is_new` if they
+    must be written.
+    """
 
     def __init__(self, folder: str, is_new: bool, place: Path) -> None:
         self.folder = folder
@@ -37,7 +41,10 @@ class Export:
         self._place = place
 
     def save(self, name: str, picture: np.ndarray | bytes) -> None:
-        """Write a picture RGB u8 (h, w, 3), or the bytes of its file. One that is there already is kept."""
+        """Write a picture RGB u8 (h, w, 3), or the bytes of its file.
+
+        One that is there already is kept.
+        """
         self.names.append(name)
         file = self._place / name
         if self.is_new or not file.is_file():
@@ -49,10 +56,11 @@ class Export:
 def exported(
     index: DatasetIndex, folder: str, stream: str, sources: Sequence[Path], which: object = None
 ) -> Iterator[Export]:
-    """Give the pictures of `stream` in `folder`, or in a folder of a name like it if that holds something else.
+    """Give the pictures of `stream` in `folder`, or in a folder of a name like it if that holds
+    something else.
 
-    `sources` and `which` decide the pictures, which come to be as a whole when the block ends. Raises DatasetError if
-    nothing can be written.
+    `sources` and `which` decide the pictures, which come to be as a whole when the block ends.
+    Raises DatasetError if nothing can be written.
     """
     place, record = find_export(index.root, folder, stream)
     is_new = record is None or not _is_same(record, sources, which)
@@ -73,7 +81,8 @@ def exported(
             index.written += len(export.names)
     except OSError as error:
         raise UserError(
-            f"the pictures of {sources[0]} cannot be written to {index.root / folder}: {error.strerror or error}; make "
+            f"the pictures of {sources[0]} cannot be written to {index.root / folder}: "
+            f"{error.strerror or error}; make "
             "its folder writable"
         ) from None
     finally:
@@ -81,7 +90,9 @@ def exported(
 
 
 def find_export(root: Path, folder: str, stream: str) -> tuple[str | None, dict[str, Any] | None]:
-    """Return the folder that holds the pictures of a stream, and its record; (None, None) if there is none."""
+    """Return the folder that holds the pictures of a stream, and its record; (None, None) if there
+    is none.
+    """
     for name in _names(folder):
         if not (root / name).exists():
             return None, None
@@ -109,7 +120,9 @@ def is_current(record: dict[str, Any], sources: Sequence[Path]) -> bool:
 
 
 def _is_same(record: dict[str, Any], sources: Sequence[Path], part: object) -> bool:
-    """Return whether sources have the sizes and times of a record, or else its sizes and content."""
+    """Return whether sources have the sizes and times of a record, or else its sizes and
+    content.
+    """
     old = record["sources"]
     if json.dumps(part) != json.dumps(record["part"]) or [name for name, *_ in old] != [
         one.name for one in sources
@@ -135,7 +148,10 @@ def _move(
     record: dict[str, Any] | None,
     names: list[str],
 ) -> str:
-    """Move new pictures to their folder, and return it. Files of the user in a replaced folder stay in it."""
+    """Move new pictures to their folder, and return it.
+
+    Files of the user in a replaced folder stay in it.
+    """
     if place is not None and record is not None:
         old = index.root / place
         ours = {EXPORT_RECORD, *record["pictures"]}
@@ -174,7 +190,10 @@ def _has_same(folder: Path, part: Path, names: list[str]) -> bool:
 
 
 def export_video(index: DatasetIndex, video: str) -> str:
-    """Write a video's frames as 000000.png.. into a folder of its name. Raises ImageError or DatasetError."""
+    """Write a video's frames as 000000.png.. into a folder of its name.
+
+    Raises ImageError or DatasetError.
+    """
     file = index.root / video
     with exported(index, video.removesuffix(file.suffix), file.name, [file]) as pictures:
         if pictures.is_new:

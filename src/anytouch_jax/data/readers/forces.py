@@ -1,8 +1,10 @@
-"""Touches with measured forces and poses: TacBench as Sparsh publishes it, ToucHD-Force, FreeTacMan.
+"""Touches with measured forces and poses: TacBench as Sparsh publishes it, ToucHD-Force,
+FreeTacMan.
 
-Layouts are those of public code: the loaders of github.com/facebookresearch/sparsh (`data/digit/utils.py` and its
-read-me) and `data/downstream_dataset.py` of github.com/GeWu-Lab/AnyTouch2. That of FreeTacMan is in `start_collect.py`
-and `pose_to_joint.py` of github.com/OpenDriveLab/FreeTacMan. Its data set card has the names of files.
+Layouts are those of public code: the loaders of github.com/facebookresearch/sparsh
+(`data/digit/utils.py` and its read-me) and `data/downstream_dataset.py` of
+github.com/GeWu-Lab/AnyTouch2. That of FreeTacMan is in `start_collect.py` and `pose_to_joint.py` of
+github.com/OpenDriveLab/FreeTacMan. Its data set card has the names of files.
 """
 
 from __future__ import annotations
@@ -19,7 +21,10 @@ from anytouch_jax.data.readers import common
 from anytouch_jax.data.readers.common import DatasetError, DatasetIndex, DatasetReader
 from anytouch_jax.data.readers.exports import Export, export_video, exported
 
-_SPARSH = "Higuera et al., Sparsh: Self-supervised touch representations for vision-based tactile sensing, CoRL 2024"
+_SPARSH = (
+    "Higuera et al., Sparsh: Self-supervised touch representations for vision-based tactile "
+    "sensing, CoRL 2024"
+)
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
 TEST_BATCHES = ("flat/batch_1",)  # the tests of Sparsh's configuration
 # of AnyTouch 2's probe of ToucHD
@@ -28,10 +33,12 @@ TRAIN_OBJECTS = (6, 41, 52, 53, 59, 69, 70)
 
 
 def _force(index: DatasetIndex) -> None:
-    """Presses and slides of three indenters on DIGIT and GelSight Mini: <indenter>/batch_<k>/dataset_<sensor>_<n>.pkl.
+    """Presses and slides of three indenters on DIGIT and GelSight Mini:
+    <indenter>/batch_<k>/dataset_<sensor>_<n>.pkl.
 
-    `dataset_slip_forces.pkl` has for each slide the frames (`indexes`), forces in newtons and slip. Frames outside
-    slides are unused, and the first free one is the background. The test is Sparsh's: flat/batch_1.
+    `dataset_slip_forces.pkl` has for each slide the frames (`indexes`), forces in newtons and slip.
+    Frames outside slides are unused, and the first free one is the background. The test is
+    Sparsh's: flat/batch_1.
     """
     folders = [folder for folder, _, files in index.walk() if "dataset_slip_forces.pkl" in files]
     if folders:
@@ -107,8 +114,8 @@ def _force(index: DatasetIndex) -> None:
 def _pose(index: DatasetIndex) -> None:
     """A hand of three DIGITs on an object that is moved: {train,test}/<object>/bag_<n>.pkl.
 
-    Labels are the change of pose over five frames that Sparsh sorts into classes: `t_x`, `t_y` and `yaw` in degrees, as
-    its code names them. Backgrounds are bgs/digit_<finger>.png.
+    Labels are the change of pose over five frames that Sparsh sorts into classes: `t_x`, `t_y` and
+    `yaw` in degrees, as its code names them. Backgrounds are bgs/digit_<finger>.png.
     """
     for part in ("train", "test"):
         for folder, _, files in index.walk(f"{part}/"):
@@ -169,7 +176,9 @@ def _list(path: Path) -> list[Any]:
 
 
 def _picture(pictures: Export, frame: Any, name: str, path: Path) -> str:
-    """Write a frame of a pickle, an encoded picture or an array, and return the name of its file."""
+    """Write a frame of a pickle, an encoded picture or an array, and return the name of its
+    file.
+    """
     if isinstance(frame, bytes):
         name += next((end for magic, end in _MAGIC.items() if frame.startswith(magic)), ".png")
         pictures.save(name, frame)
@@ -184,8 +193,9 @@ def _picture(pictures: Export, frame: Any, name: str, path: Path) -> str:
 def _touchd(index: DatasetIndex) -> None:
     """ToucHD's forces: <obj41_speed..>/<sensor>/image_<n>.png and all_data_direction.json.
 
-    The table has [number, f_x, f_y, f_z] of every picture of an object, speed and sensor. f_z is turned, so that
-    pressing is positive. image_1 is the background. Objects of AnyTouch 2's probe keep its split, others are by hash.
+    The table has [number, f_x, f_y, f_z] of every picture of an object, speed and sensor. f_z is
+    turned, so that pressing is positive. image_1 is the background. Objects of AnyTouch 2's probe
+    keep its split, others are by hash.
     """
     table = index.find_file(["all_data_direction.json"])
     if table is None:
@@ -225,10 +235,12 @@ def _touchd(index: DatasetIndex) -> None:
 
 
 def _freetacman(index: DatasetIndex) -> None:
-    """FreeTacMan's demonstrations: <task>/<task>_<n>_<camera>.mp4, with <...>_timestamps.txt if they are there.
+    """FreeTacMan's demonstrations: <task>/<task>_<n>_<camera>.mp4, with <...>_timestamps.txt if
+    they are there.
 
-    Cameras called tactile are read, or those of the option `keys`. A demonstration is an object's recording. The number
-    columns of <task>_<n>_traj.csv, such as `gripper_distance`, become labels if it has a row a frame.
+    Cameras called tactile are read, or those of the option `keys`. A demonstration is an object's
+    recording. The number columns of <task>_<n>_traj.csv, such as `gripper_distance`, become labels
+    if it has a row a frame.
     """
     wanted = index.options.keys or ("tactile",)
     for folder, _, files in index.tracked(list(index.walk())):
@@ -265,7 +277,10 @@ def _freetacman(index: DatasetIndex) -> None:
 
 
 def _poses(index: DatasetIndex, path: Path, count: int) -> dict[str, list[Any]]:
-    """Return the number columns of a trajectory as labels, {} if there are not `count` rows. Raises ManifestError."""
+    """Return the number columns of a trajectory as labels, {} if there are not `count` rows.
+
+    Raises ManifestError.
+    """
     if not path.is_file():
         index.skip("recording without a trajectory (no labels)", str(path))
         return {}
@@ -323,13 +338,15 @@ READERS = {
     "touchd_force": DatasetReader(
         _touchd,
         "all_data_direction.json and <object_speed>/<sensor>/image_1.png",
-        "AnyTouch 2: General Optical Tactile Representation Learning For Dynamic Tactile Perception, ICLR 2026",
+        "AnyTouch 2: General Optical Tactile Representation Learning For Dynamic Tactile "
+        "Perception, ICLR 2026",
         url="https://huggingface.co/datasets/BAAI/ToucHD-Force",
     ),
     "freetacman": DatasetReader(
         _freetacman,
         "<task>/<task>_1_tactile.mp4",
-        "Wu et al., FreeTacMan: Robot-free Visuo-Tactile Data Collection System for Contact-rich Manipulation, 2025",
+        "Wu et al., FreeTacMan: Robot-free Visuo-Tactile Data Collection System for Contact-rich "
+        "Manipulation, 2025",
         "MIT",
         "https://huggingface.co/datasets/OpenDriveLab/FreeTacMan",
         uses=("val", "test", "keys", "export"),

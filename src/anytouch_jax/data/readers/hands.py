@@ -1,6 +1,7 @@
 """Touches by hand, with photographs of the same place: Touch and Go, TVL with SSVTP, and TacQuad.
 
-Layouts are those of the authors' code, of AnyTouch's loaders and of data set cards. None states a licence of its data.
+Layouts are those of the authors' code, of AnyTouch's loaders and of data set cards. None states a
+licence of its data.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ from anytouch_jax.data.readers.common import (
 TASKS = {"material": "", "rough": "_rough"}  # task of Touch and Go -> ending of its lists
 SOFT = frozenset((7, 8, 9, 11, 13))  # materials, as in AnyTouch's probe
 BEFORE = 4  # frames from the background to the first frame of a touch
-SOURCE = "the authors' repository fredfyyang/Touch-and-Go has them in 'Visuo-tactile contrastive learning/dataset'"
+SOURCE = (
+    "the authors' repository fredfyyang/Touch-and-Go has them in 'Visuo-tactile contrastive "
+    "learning/dataset'"
+)
 # video -> frame number -> split by task, label by label.<task>
 Listed = dict[str, dict[int, dict[str, Any]]]
 
@@ -45,15 +49,20 @@ ON_DISK = {"shuttlecock": "yumaoqiu"}  # folder -> its name in TacQuad's list, t
 def _touch_and_go(index: DatasetIndex) -> None:
     """People touch objects with a GelSight: `dataset/<video>/gelsight_frame/<10 digits>.jpg`.
 
-    The photograph of the same moment has the same name in `video_frame/`. `label.txt` names every contact frame. Frames
-    come from videos by the dataset's extract_frame.py. Raises DatasetError without the lists of the task.
+    The photograph of the same moment has the same name in `video_frame/`. `label.txt` names every
+    contact frame. Frames come from videos by the dataset's extract_frame.py. Raises DatasetError
+    without the lists of the task.
 
-    * A touch is a run of consecutive listed frames. No run of the material lists is in both splits, but 100 of the 106
-      test videos also have train touches. A sequence here is a run within one split.
-    * The lists of material and rough disagree (3,289 rough test frames are material train frames), so a manifest
-      follows one of them, `task`. It has the labels of both, and `downstream_test` names every test list of a frame.
-    * -1 is no label. The background is the frame 4 before the touch: the rule behind 99 % of AnyTouch 2's lists.
-    * Contact frames in no list of `task` (label.txt has about 250,000) are train frames without its label.
+    * A touch is a run of consecutive listed frames. No run of the material lists is in both splits,
+      but 100 of the 106 test videos also have train touches. A sequence here is a run within one
+      split.
+    * The lists of material and rough disagree (3,289 rough test frames are material train frames),
+      so a manifest follows one of them, `task`. It has the labels of both, and `downstream_test`
+      names every test list of a frame.
+    * -1 is no label. The background is the frame 4 before the touch: the rule behind 99 % of
+      AnyTouch 2's lists.
+    * Contact frames in no list of `task` (label.txt has about 250,000) are train frames without its
+      label.
     """
     base = index.find_folder("dataset")
     if base is None:
@@ -78,7 +87,8 @@ def _listed_frames(index: DatasetIndex) -> Listed:
                 _read_list(listed, path, task, split)
             elif task == index.options.task:
                 raise DatasetError(
-                    f"expected the list {split}{ending}.txt in {index.options.lists or index.root}, or "
+                    f"expected the list {split}{ending}.txt in "
+                    f"{index.options.lists or index.root}, or "
                     f"in the folder of --lists; {SOURCE}"
                 )
             else:
@@ -86,7 +96,8 @@ def _listed_frames(index: DatasetIndex) -> Listed:
     all_contact = index.find_file(["label.txt"])
     if all_contact is None:
         index.notes.append(
-            "no label.txt: only frames of the split lists are taken (the paper has all contact frames)"
+            "no label.txt: only frames of the split lists are taken (the paper has all contact "
+            "frames)"
         )
     else:
         _read_list(listed, all_contact, None, "")
@@ -172,7 +183,10 @@ def _runs(numbers: list[int], together: Callable[[int, int], bool]) -> list[list
 
 
 def _ssvtp(index: DatasetIndex) -> None:
-    """A robot presses a DIGIT on textiles and photographs the place. `caption_id` is of TacQuad's download."""
+    """A robot presses a DIGIT on textiles and photographs the place.
+
+    `caption_id` is of TacQuad's download.
+    """
     base = index.find_folder("tvl_dataset/ssvtp", "ssvtp", "ssvtp_data", "", inside=("images_tac",))
     if base is None:
         return
@@ -197,16 +211,20 @@ def _ssvtp(index: DatasetIndex) -> None:
 
 
 def _tvl(index: DatasetIndex) -> None:
-    """A hand-held DIGIT and a camera: `hct/data{1,2,3}/<recording>/{tactile,vision}/<id>-<time>.jpg`.
+    """A hand-held DIGIT and a camera:
+    `hct/data{1,2,3}/<recording>/{tactile,vision}/<id>-<time>.jpg`.
 
-    In the authors' loader `contact.json` of each `data<k>` holds equally long lists `tactile`, `vision`, `background`
-    of paths below `data<k>`, and a missing background means `data<k>/digit_background.png`. Frames in no contact list
-    of a `data<k>` that has one are background (label.contact 0). The vision frame has the touch frame's name. Frames
-    are matched by their whole number, never by a string prefix. A recording's test frames are a separate sequence.
-    `train.csv` and `test.csv` have the columns tactile and caption (T3). The split is that of test.csv, else by hash.
+    In the authors' loader `contact.json` of each `data<k>` holds equally long lists `tactile`,
+    `vision`, `background` of paths below `data<k>`, and a missing background means
+    `data<k>/digit_background.png`. Frames in no contact list of a `data<k>` that has one are
+    background (label.contact 0). The vision frame has the touch frame's name. Frames are matched by
+    their whole number, never by a string prefix. A recording's test frames are a separate sequence.
+    `train.csv` and `test.csv` have the columns tactile and caption (T3). The split is that of
+    test.csv, else by hash.
 
-    Some recordings have the two folders swapped (reported to the authors, who point to a corrected copy). They are
-    read the other way round, if `_swapped` is certain. It opens two pictures of each recording, and no others.
+    Some recordings have the two folders swapped (reported to the authors, who point to a corrected
+    copy). They are read the other way round, if `_swapped` is certain. It opens two pictures of
+    each recording, and no others.
     """
     base = index.find_folder("tvl_dataset/hct", "hct", "", inside=HCT)
     parts = [part for part in HCT if base is not None and (index.root / base / part).is_dir()]
@@ -297,7 +315,9 @@ def _add_part(
 
 
 def _key(path: str) -> str:
-    """Return recording/name of recording/tactile/name, so that swapped folders have the same key."""
+    """Return recording/name of recording/tactile/name, so that swapped folders have the same
+    key.
+    """
     parts = path.replace("\\", "/").split("/")
     if len(parts) > 2:
         return f"{parts[-3]}/{parts[-1]}"
@@ -316,17 +336,20 @@ def _hct_contact(index: DatasetIndex, folder: str) -> tuple[set[str] | None, dic
     for paths in (touch, backgrounds):
         if not isinstance(paths, list) or not all(isinstance(one, str) for one in paths):
             raise DatasetError(
-                f"{path}: expected a list 'tactile' of contact frames, and a list 'background' or none"
+                f"{path}: expected a list 'tactile' of contact frames, and a list 'background' or "
+                "none"
             )
     keys = [_key(name) for name in touch or ()]
     return set(keys), dict(zip(keys, backgrounds, strict=False))
 
 
 def _swapped(first: Mapping[str, Sequence[Path]]) -> tuple[set[str], set[str]]:
-    """Return the recordings whose pictures (tactile, vision) are swapped, and those where that cannot be known.
+    """Return the recordings whose pictures (tactile, vision) are swapped, and those where that
+    cannot be known.
 
-    They are known by size, if only one of the two has a DIGIT's. Else touch is the side that is like those of most
-    other recordings. Where scenes are alike too, the names of two thirds of the recordings must agree.
+    They are known by size, if only one of the two has a DIGIT's. Else touch is the side that is
+    like those of most other recordings. Where scenes are alike too, the names of two thirds of the
+    recordings must agree.
     """
     swapped = set()
     thumbs = {}
@@ -363,7 +386,9 @@ def _swapped(first: Mapping[str, Sequence[Path]]) -> tuple[set[str], set[str]]:
 
 
 def _thumb(picture: np.ndarray) -> np.ndarray:
-    """Return means over THUMB x THUMB cells of a lying picture, f32, with a faint ramp so that no picture is flat."""
+    """Return means over THUMB x THUMB cells of a lying picture, f32, with a faint ramp so that no
+    picture is flat.
+    """
     if picture.shape[0] > picture.shape[1]:
         picture = np.rot90(picture)
     cells = cv2.resize(picture, (THUMB, THUMB), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -371,16 +396,20 @@ def _thumb(picture: np.ndarray) -> np.ndarray:
 
 
 def _tacquad(index: DatasetIndex) -> None:
-    """The same place of an object by four sensors: `data_{indoor,outdoor}/<item>/{gelsight,digit,duragel}/<n>.png`.
+    """The same place of an object by four sensors:
+    `data_{indoor,outdoor}/<item>/{gelsight,digit,duragel}/<n>.png`.
 
-    `gelsight` is the GelSight Mini. Photographs are `img_{gelsight,digit,duragel}/<n>.png`. `contact_<subset>.csv` has
-    no header: item, then first and last contact frame of gelsight, digit, duragel. Assumed: the fine subset has the
-    same layout (`data_fine`), and further columns are Tac3D's, whose force fields are counted and left out. Raises
-    DatasetError for a subset without its list.
+    `gelsight` is the GelSight Mini. Photographs are `img_{gelsight,digit,duragel}/<n>.png`.
+    `contact_<subset>.csv` has no header: item, then first and last contact frame of gelsight,
+    digit, duragel. Assumed: the fine subset has the same layout (`data_fine`), and further columns
+    are Tac3D's, whose force fields are counted and left out. Raises DatasetError for a subset
+    without its list.
 
-    * Contact frames get the item's split, the others `background` (label.contact 0). The first frame of a recording is
-      its background if contact begins later. The photograph is that of the same fraction of the recording.
-    * `touch` is the item, equal for all sensors, and `caption_id` the name of its caption in the authors' download.
+    * Contact frames get the item's split, the others `background` (label.contact 0). The first
+      frame of a recording is its background if contact begins later. The photograph is that of the
+      same fraction of the recording.
+    * `touch` is the item, equal for all sensors, and `caption_id` the name of its caption in the
+      authors' download.
     * The fine subset is `unused`: the paper reserves it for cross-sensor generation.
     """
     subsets = [
@@ -418,7 +447,9 @@ def _tacquad(index: DatasetIndex) -> None:
 def _contact_spans(
     index: DatasetIndex, subset: str
 ) -> dict[str, tuple[int, list[tuple[int, int]]]]:
-    """Return item -> its number in the list (from 0) and (first, last contact frame) of each sensor."""
+    """Return item -> its number in the list (from 0) and (first, last contact frame) of each
+    sensor.
+    """
     path = index.find_file([f"contact_{subset}.csv"])
     if path is None:
         place = index.options.lists or index.root
@@ -500,14 +531,16 @@ READERS = {
     "ssvtp": DatasetReader(
         _ssvtp,
         "ssvtp/images_tac/image_0_tac.jpg",
-        "Kerr et al., Self-Supervised Visuo-Tactile Pretraining to Locate and Follow Garment Features, RSS 2023",
+        "Kerr et al., Self-Supervised Visuo-Tactile Pretraining to Locate and Follow Garment "
+        "Features, RSS 2023",
         url="https://sites.google.com/berkeley.edu/ssvtp",
         paper=4_500,
     ),
     "tacquad": DatasetReader(
         _tacquad,
         "data_indoor/<item>/gelsight/0.png",
-        "Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple Visuo-tactile Sensors, "
+        "Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple "
+        "Visuo-tactile Sensors, "
         "ICLR 2025",
         url="https://huggingface.co/datasets/xxuan01/TacQuad",
         uses=("val", "test", "lists"),

@@ -1,6 +1,8 @@
-"""LeRobot data sets (version 3): tactile cameras become sequences, and features go back as a column.
+"""LeRobot data sets (version 3): tactile cameras become sequences, and features go back as a
+column.
 
-The layout is that of github.com/huggingface/lerobot (`src/lerobot/datasets/utils.py`, `dataset_reader.py`).
+The layout is that of github.com/huggingface/lerobot (`src/lerobot/datasets/utils.py`,
+`dataset_reader.py`).
 """
 
 from __future__ import annotations
@@ -25,14 +27,17 @@ from anytouch_jax.files import atomic_path
 
 
 def _lerobot(index: DatasetIndex) -> None:
-    """A LeRobotDataset v3, a sequence for each tactile camera of an episode; films become PNG by LeRobot's names."""
+    """A LeRobotDataset v3, a sequence for each tactile camera of an episode; films become PNG by
+    LeRobot's names.
+    """
     if not (index.root / "meta" / "info.json").is_file():
         return
     info = common.read_json(index.root / "meta" / "info.json")
     sensor = index.need_sensor()
     if not str(info.get("codebase_version", "")).startswith("v3"):
         raise DatasetError(
-            f"{index.root} has version {info.get('codebase_version')} of LeRobot's format; convert it to v3.0 with "
+            f"{index.root} has version {info.get('codebase_version')} of LeRobot's format; convert "
+            "it to v3.0 with "
             "LeRobot's script"
         )
     features = {
@@ -84,7 +89,8 @@ def _lerobot(index: DatasetIndex) -> None:
     others = [name for name in features if name not in (*cameras, *wanted)]
     if others:
         index.notes.append(
-            f"features that are not read: {', '.join(others)}; --values makes labels of those it names"
+            f"features that are not read: {', '.join(others)}; --values makes labels of those it "
+            "names"
         )
     first = 0
     for path, rows in rows_of.items():
@@ -129,13 +135,17 @@ def _lerobot(index: DatasetIndex) -> None:
 def _stated_splits(
     index: DatasetIndex, info: dict[str, Any], episodes: Iterable[int]
 ) -> dict[int, str]:
-    """Return the split of each episode, as meta/info.json states several ("0:2"), else by hash. Raises DatasetError."""
+    """Return the split of each episode, as meta/info.json states several ("0:2"), else by hash.
+
+    Raises DatasetError.
+    """
     stated: dict[int, str] = {}
     splits = dict(info.get("splits") or {})
     if len(splits) < 2:
         if splits and index.options.val + index.options.test:
             index.notes.append(
-                f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by hash; --val 0 "
+                f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by "
+                "hash; --val 0 "
                 "--test 0 keeps all in train"
             )
         return {number: index.split_of(f"episode-{number:06d}") for number in episodes}
@@ -159,7 +169,8 @@ def _stated_splits(
         for number in numbers:
             if stated.setdefault(number, split or "unused") != (split or "unused"):
                 raise DatasetError(
-                    f"{index.root}: episode {number} is in two splits of meta/info.json; correct them"
+                    f"{index.root}: episode {number} is in two splits of meta/info.json; correct "
+                    "them"
                 )
     index.notes.append(f"the splits are those of meta/info.json: {', '.join(splits)}")
     return stated
@@ -190,7 +201,10 @@ def _tasks(index: DatasetIndex) -> dict[int, str]:
 def _export_films(
     index: DatasetIndex, info: dict[str, Any], key: str, episodes: dict[int, dict[str, Any]]
 ) -> dict[int, str]:
-    """Write the episodes of a camera's films as PNG, and return their folders. Raises DatasetError."""
+    """Write the episodes of a camera's films as PNG, and return their folders.
+
+    Raises DatasetError.
+    """
     index.need_export(f"films of {key}")
     fps = float(info["fps"])
     films = dict[str, list[tuple[int, int, int]]]()
@@ -252,7 +266,9 @@ def _write_episodes(
 
 
 def camera_names(cameras: Sequence[str]) -> list[str]:
-    """Return what distinguishes the keys of cameras: left and right of observation.left.gel, observation.right.gel."""
+    """Return what distinguishes the keys of cameras: left and right of observation.left.gel,
+    observation.right.gel.
+    """
     parts = [camera.split(".") for camera in cameras]
     first = _common(parts)
     last = _common([part[first:][::-1] for part in parts])
@@ -271,10 +287,12 @@ def _common(lists: Sequence[Sequence[str]]) -> int:
 
 
 def write_features(root: Path, columns: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-    """Write columns by name: features f32 (n, E), and the numbers (n,) of their frames in the column `index`.
+    """Write columns by name: features f32 (n, E), and the numbers (n,) of their frames in the
+    column `index`.
 
-    Other frames get NaN. meta/stats.json gets their statistics. All files are written before the first is replaced,
-    meta/info.json last. Raises UserError for a column that is there, and for frames that are not.
+    Other frames get NaN. meta/stats.json gets their statistics. All files are written before the
+    first is replaced, meta/info.json last. Raises UserError for a column that is there, and for
+    frames that are not.
     """
     file = root / "meta" / "info.json"
     statistics = root / "meta" / "stats.json"
@@ -318,7 +336,9 @@ def write_features(root: Path, columns: Mapping[str, tuple[np.ndarray, np.ndarra
 
 
 def _statistics(features: np.ndarray) -> dict[str, list[float]]:
-    """Return statistics of features (n, E) under the names of LeRobot (`src/lerobot/datasets/compute_stats.py`)."""
+    """Return statistics of features (n, E) under the names of LeRobot
+    (`src/lerobot/datasets/compute_stats.py`).
+    """
     x = features.astype(np.float64)
     values = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
     values |= {

@@ -1,14 +1,15 @@
 """Recordings of your own: a folder of pictures is a recording, in ROOT or at any depth below it.
 
     mine/mug/pour_1/000.png ...         the object is the first folder, the recording is the folder
-    mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder of its name
-    mine/mug/background.png             the untouched gel of every recording in or below this folder
-    mine/mug/photo.jpg                  a photograph of the touched object, for the same recordings
-    mine/mug/caption.txt                a caption, for the same recordings
+    mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder of its
+    name mine/mug/background.png             the untouched gel of every recording in or below this
+    folder mine/mug/photo.jpg                  a photograph of the touched object, for the same
+    recordings mine/mug/caption.txt                a caption, for the same recordings
 
-Names decide the order and the numbers of frames (`data.names`). If numbers repeat with other words (left_0.png and
-right_0.png: two fingers), each finger is a sequence and a unit. Whole objects, or recordings without objects, are held
-out. With `--split-by recording` some recordings of each object are.
+Names decide the order and the numbers of frames (`data.names`). If numbers repeat with other words
+(left_0.png and right_0.png: two fingers), each finger is a sequence and a unit. Whole objects, or
+recordings without objects, are held out. With `--split-by recording` some recordings of each object
+are.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ _STILL = 1.0  # grey levels: pictures that differ by less show nothing
 
 
 class _Place(NamedTuple):
-    """How a folder was understood. `kinds` names its parts, `name` is its path without its split."""
+    """How a folder was understood.
+
+    `kinds` names its parts, `name` is its path without its split.
+    """
 
     split: str | None
     object: str | None
@@ -77,7 +81,10 @@ class _Recording(NamedTuple):
 
 
 def read(index: DatasetIndex) -> None:
-    """Add every folder of pictures. Raises UserError without a sensor, and for options that exclude each other."""
+    """Add every folder of pictures.
+
+    Raises UserError without a sensor, and for options that exclude each other.
+    """
     root = index.root
     options = index.options
     sensor = index.need_sensor()
@@ -138,7 +145,9 @@ def read(index: DatasetIndex) -> None:
 
 
 def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
-    """Return which recordings are films, by names, or by a few pictures if objects have one folder; order them."""
+    """Return which recordings are films, by names, or by a few pictures if objects have one folder;
+    order them.
+    """
     options = index.options
     unclear = list[str]()
     films = [options.films or options.order == "times"] * len(recordings)
@@ -159,7 +168,8 @@ def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
         what = "times of the files" if options.order == "times" else "names"
         advice = "" if options.order == "times" else "; --order times takes the times of the files"
         index.notes.append(
-            f"the {what} do not order {len(unclear)} recordings clearly (first: {unclear[0]}){advice}"
+            f"the {what} do not order {len(unclear)} recordings clearly (first: "
+            f"{unclear[0]}){advice}"
         )
     if options.singles or options.films or options.order == "times":
         return films
@@ -182,17 +192,19 @@ def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
     if alone := [one.folder for one, is_film in zip(recordings, films, strict=True) if not is_film]:
         where = f"{len(alone)} folders (first: {alone[0] or '.'})"
         index.notes.append(
-            f"the pictures of {where} do not look like a film: each is a single touch; --films makes a recording of "
+            f"the pictures of {where} do not look like a film: each is a single touch; --films "
+            "makes a recording of "
             "each folder"
         )
     return films
 
 
 def ranked_split(groups: Iterable[str], options: common.IndexOptions) -> dict[str, str]:
-    """Return the split of every group, by rank: sorted by SHA-256, the first are val, the last test, the others train.
+    """Return the split of every group, by rank: sorted by SHA-256, the first are val, the last
+    test, the others train.
 
-    The counts are the rounded shares. A share above 0 gets at least one group, if there are enough. Another group moves
-    at most one at each cut.
+    The counts are the rounded shares. A share above 0 gets at least one group, if there are enough.
+    Another group moves at most one at each cut.
     """
     order = sorted(set(groups), key=lambda group: hashlib.sha256(group.encode()).digest())
     most = max(0, len(order) - (options.val + options.test < 1))
@@ -208,7 +220,9 @@ def ranked_split(groups: Iterable[str], options: common.IndexOptions) -> dict[st
 def _assign_splits(
     index: DatasetIndex, parts: list[str], given: list[str | None], default: str
 ) -> None:
-    """Fill column split: as folders say, else by rank of groups inside each object, unless groups span several."""
+    """Fill column split: as folders say, else by rank of groups inside each object, unless groups
+    span several.
+    """
     options = index.options
     table = index.table
     by = options.split_by or default
@@ -244,13 +258,16 @@ def _assign_splits(
 
 
 def _group_values(table: dict[str, list[Any]], by: str) -> list[Any]:
-    """Return the group of every row: a column, or the first part in parentheses of a pattern in its path."""
+    """Return the group of every row: a column, or the first part in parentheses of a pattern in its
+    path.
+    """
     if "(" in by:
         try:
             find = re.compile(by).search
         except re.error as error:
             raise UserError(
-                f"--split-by {by!r} is no pattern: {error}; write a part of the path as '(p[0-9]+)_'"
+                f"--split-by {by!r} is no pattern: {error}; write a part of the path as "
+                "'(p[0-9]+)_'"
             ) from None
         matches = [find(path) for path in table["path"]]
         if not any(matches):
@@ -268,7 +285,10 @@ def _group_values(table: dict[str, list[Any]], by: str) -> list[Any]:
 
 
 def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
-    """Return the background, photograph and caption in a folder. Raises DatasetError for a caption that is no text."""
+    """Return the background, photograph and caption in a folder.
+
+    Raises DatasetError for a caption that is no text.
+    """
     cells: dict[str, Any] = {}
     for name in files:
         path = f"{folder}/{name}".lstrip("/")
@@ -287,7 +307,10 @@ def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
 
 
 def _understand(folders: Iterable[str]) -> dict[str, _Place]:
-    """Return how folders are understood: split words, then the object. Raises DatasetError for one in two splits."""
+    """Return how folders are understood: split words, then the object.
+
+    Raises DatasetError for one in two splits.
+    """
     parts = {folder: tuple(part for part in folder.split("/") if part) for folder in folders}
     above = list[tuple[str, ...]]()
     rest = list[int]()
@@ -329,7 +352,9 @@ def _place(names: tuple[str, ...], shared: int) -> _Place:
 def _sequences(
     recordings: Sequence[tuple[_Place, str, list[str]]], films: Sequence[bool]
 ) -> list[list[str]]:
-    """Return the distinct sequence of every picture, its own if it is no film, with a split or number."""
+    """Return the distinct sequence of every picture, its own if it is no film, with a split or
+    number.
+    """
     names = [
         [f"{place.name}/{unit}"] * len(pictures)
         if is_film
@@ -352,7 +377,9 @@ def _sequences(
 
 
 def _sentence(places: Sequence[_Place], films: Sequence[bool]) -> str:
-    """Return how the tree was understood: its levels, the folders of splits, and what a picture is."""
+    """Return how the tree was understood: its levels, the folders of splits, and what a picture
+    is.
+    """
     forms: Counter[str] = Counter()
     words: dict[str, str] = {}
     for place, is_film in zip(places, films, strict=True):
@@ -375,7 +402,9 @@ def _sentence(places: Sequence[_Place], films: Sequence[bool]) -> str:
 
 
 def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
-    """Return whether neighbouring pictures are more alike than others, by a few, and not stored seconds apart."""
+    """Return whether neighbouring pictures are more alike than others, by a few, and not stored
+    seconds apart.
+    """
     near = list[float]()
     far = list[float]()
     gaps = list[float]()
@@ -433,7 +462,10 @@ def _is_video(name: str) -> bool:
 
 
 def _export_videos(index: DatasetIndex) -> None:
-    """Write the frames of every video into a folder of its name. A video that cannot be read is skipped."""
+    """Write the frames of every video into a folder of its name.
+
+    A video that cannot be read is skipped.
+    """
     # before any is made
     for folder, _, files in index.tracked(list(index.walk(count=False))):
         for video in (f"{folder}/{name}".lstrip("/") for name in files if _is_video(name)):
@@ -450,7 +482,8 @@ def _skip_videos(index: DatasetIndex, folder: str, folders: list[str], files: li
         place, record = find_export(index.root, path.removesuffix(Path(name).suffix), name)
         if record is not None and not is_current(record, [index.root / path]):
             index.skip(
-                f"video that was changed after its pictures in {place} (--export writes them again)",
+                f"video that was changed after its pictures in {place} (--export writes them "
+                "again)",
                 path,
             )
         elif record is None and Path(name).stem not in folders:
@@ -458,10 +491,12 @@ def _skip_videos(index: DatasetIndex, folder: str, folders: list[str], files: li
 
 
 def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
-    """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes first.
+    """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes
+    first.
 
-    A sequence may be named by its folder or picture too, in any Unicode form. Lines and recordings without the other
-    are skipped. Raises DatasetError for a table that is missing, has no key, or has a column or a key twice.
+    A sequence may be named by its folder or picture too, in any Unicode form. Lines and recordings
+    without the other are skipped. Raises DatasetError for a table that is missing, has no key, or
+    has a column or a key twice.
     """
     names, lines = _read_labels(path)
     table, size = index.table, len(index.table["path"])
@@ -504,7 +539,9 @@ def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
 def _read_labels(
     path: Path,
 ) -> tuple[list[str], dict[tuple[str | None, str | None], dict[str, str]]]:
-    """Return the columns of the table, and (object, sequence) -> the other cells; an empty key cell is None."""
+    """Return the columns of the table, and (object, sequence) -> the other cells; an empty key cell
+    is None.
+    """
     rows = common.read_lines(path)
     names = rows[0][1] if rows else []
     if not set(LABEL_KEYS) & set(names):
@@ -542,7 +579,9 @@ def _read_labels(
 
 
 def _plain(name: str | None) -> str | None:
-    """Return a name in Unicode form NFC, None for an empty one; file systems of macOS have another form."""
+    """Return a name in Unicode form NFC, None for an empty one; file systems of macOS have another
+    form.
+    """
     if name:
         return unicodedata.normalize("NFC", name)
     return None

@@ -1,7 +1,8 @@
 """Touches by robots: VisGel, Cloth, YCB-Slide, Octopi, ObjectFolder 1.0, 2.0 and Real, and Feel.
 
-Objects or recordings are split by hash where a data set has no split. Contact lists of the authors come from TacQuad's
-download. ObjectFolder is CC BY 4.0 by its repository, as is assumed for its real touches.
+Objects or recordings are split by hash where a data set has no split. Contact lists of the authors
+come from TacQuad's download. ObjectFolder is CC BY 4.0 by its repository, as is assumed for its
+real touches.
 """
 
 from __future__ import annotations
@@ -62,9 +63,10 @@ PICTURES = {
 def _visgel(index: DatasetIndex) -> None:
     """A robot pokes 195 objects with a GelSight while a camera watches.
 
-    AnyTouch's code has the layout of READERS, with the photograph of the same moment under the same path in `vision`.
-    T3 has `data_seen` and `data_unseen` with two levels of folders as downloaded, where `frame0000.jpg` is the
-    touch-free reference. Assumed: the same `touch` / `vision` pair within these. `data_unseen` is the test part.
+    AnyTouch's code has the layout of READERS, with the photograph of the same moment under the same
+    path in `vision`. T3 has `data_seen` and `data_unseen` with two levels of folders as downloaded,
+    where `frame0000.jpg` is the touch-free reference. Assumed: the same `touch` / `vision` pair
+    within these. `data_unseen` is the test part.
     """
     index.read_contact_list(("contact_visgel.csv", "images/contact_visgel.csv"), "touch")
     for place in VISGEL:
@@ -95,8 +97,9 @@ def _visgel(index: DatasetIndex) -> None:
 def _cloth(index: DatasetIndex) -> None:
     """A robot squeezes 153 pieces of clothing with a GelSight; the cloth is the object.
 
-    AnyTouch has the layout of READERS, with the frames of `GelSight_video.mp4` of each trial. T3 has
-    `gsframes/frame%06d.jpg`. `cloth_metadata.json` (AnyTouch 2, T3) holds the numbers CLOTH_PROPERTIES of each cloth.
+    AnyTouch has the layout of READERS, with the frames of `GelSight_video.mp4` of each trial. T3
+    has `gsframes/frame%06d.jpg`. `cloth_metadata.json` (AnyTouch 2, T3) holds the numbers
+    CLOTH_PROPERTIES of each cloth.
     """
     base = index.find_folder("Data_ICRA18/Data", "Data")
     if base is None:
@@ -147,7 +150,8 @@ def _cloth_labels(values: object, table: Path | None, cloth: str) -> dict[str, i
         numbers = []
     if len(numbers) != len(CLOTH_PROPERTIES) or not all(number.is_integer() for number in numbers):
         raise DatasetError(
-            f"{table}: cloth {cloth!r} must have {len(CLOTH_PROPERTIES)} whole numbers, has {values}"
+            f"{table}: cloth {cloth!r} must have {len(CLOTH_PROPERTIES)} whole numbers, has "
+            f"{values}"
         )
     return {
         f"label.{name}": int(number) for name, number in zip(CLOTH_PROPERTIES, numbers, strict=True)
@@ -155,10 +159,12 @@ def _cloth_labels(values: object, table: Path | None, cloth: str) -> dict[str, i
 
 
 def _ycb_slide(index: DatasetIndex) -> None:
-    """A DIGIT slides over ten YCB objects, five times 60 s at 30 Hz each; with ten objects a split may stay empty.
+    """A DIGIT slides over ten YCB objects, five times 60 s at 30 Hz each; with ten objects a split
+    may stay empty.
 
-    The layout is that of the dataset's read-me; its simulated part is left out, as in the paper. Neighbouring frames
-    differ too little: a clip takes every third, as in AnyTouch, so every row has stride 3 and keeps its number.
+    The layout is that of the dataset's read-me; its simulated part is left out, as in the paper.
+    Neighbouring frames differ too little: a clip takes every third, as in AnyTouch, so every row
+    has stride 3 and keeps its number.
     """
     base = index.find_folder("real", "dataset/real", "") or ""
     for obj in index.tracked(index.listing(base)[0]):
@@ -181,9 +187,10 @@ def _ycb_slide(index: DatasetIndex) -> None:
 def _octopi(index: DatasetIndex) -> None:
     """PhysiCLeAR: a GelSight Mini is pressed on and rubbed over 74 everyday objects.
 
-    The authors' script turns 476 videos `dataset/<object>_<k>.mov` into `physiclear_<object>_<k>/%010d.jpg` (only
-    frames that move, so numbers have gaps). It writes `{train,val,test}_samples.json` (object -> folders), whose folder
-    names give the split if all three exist. AnyTouch calls the output folder `processed`.
+    The authors' script turns 476 videos `dataset/<object>_<k>.mov` into
+    `physiclear_<object>_<k>/%010d.jpg` (only frames that move, so numbers have gaps). It writes
+    `{train,val,test}_samples.json` (object -> folders), whose folder names give the split if all
+    three exist. AnyTouch calls the output folder `processed`.
     """
     base = index.find_folder("processed", "") or ""
     index.read_contact_list(
@@ -228,10 +235,11 @@ def _octopi(index: DatasetIndex) -> None:
 def _rendered(index: DatasetIndex) -> None:
     """Touches rendered by TACTO (1.0) and Taxim (2.0), two sensors that the paper never trains on.
 
-    AnyTouch's code has `obj1.0/<id>/<n>.png` and `obj2.0/touch/<id>/<n>.png`, with `obj2.0/label.json` (id -> material
-    number, without names) and `obj2.0/split.json` (train, test: lists of [id, n]) for both. Ids up to 100 are 1.0, and
-    2.0 leaves them out. The split is the benchmark's and by picture, so an object is in train and test. Every picture
-    is a sequence. Pictures in no list are `unused`. Raises DatasetError without label.json or split.json.
+    AnyTouch's code has `obj1.0/<id>/<n>.png` and `obj2.0/touch/<id>/<n>.png`, with
+    `obj2.0/label.json` (id -> material number, without names) and `obj2.0/split.json` (train, test:
+    lists of [id, n]) for both. Ids up to 100 are 1.0, and 2.0 leaves them out. The split is the
+    benchmark's and by picture, so an object is in train and test. Every picture is a sequence.
+    Pictures in no list are `unused`. Raises DatasetError without label.json or split.json.
     """
     ids = {
         place: [name for name in index.listing(place, count=False)[0] if name.isdecimal()]
@@ -295,13 +303,15 @@ def _objectfolder_lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple
 
 
 def _real(index: DatasetIndex) -> None:
-    """A robot touches 100 household objects with a GelSlim: every folder called `gelsight` is a recording.
+    """A robot touches 100 household objects with a GelSlim: every folder called `gelsight` is a
+    recording.
 
-    T3 and Sparsh have `<object>/tactile_data/<trial>/0/gelsight/<n>.png`, AnyTouch the same under `tactile/`. T3 has
-    `objectfolder_real_metadata.csv` with Index,Name,Material. The authors' `contact_text_obj.csv` has touch frame,
-    photograph and caption number, where both paths start below `tactile/`. The names of the two camera folders are
-    unknown. Assumed: they are siblings of `gelsight` with the same numbers. The first two by name are `image_path` and
-    `image2_path`, unless the list names the photograph. The object is the first number in the path.
+    T3 and Sparsh have `<object>/tactile_data/<trial>/0/gelsight/<n>.png`, AnyTouch the same under
+    `tactile/`. T3 has `objectfolder_real_metadata.csv` with Index,Name,Material. The authors'
+    `contact_text_obj.csv` has touch frame, photograph and caption number, where both paths start
+    below `tactile/`. The names of the two camera folders are unknown. Assumed: they are siblings of
+    `gelsight` with the same numbers. The first two by name are `image_path` and `image2_path`,
+    unless the list names the photograph. The object is the first number in the path.
     """
     base = index.find_folder("tactile", "real/tactile", "") or ""
     table = index.find_file(["objectfolder_real_metadata.csv"])
@@ -352,7 +362,9 @@ def _real(index: DatasetIndex) -> None:
 def _camera_views(
     index: DatasetIndex, base: str, siblings: list[tuple[str, list[str]]], numbers: list[int]
 ) -> list[list[str | None]]:
-    """Return the pictures of the first two camera views (by name) with the numbers of the touch frames, else None."""
+    """Return the pictures of the first two camera views (by name) with the numbers of the touch
+    frames, else None.
+    """
     views: list[list[str | None]] = []
     for folder, files in sorted(siblings):
         names = index.frames(folder, common.NUMBERED, files, count=False)
@@ -361,16 +373,19 @@ def _camera_views(
 
 
 def _feel(index: DatasetIndex) -> None:
-    """Grasps with two GelSight fingers: `<object>/touch_{before,during,after}/<n>_{A,B}.png`, `vision_{...}/<n>.png`.
+    """Grasps with two GelSight fingers: `<object>/touch_{before,during,after}/<n>_{A,B}.png`,
+    `vision_{...}/<n>.png`.
 
-    `feel.csv` has no header: object, n, success. `split_<k>.npy` is a pickled dict of train and test object lists, as
-    `split_<k>.json` may be; without either the split is by hash. The original files are `calandra_corl2017_*.h5`, of
-    which `export` writes the pictures as PNG (needs `pip install h5py`). Raises DatasetError for them without it.
+    `feel.csv` has no header: object, n, success. `split_<k>.npy` is a pickled dict of train and
+    test object lists, as `split_<k>.json` may be; without either the split is by hash. The original
+    files are `calandra_corl2017_*.h5`, of which `export` writes the pictures as PNG (needs `pip
+    install h5py`). Raises DatasetError for them without it.
 
-    * The split of a `during` frame is its object's. `before` (open fingers) is background, and the background of the
-      others. `after` shows the outcome and is `unused`. Every frame is a sequence: no clip spans the phases.
-    * `grasp_group` is the grasp, the same for both fingers (`unit` A and B). They press opposite sides and not one
-      place, so it is no `touch`, and nothing is matched by it.
+    * The split of a `during` frame is its object's. `before` (open fingers) is background, and the
+      background of the others. `after` shows the outcome and is `unused`. Every frame is a
+      sequence: no clip spans the phases.
+    * `grasp_group` is the grasp, the same for both fingers (`unit` A and B). They press opposite
+      sides and not one place, so it is no `touch`, and nothing is matched by it.
     """
     base = index.find_folder("feel", "", inside=("feel.csv",))
     if base is None:
@@ -399,7 +414,8 @@ def _feel(index: DatasetIndex) -> None:
             }
         if splits is not None and name not in splits:
             index.skip(
-                f"grasp of an object that is in no list of split {index.options.fold} (split unused)",
+                f"grasp of an object that is in no list of split {index.options.fold} (split "
+                "unused)",
                 name,
             )
         split = index.split_of(name) if splits is None else splits.get(name, "unused")
@@ -465,7 +481,10 @@ def _splits_of_fold(index: DatasetIndex, base: str) -> dict[str, str] | None:
 
 
 def export_grasps(root: Path, names: Sequence[str]) -> int:
-    """Write the grasps of HDF5 files as PNG, feel.csv last, and return their number. Raises DatasetError."""
+    """Write the grasps of HDF5 files as PNG, feel.csv last, and return their number.
+
+    Raises DatasetError.
+    """
     try:
         import h5py  # type: ignore[import-not-found, unused-ignore]
     except ImportError:
@@ -539,7 +558,8 @@ READERS = {
     "cloth": DatasetReader(
         _cloth,
         "Data_ICRA18/Data/<cloth>/<trial>/gelsight_frame/0000.png",
-        "Yuan et al., Active Clothing Material Perception using Tactile Sensing and Deep Learning, ICRA 2018",
+        "Yuan et al., Active Clothing Material Perception using Tactile Sensing and Deep Learning, "
+        "ICRA 2018",
         url="http://data.csail.mit.edu/active_clothing/Data_ICRA18.tar",
         uses=("val", "test", "lists"),
         paper=587_000,
@@ -547,7 +567,8 @@ READERS = {
     "ycb_slide": DatasetReader(
         _ycb_slide,
         "real/<object>/dataset_0/frames/frame_0000000.jpg",
-        "Suresh et al., MidasTouch: Monte-Carlo inference over distributions across sliding touch, CoRL 2022",
+        "Suresh et al., MidasTouch: Monte-Carlo inference over distributions across sliding touch, "
+        "CoRL 2022",
         "MIT",
         "https://github.com/rpl-cmu/YCB-Slide",
         paper=183_000,
@@ -571,7 +592,8 @@ READERS = {
     "objectfolder_real": DatasetReader(
         _real,
         "tactile/<object>/<trial>/gelsight/<n>.png",
-        "Gao et al., The ObjectFolder Benchmark: Multisensory Learning with Neural and Real Objects, CVPR 2023",
+        "Gao et al., The ObjectFolder Benchmark: Multisensory Learning with Neural and Real "
+        "Objects, CVPR 2023",
         "CC-BY-4.0",
         "https://objectfolder.stanford.edu/objectfolder-real-download",
         uses=("val", "test", "lists"),
@@ -580,7 +602,8 @@ READERS = {
     "feel": DatasetReader(
         _feel,
         "feel.csv and <object>/touch_during/0_A.png",
-        "Calandra et al., The Feeling of Success: Does Touch Sensing Help Predict Grasp Outcomes?, CoRL 2017",
+        "Calandra et al., The Feeling of Success: Does Touch Sensing Help Predict Grasp Outcomes?, "
+        "CoRL 2017",
         url="https://sites.google.com/view/the-feeling-of-success",
         uses=("val", "test", "lists", "fold", "export"),
     ),

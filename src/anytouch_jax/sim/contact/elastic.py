@@ -1,7 +1,9 @@
-"""Elastic half-spaces and bonded layers: influence coefficients of a surface load, and their convolution.
+"""Elastic half-spaces and bonded layers: influence coefficients of a surface load, and their
+convolution.
 
-Lengths are in pixels and stresses in units of the composite modulus E*. A stress p on one pixel moves the surface at an
-offset of (i, j) pixels by `p / E* * pitch * coefficient(i, j)`. Coefficients are listed at offsets >= 0.
+Lengths are in pixels and stresses in units of the composite modulus E*. A stress p on one pixel
+moves the surface at an offset of (i, j) pixels by `p / E* * pitch * coefficient(i, j)`.
+Coefficients are listed at offsets >= 0.
 """
 
 from __future__ import annotations
@@ -22,16 +24,19 @@ Host = npt.NDArray[np.float64]
 # thicknesses of the layer; the motion of a bonded layer decays exponentially and is zero beyond
 FAR = 12.0
 DISTANCE: Host = np.linspace(0, FAR, 513)
-# Up to this side length four matrix products are faster than two FFTs (twice as fast at 112, on two cores).
+# Up to this side length four matrix products are faster than two FFTs (twice as fast at 112, on two
+# cores).
 MATMUL_LIMIT = 144
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Fourier transforms of (rows, columns) fields, padded so that a convolution does not wrap around.
+    """Fourier transforms of (rows, columns) fields, padded so that a convolution does not wrap
+    around.
 
-    A transform is complex, or for small sizes a real (2, 2, KH, KW) array. The latter holds the cosine and sine sums of
-    the parts that are even and odd about the centre in x and in y. A symmetric kernel does not mix them.
+    A transform is complex, or for small sizes a real (2, 2, KH, KW) array. The latter holds the
+    cosine and sine sums of the parts that are even and odd about the centre in x and in y. A
+    symmetric kernel does not mix them.
     """
 
     rows: int
@@ -65,7 +70,9 @@ class Plan:
         return _join(_join(parts, 2), 0)[: self.rows, : self.columns]
 
     def even(self, transform: Array, spectrum: Array) -> Array:
-        """Return the transform of a field's convolution with a kernel that is even in x and in y."""
+        """Return the transform of a field's convolution with a kernel that is even in x and in
+        y.
+        """
         return transform * (
             spectrum[None, None] if self.matmul else _unfold(spectrum, self.padded[0], 1)
         )
@@ -113,7 +120,9 @@ def _wave_table(padded: int) -> Host:
 
 @functools.lru_cache(maxsize=64)
 def _kernel_table(size: int, padded: int, parity: int, weighted: bool) -> Host:
-    """Return the sums (padded / 2 + 1, size) of a kernel that is even or odd, weighted as `Plan.inverse` needs it."""
+    """Return the sums (padded / 2 + 1, size) of a kernel that is even or odd, weighted as
+    `Plan.inverse` needs it.
+    """
     wave = np.arange(padded // 2 + 1)
     offset = np.arange(size)
     angle = 2 * np.pi / padded * np.outer(wave, offset)
@@ -133,7 +142,9 @@ def _einsum(formula: str, a: Array, b: Array) -> Array:
 
 
 def _split(field: Array, axis: int) -> Array:
-    """Return the parts even and odd about the centre of `axis`, by distance from it, stacked in front."""
+    """Return the parts even and odd about the centre of `axis`, by distance from it, stacked in
+    front.
+    """
     left, right = jnp.split(field, 2, axis)
     left = jnp.flip(left, axis)
     return jnp.stack([right + left, right - left])
@@ -160,9 +171,11 @@ def normal_coefficients(rows: int, columns: int) -> Host:
 
 
 def tangential_coefficients(rows: int, columns: int, poisson: float) -> tuple[Host, Host, Host]:
-    """Return the tangential displacement by a unit traction on a pixel: x by x, x by y (odd in x and in y), y by y.
+    """Return the tangential displacement by a unit traction on a pixel: x by x, x by y (odd in x
+    and in y), y by y.
 
-    Cerruti's load (Johnson, Contact Mechanics, 3.75) over a square, in units of the normal modulus E*.
+    Cerruti's load (Johnson, Contact Mechanics, 3.75) over a square, in units of the normal modulus
+    E*.
     """
     xx, yy, xy = (
         _over_pixel(f, rows, columns) / np.pi for f in (_xx, _yy, lambda x, y: -np.hypot(x, y))
@@ -172,7 +185,10 @@ def tangential_coefficients(rows: int, columns: int, poisson: float) -> tuple[Ho
 
 
 def _xx(x: Host, y: Host) -> Host:
-    """Return the double integral of x^2 / r^3. With its counterpart in y it sums to that of 1 / r."""
+    """Return the double integral of x^2 / r^3.
+
+    With its counterpart in y it sums to that of 1 / r.
+    """
     return y * np.arcsinh(x / np.abs(y))
 
 
@@ -192,9 +208,11 @@ def _over_pixel(integral: Callable[[Host, Host], Host], rows: int, columns: int)
 
 
 def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
-    """Return a bonded layer's compliance over the half-space's at `wave` = wave number times thickness.
+    """Return a bonded layer's compliance over the half-space's at `wave` = wave number times
+    thickness.
 
-    The loads are normal, tangential along the wave, and tangential across it (Sneddon 1951; Johnson 5.8).
+    The loads are normal, tangential along the wave, and tangential across it (Sneddon 1951; Johnson
+    5.8).
     """
     k = 3 - 4 * poisson
     # divided by exp(2 wave), so nothing overflows
@@ -205,9 +223,11 @@ def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
 
 
 def sideways_symbol(wave: Host, poisson: float) -> Host:
-    """Return a bonded layer's tangential motion toward the load's crests over a half-space's normal motion.
+    """Return a bonded layer's tangential motion toward the load's crests over a half-space's normal
+    motion.
 
-    `wave` and the derivation are as in `layer_symbols`. It is negative where the layer is squeezed out.
+    `wave` and the derivation are as in `layer_symbols`. It is negative where the layer is squeezed
+    out.
     """
     k = 3 - 4 * poisson
     decay = np.exp(-2 * wave)
@@ -219,7 +239,9 @@ def sideways_symbol(wave: Host, poisson: float) -> Host:
 
 @functools.lru_cache(maxsize=1)
 def _hankel() -> tuple[Host, Host, Host, Host]:
-    """Return waves, quadrature weights, and J0 and J2 of `DISTANCE` times wave (distances, waves)."""
+    """Return waves, quadrature weights, and J0 and J2 of `DISTANCE` times wave (distances,
+    waves).
+    """
     nodes, weights = np.polynomial.legendre.leggauss(128)
     wave = 7.0 * (nodes + 1)
     weights = 7.0 * weights
@@ -230,10 +252,11 @@ def _hankel() -> tuple[Host, Host, Host, Host]:
 
 @functools.lru_cache(maxsize=8)
 def layer_tables(poisson: float) -> tuple[Host, Host, Host]:
-    """Return the motions of a half-space minus those of a layer by a point load at `DISTANCE` thicknesses.
+    """Return the motions of a half-space minus those of a layer by a point load at `DISTANCE`
+    thicknesses.
 
-    The motions are normal, tangential (mean over directions) and tangential (amplitude of cos 2 phi), in units of
-    P / (pi E* thickness).
+    The motions are normal, tangential (mean over directions) and tangential (amplitude of cos 2
+    phi), in units of P / (pi E* thickness).
     """
     wave, weights, bessel0, bessel2 = _hankel()
     normal, along, across = (1 - symbol for symbol in layer_symbols(wave, poisson))
@@ -249,7 +272,9 @@ def is_infinite(value: Any) -> bool:
 
 @functools.lru_cache(maxsize=8)
 def sideways_table(poisson: float) -> tuple[Host, float]:
-    """Return the smooth part of `sideways_kernel` at `DISTANCE` d thicknesses, and the factor of asinh(2 / d)."""
+    """Return the smooth part of `sideways_kernel` at `DISTANCE` d thicknesses, and the factor of
+    asinh(2 / d).
+    """
     wave, weights, bessel0, _ = _hankel()
     # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
     rest = (1 - 2 * poisson) / (2 * (1 - poisson))
@@ -284,7 +309,10 @@ def _looked_up(far: Array, table: Host, limit: float) -> Array:
 def normal_spectrum(
     plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
 ) -> Array:
-    """Return the spectrum of the normal coefficients. `share` (E* over the gel's modulus) is the layer's motion."""
+    """Return the spectrum of the normal coefficients.
+
+    `share` (E* over the gel's modulus) is the layer's motion.
+    """
     deep = jnp.asarray(_normal_host(plan), dtype)
     if is_infinite(thickness):
         return deep
@@ -297,7 +325,10 @@ def normal_spectrum(
 def tangential_spectra(
     plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
 ) -> Array:
-    """Return (3, KH, KW) spectra of the tangential coefficients xx, xy, yy. `share` is as in `normal_spectrum`."""
+    """Return (3, KH, KW) spectra of the tangential coefficients xx, xy, yy.
+
+    `share` is as in `normal_spectrum`.
+    """
     deep = jnp.asarray(_tangential_host(plan, poisson), dtype)
     if is_infinite(thickness):
         return deep

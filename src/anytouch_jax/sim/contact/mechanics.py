@@ -1,8 +1,10 @@
-"""Normal contact of a gel with an object pressed to a depth: pressure, displacement, force, without friction.
+"""Normal contact of a gel with an object pressed to a depth: pressure, displacement, force, without
+friction.
 
-Units are mm, kPa and N. The gel is a linear elastic half-space, or, with a finite thickness, a layer bonded to a rigid
-plate. Friction does not change the pressure, which is exact for an incompressible half-space under a rigid object.
-`sideways` is the tangential motion by pressing before friction resists it (`shear`).
+Units are mm, kPa and N. The gel is a linear elastic half-space, or, with a finite thickness, a
+layer bonded to a rigid plate. Friction does not change the pressure, which is exact for an
+incompressible half-space under a rigid object. `sideways` is the tangential motion by pressing
+before friction resists it (`shear`).
 """
 
 from __future__ import annotations
@@ -36,7 +38,9 @@ COARSEST = 24  # pixels; a coarser grid saves no time
 
 @dataclass(frozen=True)
 class Gel:
-    """A gel: Young's modulus in kPa, Poisson's ratio, thickness in mm. An infinite thickness is a half-space.
+    """A gel: Young's modulus in kPa, Poisson's ratio, thickness in mm.
+
+    An infinite thickness is a half-space.
 
     `modulus` and `thickness` may be traced arrays.
     """
@@ -55,11 +59,12 @@ jax.tree_util.register_dataclass(Gel, data_fields=["modulus", "thickness"], meta
 
 
 class PressResult(NamedTuple):
-    """The result of a press: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface, force N.
+    """The result of a press: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface,
+    force N.
 
-    A displacement is positive away from the object, and negative where a bonded layer bulges around the contact.
-    `residual` is the largest gap in contact, or overlap outside of it, over the largest penetration. `converged` is
-    whether it is below the tolerance.
+    A displacement is positive away from the object, and negative where a bonded layer bulges around
+    the contact. `residual` is the largest gap in contact, or overlap outside of it, over the
+    largest penetration. `converged` is whether it is below the tolerance.
     """
 
     pressure: Array
@@ -81,14 +86,16 @@ def press(
     tolerance: float = 1e-4,
     iterations: int | None = None,
 ) -> PressResult:
-    """Press an object with `surface` (H, W) mm, its highest nominal point at 0, `depth` mm into the flat gel.
+    """Press an object with `surface` (H, W) mm, its highest nominal point at 0, `depth` mm into the
+    flat gel.
 
-    `pitch` is mm per pixel. `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf is no object. With
-    "exact", conjugate gradients on the contact set (Polonsky and Keer 1999) reach `tolerance` in at most `iterations`
-    (300). With "fast", `iterations` (2) projected gradients on this grid follow twice and four times as many on coarser
-    grids. Where the gel still cuts the object, it takes the object's surface, as in Taxim (Si and Yuan 2022). Use
-    `jax.vmap` for a batch. Raises UserError for untraced values that make no sense, such as a negative depth or a
-    modulus of 0, and for a gel thinner than a pixel ("fast": 1.5 pixels of the coarsest grid).
+    `pitch` is mm per pixel. `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf
+    is no object. With "exact", conjugate gradients on the contact set (Polonsky and Keer 1999)
+    reach `tolerance` in at most `iterations` (300). With "fast", `iterations` (2) projected
+    gradients on this grid follow twice and four times as many on coarser grids. Where the gel still
+    cuts the object, it takes the object's surface, as in Taxim (Si and Yuan 2022). Use `jax.vmap`
+    for a batch. Raises UserError for untraced values that make no sense, such as a negative depth
+    or a modulus of 0, and for a gel thinner than a pixel ("fast": 1.5 pixels of the coarsest grid).
     """
     _check(surface, depth, pitch, fidelity)
     _check_elastic(np.shape(surface), gel, pitch, fidelity, modulus_object)
@@ -129,7 +136,8 @@ def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
         raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
     if np.ndim(surface) != 2:
         raise UserError(
-            f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap for more"
+            f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap "
+            "for more"
         )
     for name, value, least in (("depth", depth, 0.0), ("pitch", pitch, 1e-12)):
         if not isinstance(value, jax.core.Tracer) and not np.all(
@@ -184,7 +192,10 @@ def _compliance(plan: Plan, pitch: Array, gel: Gel, share: Array, dtype: Any) ->
 
 
 def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -> Any:
-    """Return the object's part of the displacement by a pressure, in units of `cut`. The object is a half-space."""
+    """Return the object's part of the displacement by a pressure, in units of `cut`.
+
+    The object is a half-space.
+    """
     if is_infinite(modulus_object):
         return 0.0
     deep = normal_spectrum(plan, 1.0, 0.0, float("inf"), 1.0, pressure.dtype)
@@ -205,7 +216,9 @@ def _exact(
 def _fast(
     compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
 ) -> tuple[Solution, Array, Array]:
-    """Solve from coarse to fine, with `iterations` on the finest grid and twice as many on each coarser one."""
+    """Solve from coarse to fine, with `iterations` on the finest grid and twice as many on each
+    coarser one.
+    """
     cuts = [cut]
     for _ in compliances[1:]:
         cuts.append(halved(cuts[-1]))
@@ -222,13 +235,17 @@ def _fast(
 
 
 def _sharpened(solution: Solution) -> Array:
-    """Take one local step without a convolution and with the same load, which removes pressure from gaps."""
+    """Take one local step without a convolution and with the same load, which removes pressure from
+    gaps.
+    """
     local = jnp.maximum(solution.x - solution.excess / OWN, 0)
     return local * ratio(jnp.sum(solution.x), jnp.sum(local), 0.0)
 
 
 def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) -> Solution:
-    """Run projected gradients from `pressure` at its best scale, and scale the result to its best."""
+    """Run projected gradients from `pressure` at its best scale, and scale the result to its
+    best.
+    """
     moved = apply(pressure)
     factor = scaled(pressure, moved, cut)
     end = descent(
@@ -242,11 +259,13 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
 def sideways(
     pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False
 ) -> Array:
-    """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W) kPa alone.
+    """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W)
+    kPa alone.
 
-    A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more under a wide block.
-    A compressible one is also drawn toward the load. Friction reduces the motion (`shear_step`). With "fast" it is
-    computed on the coarsest grid, and stays there if `coarse`. Raises UserError for a gel without a thickness.
+    A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more
+    under a wide block. A compressible one is also drawn toward the load. Friction reduces the
+    motion (`shear_step`). With "fast" it is computed on the coarsest grid, and stays there if
+    `coarse`. Raises UserError for a gel without a thickness.
     """
     if is_infinite(gel.thickness):
         raise UserError("sideways motion needs a bonded layer: set the thickness of the gel")
@@ -271,7 +290,9 @@ def sideways(
 
 
 def enlarged(motion: Array, shape: tuple[int, ...]) -> Array:
-    """Return a motion (h, w, 2) of a coarser grid on the grid of `shape`, by cubic interpolation."""
+    """Return a motion (h, w, 2) of a coarser grid on the grid of `shape`, by cubic
+    interpolation.
+    """
     if motion.shape[:2] == shape:
         return motion
     return jax.image.resize(motion, (*shape, 2), "cubic")
@@ -289,7 +310,9 @@ def doubled(field: Array) -> Array:
 
 
 def positions(shape: tuple[int, int], pitch: Any) -> tuple[Array, Array]:
-    """Return x (to the right) and y (down) of the pixels of `shape` in mm from the field's centre, each (H, W)."""
+    """Return x (to the right) and y (down) of the pixels of `shape` in mm from the field's centre,
+    each (H, W).
+    """
     pitch = jnp.asarray(pitch)
     y, x = (pitch * (jnp.arange(n, dtype=pitch.dtype) - (n - 1) / 2) for n in shape)
     return jnp.broadcast_to(x[None, :], shape), jnp.broadcast_to(y[:, None], shape)
@@ -301,7 +324,9 @@ def area(pressure: Array, pitch: Any) -> Array:
 
 
 def centroid(pressure: Array, pitch: Any) -> Array:
-    """Return the centre of a pressure (H, W), (x, y) in mm from the field's centre, (0, 0) without contact."""
+    """Return the centre of a pressure (H, W), (x, y) in mm from the field's centre, (0, 0) without
+    contact.
+    """
     x, y = positions((pressure.shape[0], pressure.shape[1]), jnp.asarray(pitch, pressure.dtype))
     total = jnp.sum(pressure)
     moments = jnp.stack([jnp.sum(x * pressure), jnp.sum(y * pressure)])

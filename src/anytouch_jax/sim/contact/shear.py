@@ -1,8 +1,10 @@
-"""Tangential contact: Coulomb friction under sliding and twist, with its history (stick, partial slip, full slip).
+"""Tangential contact: Coulomb friction under sliding and twist, with its history (stick, partial
+slip, full slip).
 
-Friction does not change the pressure. The sideways motion by pressing alone is an optional input. It is zero on an
-incompressible half-space, and Cattaneo's and Mindlin's solutions omit it. A bonded layer is squeezed out, and the
-object resists. Units are mm, kPa, N and rad. x points right, y down, and twist is positive from x to y.
+Friction does not change the pressure. The sideways motion by pressing alone is an optional input.
+It is zero on an incompressible half-space, and Cattaneo's and Mindlin's solutions omit it. A bonded
+layer is squeezed out, and the object resists. Units are mm, kPa, N and rad. x points right, y down,
+and twist is positive from x to y.
 """
 
 from __future__ import annotations
@@ -72,16 +74,18 @@ def shear_step(
     tolerance: float = 1e-3,
     iterations: int | None = None,
 ) -> Shear:
-    """Move the object by `motion` (dx mm, dy mm, dtheta rad about `centre` mm) under the pressure of `contact`.
+    """Move the object by `motion` (dx mm, dy mm, dtheta rad about `centre` mm) under the pressure
+    of `contact`.
 
-    `state` is that of the previous frame, or None at rest. The traction starts from it, so a reversed motion leaves a
-    locked-in shear. `friction` is Coulomb's coefficient. With "exact", projected gradients with all tangential
-    coefficients on the grid of the pressure reach `tolerance` in at most `iterations` (400). With "fast", an elastic
-    predictor and the return to the friction cone are followed by `iterations` (6) corrections on a coarser grid.
-    `squeezed` (H, W, 2) mm is the sideways motion by this step's change of pressure (from `mechanics.sideways`). The
-    traction then also resists it, and `displacement` is that of the traction alone. Both are on the coarser grid of
-    "fast" if `coarse`. Use `jax.vmap` for a batch. Raises
-    UserError for a negative untraced friction.
+    `state` is that of the previous frame, or None at rest. The traction starts from it, so a
+    reversed motion leaves a locked-in shear. `friction` is Coulomb's coefficient. With "exact",
+    projected gradients with all tangential coefficients on the grid of the pressure reach
+    `tolerance` in at most `iterations` (400). With "fast", an elastic predictor and the return to
+    the friction cone are followed by `iterations` (6) corrections on a coarser grid. `squeezed` (H,
+    W, 2) mm is the sideways motion by this step's change of pressure (from `mechanics.sideways`).
+    The traction then also resists it, and `displacement` is that of the traction alone. Both are on
+    the coarser grid of "fast" if `coarse`. Use `jax.vmap` for a batch. Raises UserError for a
+    negative untraced friction.
     """
     _check(contact, pitch, friction, fidelity)
     pressure = contact.pressure
@@ -151,7 +155,8 @@ def _check(contact: PressResult, pitch: Any, friction: Any, fidelity: str) -> No
         raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
     if jnp.ndim(contact.pressure) != 2:
         raise UserError(
-            f"shear_step takes one contact, not pressures {jnp.shape(contact.pressure)}; use jax.vmap"
+            f"shear_step takes one contact, not pressures {jnp.shape(contact.pressure)}; use "
+            "jax.vmap"
         )
     if not isinstance(pitch, jax.core.Tracer) and not np.all(np.asarray(pitch) > 0):
         raise UserError(f"pitch must be above 0 mm, not {pitch}")
@@ -194,7 +199,9 @@ def _returned(traction: Array, limit: Array) -> Array:
 
 
 def _stiffness(touching: Array, poisson: float) -> Array:
-    """Return the mean traction per rigid motion of a sticking circle of the same area (Mindlin 1949), dimensionless."""
+    """Return the mean traction per rigid motion of a sticking circle of the same area (Mindlin
+    1949), dimensionless.
+    """
     radius = jnp.sqrt(jnp.maximum(jnp.sum(touching), 1) / jnp.pi)
     return 4 * (1 - poisson) / (2 - poisson) / (jnp.pi * radius)
 
@@ -214,7 +221,9 @@ def _repeated(field: Array, times: int) -> Array:
 def _totals(
     traction: Array, slipping: Array, pressure: Array, pitch: Array
 ) -> tuple[Array, Array, Array]:
-    """Return force (2,) N, torque N mm about the centre of pressure, and the slipping share of the contact's area."""
+    """Return force (2,) N, torque N mm about the centre of pressure, and the slipping share of the
+    contact's area.
+    """
     x, y = positions((pressure.shape[0], pressure.shape[1]), pitch)
     middle = centroid(pressure, pitch)
     area = pitch**2 * KPA_MM2

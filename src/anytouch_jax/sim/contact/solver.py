@@ -1,7 +1,9 @@
-"""Quadratic programs of contact: least energy with pressure >= 0, or with a traction within the friction limit.
+"""Quadratic programs of contact: least energy with pressure >= 0, or with a traction within the
+friction limit.
 
-Both minimise `x . K x / 2 - x . target` for a compliance K, which is a function. Everything is dimensionless or in one
-length unit. `excess` is K x - target: the gap for pressures, minus the slip for tractions.
+Both minimise `x . K x / 2 - x . target` for a compliance K, which is a function. Everything is
+dimensionless or in one length unit. `excess` is K x - target: the gap for pressures, minus the slip
+for tractions.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ OWN = 1.122
 
 
 class Solution(NamedTuple):
-    """A load `x`, its `excess` K x - target, the residual in units of target, and the number of iterations."""
+    """A load `x`, its `excess` K x - target, the residual in units of target, and the number of
+    iterations.
+    """
 
     x: Array
     excess: Array
@@ -42,7 +46,8 @@ class _Conjugate(NamedTuple):
 def conjugate_gradients(
     apply: Compliance, target: Array, start: Array, tolerance: float | Array, iterations: int
 ) -> Solution:
-    """Solve for pressures >= 0 by conjugate gradients on the contact set (Polonsky and Keer, Wear 231, 1999).
+    """Solve for pressures >= 0 by conjugate gradients on the contact set (Polonsky and Keer, Wear
+    231, 1999).
 
     It stops after `iterations`, or if no gap in contact and no overlap outside exceeds `tolerance`.
     """
@@ -106,10 +111,11 @@ def descent(
     tolerance: float | Array | None = None,
     moved: Array | None = None,
 ) -> Solution:
-    """Solve for loads in a convex set by projected gradients with Barzilai-Borwein steps (Birgin et al. 2000).
+    """Solve for loads in a convex set by projected gradients with Barzilai-Borwein steps (Birgin et
+    al. 2000).
 
-    Energy never rises. There is one product with K an iteration. It stops after `iterations`, or at a projected
-    gradient below `tolerance`. `moved` is K of `start`, if known.
+    Energy never rises. There is one product with K an iteration. It stops after `iterations`, or at
+    a projected gradient below `tolerance`. `moved` is K of `start`, if known.
     """
 
     def residual(x: Array, excess: Array) -> Array:
@@ -148,7 +154,8 @@ def scaled(start: Array, moved: Array, target: Array) -> Array:
 def ratio(above: Array, below: Array, otherwise: float) -> Array:
     """Return `above` over `below`, or `otherwise` where `below` is not above a tiny number.
 
-    The gradient divides by the square of `below`, which must not overflow: the last steps of a descent are tiny.
+    The gradient divides by the square of `below`, which must not overflow: the last steps of a
+    descent are tiny.
     """
     is_large = below > jnp.finfo(below.dtype).tiny ** 0.45
     return jnp.where(is_large, above / jnp.where(is_large, below, 1), otherwise)

@@ -1,9 +1,9 @@
 """Renderer of tactile images from the deformation of the skin, and the field that Tac3D measures.
 
-Everything is a product of small matrices along rows and columns, or arithmetic that XLA fuses into one pass. So a batch
-under `vmap` costs little more than its pixels. The steps are: resample and differentiate the displacement at the
-pixels, colour change by normal and place, soft shadow and light bleed from the blurred dent, background, markers,
-noise.
+Everything is a product of small matrices along rows and columns, or arithmetic that XLA fuses into
+one pass. So a batch under `vmap` costs little more than its pixels. The steps are: resample and
+differentiate the displacement at the pixels, colour change by normal and place, soft shadow and
+light bleed from the blurred dent, background, markers, noise.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: val
 
 
 class PictureView(NamedTuple):
-    """Places of the image's columns and rows: `x` (W,), `y` (H,) mm from the field's middle, and `u`, `v` in -1..1.
+    """Places of the image's columns and rows: `x` (W,), `y` (H,) mm from the field's middle, and
+    `u`, `v` in -1..1.
 
     `u` and `v` are the places that the unit's lights see.
     """
@@ -60,9 +61,11 @@ def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
 def picture_view(
     sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False
 ) -> PictureView:
-    """Return the part of the field in an image of (height, width): the largest of its shape, zoomed and mirrored.
+    """Return the part of the field in an image of (height, width): the largest of its shape, zoomed
+    and mirrored.
 
-    If `stretched`, the whole field fills the image, whose pixels need not be square: what `encoder.preprocess` makes.
+    If `stretched`, the whole field fills the image, whose pixels need not be square: what
+    `encoder.preprocess` makes.
     """
     height, width = resolution
     tall = sensor.field[0] / height
@@ -104,7 +107,10 @@ def backdrop(
 
 
 def _light(uneven: Array, tint: Array, place: PictureView, sensor: Sensor) -> Array:
-    """Return the light (H, W) of one colour, relative to the nominal one. It falls on dents as on the untouched gel."""
+    """Return the light (H, W) of one colour, relative to the nominal one.
+
+    It falls on dents as on the untouched gel.
+    """
     u = place.u[None, :]
     v = place.v[:, None]
     relative = 1 + u * (uneven[0] + u * uneven[2] + v * uneven[3]) + v * (uneven[1] + v * uneven[4])
@@ -125,14 +131,16 @@ def render(
     drift: Array | None = None,
     stretched: bool = False,
 ) -> Array:
-    """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid of `pitch` mm.
+    """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid
+    of `pitch` mm.
 
-    The grid and the field have the same middle, and the grid's edge is repeated outside of it. `tangential` (h, w, 2)
-    mm (x, y), on that grid or a coarser one, moves the markers. None is an untouched gel. `key` draws the noise, and
-    None omits it. `resolution` is (height, width), by default square pixels with a short side of 224. `photometry`
-    replaces that of the sensor. `sensor` and `resolution` are static under jit. `behind` is the `backdrop` of the same
-    unit and resolution. `drift` (3, 3) changes the light (`sensors.draw_drift`). `stretched` is as in `picture_view`.
-    Raises UserError for a sensor without a camera.
+    The grid and the field have the same middle, and the grid's edge is repeated outside of it.
+    `tangential` (h, w, 2) mm (x, y), on that grid or a coarser one, moves the markers. None is an
+    untouched gel. `key` draws the noise, and None omits it. `resolution` is (height, width), by
+    default square pixels with a short side of 224. `photometry` replaces that of the sensor.
+    `sensor` and `resolution` are static under jit. `behind` is the `backdrop` of the same unit and
+    resolution. `drift` (3, 3) changes the light (`sensors.draw_drift`). `stretched` is as in
+    `picture_view`. Raises UserError for a sensor without a camera.
     """
     resolution = resolution or picture_size(sensor)
     place = picture_view(sensor, unit, resolution, stretched=stretched)
@@ -165,8 +173,9 @@ def render(
 
     if behind is None:
         behind = backdrop(sensor, unit, resolution, stretched=stretched)
-    # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU backend cannot fuse the
-    # arithmetic into the transpose, whose inner loop over three channels is not vectorised (six times slower).
+    # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU
+    # backend cannot fuse the arithmetic into the transpose, whose inner loop over three channels is
+    # not vectorised (six times slower).
     planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift)).astype(
         jnp.uint32
     )
@@ -183,7 +192,9 @@ def _shading(
     photometry: Photometry,
     place: PictureView,
 ) -> Callable[[dict[str, Array]], Array]:
-    """Return the change (H, W) of one channel by the dent, as a function of the channel's numbers."""
+    """Return the change (H, W) of one channel by the dent, as a function of the channel's
+    numbers.
+    """
     matrices = _resample(displacement.shape, pitch, place)
     skin = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
     nx, ny = tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
@@ -200,7 +211,9 @@ def _shading(
 
 
 def tilt(slope_x: Array, slope_y: Array, steepest: float | Array) -> tuple[Array, Array]:
-    """Return slopes (mm/mm) over the length of their normal, which are sines of the tilt, cut to length `steepest`."""
+    """Return slopes (mm/mm) over the length of their normal, which are sines of the tilt, cut to
+    length `steepest`.
+    """
     square = slope_x**2 + slope_y**2
     scale = jnp.minimum(
         jax.lax.rsqrt(1.0 + square), steepest * jax.lax.rsqrt(jnp.maximum(square, 1e-12))
@@ -209,10 +222,12 @@ def tilt(slope_x: Array, slope_y: Array, steepest: float | Array) -> tuple[Array
 
 
 def colour_change(normal: Array, nx: Array, ny: Array, u: Array, v: Array) -> Array:
-    """Return the change (H, W) of one colour channel, 0..1, of a surface with `tilt` (nx, ny) (H, W).
+    """Return the change (H, W) of one colour channel, 0..1, of a surface with `tilt` (nx, ny) (H,
+    W).
 
-    `normal` (20, 6) is that channel of `Photometry.normal`, and `u` (W,) and `v` (H,) are places in -1..1. It is
-    Horner's scheme in nx over Horner's scheme in ny. Every coefficient is a quadric of the place.
+    `normal` (20, 6) is that channel of `Photometry.normal`, and `u` (W,) and `v` (H,) are places in
+    -1..1. It is Horner's scheme in nx over Horner's scheme in ny. Every coefficient is a quadric of
+    the place.
     """
     index = {power: k for k, power in enumerate(POWERS)}
     u = u[None, :]
@@ -232,7 +247,8 @@ def colour_change(normal: Array, nx: Array, ny: Array, u: Array, v: Array) -> Ar
 
 
 def halo_change(halo: Array, features: tuple[Array, ...], u: Array, v: Array) -> Array:
-    """Return the change (H, W) of one channel from slope x, slope y and depth (each (H, W)) of the blurred dent.
+    """Return the change (H, W) of one channel from slope x, slope y and depth (each (H, W)) of the
+    blurred dent.
 
     `halo` (3, 3) is that channel of `Photometry.halo`.
     """
@@ -262,7 +278,10 @@ def _channels(
 
 
 def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: Any) -> Array:
-    """Render the background image of a unit, u8 (H, W, 3) RGB, with its markers and noise. `options` of `render`."""
+    """Render the background image of a unit, u8 (H, W, 3) RGB, with its markers and noise.
+
+    `options` of `render`.
+    """
     return render(None, None, 1.0, sensor, unit, key, **options)
 
 
@@ -277,10 +296,11 @@ def onto_picture(
     stretched: bool = False,
     grid: tuple[int, int] | None = None,
 ) -> Array:
-    """Resample maps (..., h, w, C) of the solve grid at the pixels of a unit's image of (height, width).
+    """Resample maps (..., h, w, C) of the solve grid at the pixels of a unit's image of (height,
+    width).
 
-    With `vectors`, the two channels are x and y of a vector, which is mirrored with the image. `grid` is the size of
-    the solve grid if that of the maps is coarser.
+    With `vectors`, the two channels are x and y of a vector, which is mirrored with the image.
+    `grid` is the size of the solve grid if that of the maps is coarser.
     """
     place = picture_view(sensor, unit, resolution, stretched=stretched)
     ay, ax = _enlarging(maps.shape[-3:-1], grid, pitch, place)
@@ -299,7 +319,9 @@ def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrice
 def _enlarging(
     shape: tuple[int, ...], grid: Any, pitch: Any, place: PictureView
 ) -> tuple[Array, Array]:
-    """Return the value matrices from a map of `shape`, on a grid of (rows, columns) with `pitch` or a coarser one."""
+    """Return the value matrices from a map of `shape`, on a grid of (rows, columns) with `pitch` or
+    a coarser one.
+    """
     grid = grid or shape
     ay, _, ax, _ = _resample(grid, pitch, place)
     if shape[:2] == grid[:2]:
@@ -332,7 +354,9 @@ def _ink(
     sensor: Sensor,
     unit: Unit,
 ) -> Array:
-    """Return the share of ink (H, W): the lattice at the undeformed places of the skin at the pixels."""
+    """Return the share of ink (H, W): the lattice at the undeformed places of the skin at the
+    pixels.
+    """
     x, y = (
         jnp.broadcast_to(a, (len(place.y), len(place.x)))
         for a in (place.x[None, :], place.y[:, None])
@@ -351,10 +375,12 @@ def _ink(
 def ink_coverage(
     markers: Markers, x: Array, y: Array, phase: Array, size: Array, soft: Array, half: Any
 ) -> Array:
-    """Return the share of ink (H, W), 0..1, at places with *undeformed* coordinates `x`, `y` (H, W) mm.
+    """Return the share of ink (H, W), 0..1, at places with *undeformed* coordinates `x`, `y` (H, W)
+    mm.
 
-    Spots lie on a lattice and differ a little in size, as printed spots do. `phase` (2,) is in lattice steps, `size` a
-    factor on the radius, `soft` mm the width of a spot's rim, `half` mm half the field's diagonal (for the lens).
+    Spots lie on a lattice and differ a little in size, as printed spots do. `phase` (2,) is in
+    lattice steps, `size` a factor on the radius, `soft` mm the width of a spot's rim, `half` mm
+    half the field's diagonal (for the lens).
     """
     bends = is_traced(markers.bend) or markers.bend
     grow = 1.0 - markers.bend * (1.0 - (x**2 + y**2) / half**2) if bends else 1.0
@@ -390,14 +416,18 @@ def _pixel_bits(key: Array, shape: tuple[int, int]) -> Array:
 
 
 def _mixed(word: Array) -> Array:
-    """Return words in which every bit depends on all bits of `word` u32 (C. Wellons, Hash Prospector, 2018)."""
+    """Return words in which every bit depends on all bits of `word` u32 (C. Wellons, Hash
+    Prospector, 2018).
+    """
     word = (word ^ word >> 16) * jnp.uint32(0x21F0AAAD)
     word = (word ^ word >> 15) * jnp.uint32(0x735A2D97)
     return word ^ word >> 15
 
 
 def _noise(bits: Array) -> Array:
-    """Return noise of zero mean and unit variance from the lowest ten bits of each word: ten coin tosses."""
+    """Return noise of zero mean and unit variance from the lowest ten bits of each word: ten coin
+    tosses.
+    """
     return (jax.lax.population_count(bits & jnp.uint32(1023)).astype(jnp.float32) - 5) / np.sqrt(
         2.5
     )
@@ -415,18 +445,21 @@ def measure_field(
     gel: Gel | None = None,
     key: Array | None = None,
 ) -> Array:
-    """Return the measurement of a field sensor, f32 (points, points, 6): displacement x, y, z mm, force x, y, z N.
+    """Return the measurement of a field sensor, f32 (points, points, 6): displacement x, y, z mm,
+    force x, y, z N.
 
-    Inputs on the solve grid are `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h, w) kPa, `traction`
-    (h, w, 2) kPa and `pitch` mm. A point reports the mean displacement and the total force of its cell, so without
-    noise the forces sum to the load. `key` draws noise of `noise` mm in a displacement. The sensor computes forces from
-    displacements, so their noise is the force that moves a cube of `gel` under a cell by it. Raises UserError for maps
-    of different sizes.
+    Inputs on the solve grid are `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h,
+    w) kPa, `traction` (h, w, 2) kPa and `pitch` mm. A point reports the mean displacement and the
+    total force of its cell, so without noise the forces sum to the load. `key` draws noise of
+    `noise` mm in a displacement. The sensor computes forces from displacements, so their noise is
+    the force that moves a cube of `gel` under a cell by it. Raises UserError for maps of different
+    sizes.
     """
     shape = displacement.shape
     if not shape == pressure.shape == tangential.shape[:2] == traction.shape[:2]:
         raise UserError(
-            f"displacement {shape}, pressure {pressure.shape} and the tangential maps must have one size"
+            f"displacement {shape}, pressure {pressure.shape} and the tangential maps must have "
+            "one size"
         )
     maps = jnp.concatenate([tangential, displacement[..., None], traction, pressure[..., None]], -1)
     rows, columns = (jnp.asarray(interpolation.average(n, points)) for n in shape)

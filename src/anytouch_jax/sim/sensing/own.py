@@ -1,4 +1,5 @@
-"""A user's own sensor: a folder `NAME.sensor` with readable numbers (sensor.json) and the arrays of its look.
+"""A user's own sensor: a folder `NAME.sensor` with readable numbers (sensor.json) and the arrays of
+its look.
 
 Wherever the simulator takes the name of a sensor, it takes such a folder too.
 """
@@ -70,13 +71,17 @@ class OwnSensor:
 
 
 def find_sensor(word: str) -> Sensor:
-    """Return the sensor of a name in `SENSORS`, or of a folder NAME.sensor. Raises UserError for another word."""
+    """Return the sensor of a name in `SENSORS`, or of a folder NAME.sensor.
+
+    Raises UserError for another word.
+    """
     if word in SENSORS:
         return SENSORS[word]
     if Path(word).suffix == OWN_SENSOR:
         return read_sensor(word)
     raise UserError(
-        f"there is no simulated sensor {word!r}; choose among {', '.join(SENSORS)}, or name a folder{OWN_SENSOR} of "
+        f"there is no simulated sensor {word!r}; choose among {', '.join(SENSORS)}, or name a "
+        f"folder{OWN_SENSOR} of "
         "`anytouch sensor fit`"
     )
 

@@ -1,4 +1,6 @@
-"""Photographs of the touched place: a shaded height map on a table, with random view, light and background."""
+"""Photographs of the touched place: a shaded height map on a table, with random view, light and
+background.
+"""
 
 import math
 from collections.abc import Sequence
@@ -38,7 +40,8 @@ def seeded_photograph(job: tuple[Object, Any, Sequence[int]], size: int) -> np.n
 def photograph(
     thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224
 ) -> np.ndarray:
-    """Return an RGB photograph u8 (size, size, 3) of the object around `place_mm` (x, y) mm in its frame.
+    """Return an RGB photograph u8 (size, size, 3) of the object around `place_mm` (x, y) mm in its
+    frame.
 
     The place is in the middle of 30 to 40 mm. `rng` draws view, light and background.
     """
@@ -116,7 +119,9 @@ def _dot(a: Planes, b: Any) -> Image:
 def _trace(
     shape: Shape, place: Any, view: CameraView, size: int
 ) -> tuple[Image, Image, Image, Planes]:
-    """Return where the ray of each pixel meets the bare primitive (x, y, z mm in the object's frame), and unit rays."""
+    """Return where the ray of each pixel meets the bare primitive (x, y, z mm in the object's
+    frame), and unit rays.
+    """
     axis = ((np.arange(size) + 0.5) / size - 0.5).astype(np.float32)
     focal = float(np.linalg.norm(view.eye)) / view.extent
     right, down, ahead = view.axes
@@ -153,7 +158,9 @@ def _trace(
 
 
 def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tuple[Image, Image]:
-    """Return texture and grain at x, y, and 1 outside of `where`, from a raster of the unrolled surface."""
+    """Return texture and grain at x, y, and 1 outside of `where`, from a raster of the unrolled
+    surface.
+    """
     ones = np.ones_like(x)
     plain = shape.texture == "smooth" and shape.grain == "none"
     if plain or not where.any():
@@ -202,7 +209,9 @@ def _normals(x: Image, y: Image, z: Image) -> Planes:
 
 
 def _shadow(shape: Shape, x: Image, y: Image, z: Image, light: Any) -> Image:
-    """Return 0 in the light to 1 in the shade, by steps toward the lamp over the primitive at half resolution."""
+    """Return 0 in the light to 1 in the shade, by steps toward the lamp over the primitive at half
+    resolution.
+    """
     half = [np.ascontiguousarray(a[::2, ::2]) for a in (x, y, z)]
     dark = np.zeros_like(half[0])
     lamp = light.astype(np.float32)
@@ -220,7 +229,9 @@ def _noise(rng: np.random.Generator, size: int, cells: int) -> Image:
 
 
 def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -> Image:
-    """Return highlights: those of the lamp, and on glossy objects the bright and dark sides of the room."""
+    """Return highlights: those of the lamp, and on glossy objects the bright and dark sides of the
+    room.
+    """
     gloss = thing.material.gloss
     metallic = thing.material.metallic
     if gloss < 0.03:
@@ -283,7 +294,10 @@ def _table(rng: np.random.Generator, x: Image, y: Image, place: Any) -> Planes:
 
 
 def _develop(planes: Sequence[Image], rng: np.random.Generator) -> np.ndarray:
-    """Apply exposure, vignette, blur, noise and gamma to red, green and blue. Returns u8 (H, W, 3)."""
+    """Apply exposure, vignette, blur, noise and gamma to red, green and blue.
+
+    Returns u8 (H, W, 3).
+    """
     size = planes[0].shape[0]
     axis: Image = np.linspace(-1, 1, size, dtype=np.float32) ** 2
     exposure = np.float32(rng.uniform(0.85, 1.15)) * (

@@ -1,10 +1,13 @@
-"""Simulated sensors, one frozen record each, and their units. A new sensor is a new entry of `SENSORS`, see also `own`.
+"""Simulated sensors, one frozen record each, and their units.
 
-`looks.npz` has the untouched gels of camera sensors and the colours of their dents (`experiments/results/tried.md`).
-GelSight, GelSight Mini, DIGIT and 9DTact look like real units. The colours of the Mini are fitted to 17 presses of a
-ball of 6.31 mm (GelSLAM) by `fitting.fit`. Its `contrast` makes simulated balls as strong as real ones. GelSlim and
-DuraGel are a few lights each, set by eye.
-Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field and has no image.
+A new sensor is a new entry of `SENSORS`, see also `own`.
+
+`looks.npz` has the untouched gels of camera sensors and the colours of their dents
+(`experiments/results/tried.md`). GelSight, GelSight Mini, DIGIT and 9DTact look like real units.
+The colours of the Mini are fitted to 17 presses of a ball of 6.31 mm (GelSLAM) by `fitting.fit`.
+Its `contrast` makes simulated balls as strong as real ones. GelSlim and DuraGel are a few lights
+each, set by eye. Sizes, gels and moduli are round numbers near published ones. Tac3D measures a
+field and has no image.
 """
 
 import math
@@ -54,8 +57,8 @@ class Sensor:
     contrast: float = 1.0  # of dents in most units over that of the calibrated one
     vignette: float = 0.0  # loss of light from the middle to the corners, of dents too
     halo: float = 1.0  # mm, width of the soft shadow
-    # Standard deviation of a pixel (0 to 255), or of a field's displacement in mm. 0.01 mm is a third of a pixel of
-    # Tac3D's camera with 640 columns.
+    # Standard deviation of a pixel (0 to 255), or of a field's displacement in mm. 0.01 mm is a
+    # third of a pixel of Tac3D's camera with 640 columns.
     noise: float = 1.0
     real: bool = True  # whether its look is that of real units
     # of units, relative to a family's: 1 is also mirrored and cropped, less is one device
@@ -67,9 +70,10 @@ class Sensor:
 class Photometry(NamedTuple):
     """The change of one sensor's image with the tilt of its surface. Colours are RGB in 0..1.
 
-    The colour of diffuse paint under a few fixed lights is a low-order polynomial of its normal (spherical harmonics,
-    Basri and Jacobs 2003), whose coefficients drift slowly over the image. So a few hundred numbers replace a table
-    over gradient bins (Taxim, Si and Yuan 2022). They are smooth, bounded, and exactly zero without contact.
+    The colour of diffuse paint under a few fixed lights is a low-order polynomial of its normal
+    (spherical harmonics, Basri and Jacobs 2003), whose coefficients drift slowly over the image. So
+    a few hundred numbers replace a table over gradient bins (Taxim, Si and Yuan 2022). They are
+    smooth, bounded, and exactly zero without contact.
     """
 
     # (20, 6, 3), a colour for every power of the normal (`POWERS`) and of the position
@@ -179,7 +183,10 @@ def _stored(sensor: Sensor) -> dict[str, Array]:
 
 @lru_cache(maxsize=16)
 def bases(sensor: Sensor) -> Array:
-    """Return untouched images (units, h, w, 3) f32 in 0..1 of the whole field. They are black for a field sensor."""
+    """Return untouched images (units, h, w, 3) f32 in 0..1 of the whole field.
+
+    They are black for a field sensor.
+    """
     if sensor.kind == "field":
         return np.zeros((1, 30, 30, 3), np.float32)
     stored = _stored(sensor)["bases"]
@@ -200,10 +207,12 @@ Leaf = Any  # numpy, or jax under vmap and jit
 
 
 class Unit(NamedTuple):
-    """Arrays f32 of one unit, or of several units stacked: how a device differs from others of its family.
+    """Arrays f32 of one unit, or of several units stacked: how a device differs from others of its
+    family.
 
-    `rotation` and `offset` move the *object* before contact (`gel_to_object`). `mirror`, `zoom` and `window` move the
-    *image*: they choose the visible part of the gel and its side. Only the renderer uses them.
+    `rotation` and `offset` move the *object* before contact (`gel_to_object`). `mirror`, `zoom` and
+    `window` move the *image*: they choose the visible part of the gel and its side. Only the
+    renderer uses them.
     """
 
     base: Leaf  # (h, w, 3) untouched gel of the whole field, 0..1
@@ -272,16 +281,20 @@ MOST_BASES = 16  # untouched gels of a sensor; so many weights are drawn for eac
 
 
 def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Unit:
-    """Return a unit of `sensor` drawn from `rng`. `real` (n, h, w, 3) replaces the untouched gels of `bases`.
+    """Return a unit of `sensor` drawn from `rng`.
 
-    Gels of F sensors (F, n, h, w, 3) are given with the number `of` the sensor. "Measured" is on real pictures scaled
-    to 128 pixels: GelSight Mini with dots (8 gels, 39 recordings) and without (3 units), DIGIT (3 units), 9DTact (3
-    units). All sensors draw equally often, so that they can share a stream.
+    `real` (n, h, w, 3) replaces the untouched gels of `bases`.
+
+    Gels of F sensors (F, n, h, w, 3) are given with the number `of` the sensor. "Measured" is on
+    real pictures scaled to 128 pixels: GelSight Mini with dots (8 gels, 39 recordings) and without
+    (3 units), DIGIT (3 units), 9DTact (3 units). All sensors draw equally often, so that they can
+    share a stream.
     """
     xp = namespace_of(rng)
     spread = sensor.spread
     share = sensor.markers.share if sensor.markers else 0.0
-    # Measured: the dots of the 8 gels are 0.131 or 0.183 short sides apart, which is 1.85 mm at a zoom of 1 or 0.72.
+    # Measured: the dots of the 8 gels are 0.131 or 0.183 short sides apart, which is 1.85 mm at a
+    # zoom of 1 or 0.72.
     zoom = 1 + spread * (rng.uniform(0.68, 1.0) - 1)
     room = (1 - zoom) / 2 * xp.asarray(sensor.field[::-1])
     # measured: 0 to 4 specks or scratches a gel
@@ -326,7 +339,9 @@ def draw_unit(sensor: Sensor, rng: Rng, real: Any = None, of: Any = None) -> Uni
 
 
 def _draw_base(real: Any, rng: Rng, of: Any) -> Any:
-    """Return an untouched gel: a mix of the `real` ones (n, h, w, 3), without the black ones, with blotches."""
+    """Return an untouched gel: a mix of the `real` ones (n, h, w, 3), without the black ones, with
+    blotches.
+    """
     xp = namespace_of(rng)
     count, height, width, _ = real.shape[-4:]
     drawn = rng.gamma(0.3, size=MOST_BASES)[:count] + 1e-9
@@ -339,10 +354,12 @@ def _draw_base(real: Any, rng: Rng, of: Any) -> Any:
 
 
 def draw_drift(frames: int, rng: Rng) -> Any:
-    """Return the relative change of light (frames, 3, 3) since the background image: at 1, u and v, for each colour.
+    """Return the relative change of light (frames, 3, 3) since the background image: at 1, u and v,
+    for each colour.
 
-    Measured on 42 recordings: deviations from the background of 1 to 2 % in each colour and 1 % across the image, and
-    of 0.2 % from frame to frame. A tenth of the recordings drift four times as much, as when the exposure settles.
+    Measured on 42 recordings: deviations from the background of 1 to 2 % in each colour and 1 %
+    across the image, and of 0.2 % from frame to frame. A tenth of the recordings drift four times
+    as much, as when the exposure settles.
     """
     xp = namespace_of(rng)
     often = xp.where(rng.uniform() < 0.1, 4.0, 1.0)

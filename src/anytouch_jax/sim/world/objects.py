@@ -1,4 +1,6 @@
-"""Objects to touch: materials, a catalogue drawn from a seed, labels, held-out kinds, and captions of their feel."""
+"""Objects to touch: materials, a catalogue drawn from a seed, labels, held-out kinds, and captions
+of their feel.
+"""
 
 import math
 import re
@@ -220,7 +222,9 @@ MATERIALS: dict[str, Material] = {
 
 
 class PrimitiveKind(NamedTuple):
-    """The noun of a primitive, its range of sizes in mm (see `Shape`), and the textures that fit it."""
+    """The noun of a primitive, its range of sizes in mm (see `Shape`), and the textures that fit
+    it.
+    """
 
     noun: str
     size: tuple[float, float]
@@ -228,15 +232,17 @@ class PrimitiveKind(NamedTuple):
 
 
 class TextureKind(NamedTuple):
-    """The adjective of a texture, its range of pitches in mm, and its RMS slope if its depth equals its pitch."""
+    """The adjective of a texture, its range of pitches in mm, and its RMS slope if its depth equals
+    its pitch.
+    """
 
     adjective: str
     pitch: tuple[float, float]
     slope: float
 
 
-# Contacts of 0.2 to 1.2 mm fill a good part of a field of 12 to 19 mm. Small contacts and raised figures have only
-# textures that do not hide them and are not hidden by them.
+# Contacts of 0.2 to 1.2 mm fill a good part of a field of 12 to 19 mm. Small contacts and raised
+# figures have only textures that do not hide them and are not hidden by them.
 PRIMITIVE_KINDS = {
     "sphere": PrimitiveKind("ball", (5.0, 12.0)),
     "cylinder": PrimitiveKind("rod", (4.0, 11.0)),
@@ -294,9 +300,12 @@ def combinations() -> list[tuple[str, str, str]]:
 
 
 def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
-    """Return `count` objects with different names. A smaller count returns the first objects of a larger one.
+    """Return `count` objects with different names.
 
-    No combination is repeated, and the least drawn one so far comes next. Raises UserError for a bad count.
+    A smaller count returns the first objects of a larger one.
+
+    No combination is repeated, and the least drawn one so far comes next. Raises UserError for a
+    bad count.
     """
     left = combinations()
     if not 1 <= count <= len(left):
@@ -354,9 +363,11 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
 def hold_out(
     objects: Sequence[Object], share: float, seed: int
 ) -> tuple[tuple[Object, ...], tuple[Object, ...]]:
-    """Split objects into (training, held out) that share no (primitive, texture) pair, in their order.
+    """Split objects into (training, held out) that share no (primitive, texture) pair, in their
+    order.
 
-    At least `share` is held out. Training objects keep every primitive and texture. Raises UserError otherwise.
+    At least `share` is held out. Training objects keep every primitive and texture. Raises
+    UserError otherwise.
     """
     if not 0 < share < 1:
         raise UserError(f"the share of objects held out must lie between 0 and 1, not {share}")
@@ -377,7 +388,8 @@ def hold_out(
             test_objects += sizes[pairs[i]]
     if test_objects < share * len(objects):
         raise UserError(
-            f"of {len(objects)} objects only {test_objects} can be held out without losing a primitive or a texture; "
+            f"of {len(objects)} objects only {test_objects} can be held out without losing a "
+            "primitive or a texture; "
             f"ask for less than {share:g} of them or draw more objects"
         )
     training = tuple(o for o in objects if o.kind not in test_pairs)
@@ -405,9 +417,10 @@ def roughness_of(thing: Object) -> str:
     return "rough"
 
 
-# Captions, in the style of AnyTouch's annotations (its appendix on GPT-4o). They never name the object, its material,
-# its form or the touch, so they do not reveal those labels. Two hints remain: most words for warmth and grip belong to
-# one material, and wide spacing is rare for cones, rings and letters, which have finer textures.
+# Captions, in the style of AnyTouch's annotations (its appendix on GPT-4o). They never name the
+# object, its material, its form or the touch, so they do not reveal those labels. Two hints remain:
+# most words for warmth and grip belong to one material, and wide spacing is rare for cones, rings
+# and letters, which have finer textures.
 HARDNESS: dict[str, tuple[str, ...]] = {
     "soft": ("soft", "yielding", "pliable", "squishy", "springy", "very soft"),
     "firm": ("firm", "fairly firm", "moderately firm", "semi-rigid", "tough"),
@@ -511,7 +524,10 @@ SECOND = (
 
 
 def caption(thing: Object, rng: np.random.Generator) -> str:
-    """Return one or two sentences about the object's feel. `rng` draws the words. The facts stay the same."""
+    """Return one or two sentences about the object's feel.
+
+    `rng` draws the words. The facts stay the same.
+    """
     shape = thing.shape
 
     def pick(options: tuple[str, ...]) -> str:

@@ -1,8 +1,10 @@
-"""Surfaces of objects in millimetres: a primitive, a texture on it, and the fine grain of its material.
+"""Surfaces of objects in millimetres: a primitive, a texture on it, and the fine grain of its
+material.
 
-A texture takes (u, v, pitch, seed) and returns heights from 0 (lowest) to 1 (highest). `u`, `v` are mm on the unrolled
-surface, of equal shape or an open grid of (1, W) and (H, 1). `pitch` mm is the repeat, or the size of a bump in a
-random texture. `seed` draws random textures and shifts repeating ones. Numpy arrays return numpy, JAX arrays JAX.
+A texture takes (u, v, pitch, seed) and returns heights from 0 (lowest) to 1 (highest). `u`, `v` are
+mm on the unrolled surface, of equal shape or an open grid of (1, W) and (H, 1). `pitch` mm is the
+repeat, or the size of a bump in a random texture. `seed` draws random textures and shifts repeating
+ones. Numpy arrays return numpy, JAX arrays JAX.
 """
 
 import math
@@ -21,7 +23,8 @@ Array = Any  # numpy's or JAX's
 Texture = Callable[[Array, Array, float, int], Array]
 
 SAND_LENGTH = 0.35  # pitches, at which the autocorrelation is 1/e
-# The autocorrelation of normal_cdf of a Gaussian field is 6/pi asin(rho/2); with rho = exp(-r^2/l^2) it is 1/e here.
+# The autocorrelation of normal_cdf of a Gaussian field is 6/pi asin(rho/2); with rho =
+# exp(-r^2/l^2) it is 1/e here.
 _FALL = math.sqrt(-math.log(2 * math.sin(math.pi / (6 * math.e))))
 
 
@@ -34,10 +37,12 @@ def namespace(x: Array) -> ModuleType:
 def gaussian_field(
     u: Array, v: Array, length: tuple[float, float], seed: int, terms: int = 40
 ) -> Array:
-    """Return a random field of mean 0 and deviation 1 with autocorrelation exp(-(du/l_u)^2 - (dv/l_v)^2).
+    """Return a random field of mean 0 and deviation 1 with autocorrelation exp(-(du/l_u)^2 -
+    (dv/l_v)^2).
 
-    `u`, `v` and `length` are in mm. The field is a sum of cosines. The radii of their wave vectors are quantiles, so
-    few terms follow the spectrum, and no wave is shorter than 1.6 lengths. An open grid costs one matrix product.
+    `u`, `v` and `length` are in mm. The field is a sum of cosines. The radii of their wave vectors
+    are quantiles, so few terms follow the spectrum, and no wave is shorter than 1.6 lengths. An
+    open grid costs one matrix product.
     """
     rng = np.random.default_rng([seed, terms])
     radius = np.sqrt(-2 * np.log1p(-(np.arange(terms) + 0.5) / terms))
@@ -60,12 +65,16 @@ def gaussian_field(
 
 
 def normal_cdf(n: Array) -> Array:
-    """Return the normal distribution function to 3e-4, which makes a Gaussian field uniform in 0 to 1."""
+    """Return the normal distribution function to 3e-4, which makes a Gaussian field uniform in 0 to
+    1.
+    """
     return 0.5 + 0.5 * namespace(n).tanh(0.7978845608 * (n + 0.044715 * n * n * n))
 
 
 def warp(u: Array, v: Array, pitch: float, amount: float, seed: int) -> tuple[Array, Array]:
-    """Displace the places by `amount` pitches (RMS) over some five pitches: no real pattern is quite regular."""
+    """Displace the places by `amount` pitches (RMS) over some five pitches: no real pattern is
+    quite regular.
+    """
     if amount == 0:
         return u, v
     length = (5 * pitch, 5 * pitch)
@@ -165,7 +174,9 @@ def _knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
 
 
 def _bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
-    """Bark-like plates along v: RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and v."""
+    """Bark-like plates along v: RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and
+    v.
+    """
     n = gaussian_field(u, v, (0.55 * pitch, 2.2 * pitch), seed + 3, terms=28)
     plate = gaussian_field(u, v, (0.8 * pitch, 1.6 * pitch), seed + 4, terms=16)
     furrow = 1 - namespace(u).exp(-((n / 0.55) ** 2))
@@ -222,10 +233,11 @@ _STEEP = 2.5  # steepest slope that a height map of 0.1 mm shows without steps
 class Shape:
     """A touchable surface. Lengths are in mm, angles in radians.
 
-    `size` is the radius of a sphere, cylinder, screw, ring, flat face or cone's base, the rim's radius of an edge or
-    corner, or the height of a letter. The texture is between 0 and -`texture_depth` under the primitive, rotated by
-    `texture_angle`. `irregularity` bends a repeating texture by this share of its pitch. The `grain` is a second, finer
-    texture. Raises UserError for an unknown name, a size or pitch of 0 or less, or a negative depth.
+    `size` is the radius of a sphere, cylinder, screw, ring, flat face or cone's base, the rim's
+    radius of an edge or corner, or the height of a letter. The texture is between 0 and
+    -`texture_depth` under the primitive, rotated by `texture_angle`. `irregularity` bends a
+    repeating texture by this share of its pitch. The `grain` is a second, finer texture. Raises
+    UserError for an unknown name, a size or pitch of 0 or less, or a negative depth.
     """
 
     primitive: str
@@ -256,7 +268,9 @@ class Shape:
 
 
 def base(shape: Shape, x: Array, y: Array) -> Array:
-    """Return heights in mm of the primitive at `x`, `y` mm, from 0 at its highest place down to the table."""
+    """Return heights in mm of the primitive at `x`, `y` mm, from 0 at its highest place down to the
+    table.
+    """
     return namespace(x).clip(PRIMITIVES[shape.primitive](shape, x, y), floor(shape), 0)
 
 
@@ -277,7 +291,9 @@ def unroll(shape: Shape, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
-    """Return texture and grain at the unrolled places `u`, `v` mm, each from 0 (low) to 1 (high)."""
+    """Return texture and grain at the unrolled places `u`, `v` mm, each from 0 (low) to 1
+    (high).
+    """
     if shape.texture in ("bark", "sand"):
         # random already
         s = u
@@ -289,7 +305,8 @@ def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def height(shape: Shape, x: Array, y: Array) -> Array:
-    """Return heights z mm toward the gel at `x`, `y` mm in the object's frame, numpy or JAX arrays of one shape.
+    """Return heights z mm toward the gel at `x`, `y` mm in the object's frame, numpy or JAX arrays
+    of one shape.
 
     The highest place of the primitive is 0, and texture and grain only lower it.
     """
@@ -316,14 +333,18 @@ def _floating(x: Array) -> Array:
 
 
 def relief(shape: Shape, pixels: int, pitch: float) -> np.ndarray:
-    """Return heights (pixels, pixels) f32 mm, `pitch` mm apart, the object's origin in the centre."""
+    """Return heights (pixels, pixels) f32 mm, `pitch` mm apart, the object's origin in the
+    centre.
+    """
     axis = ((np.arange(pixels) - (pixels - 1) / 2) * pitch).astype(np.float32)
     x, y = np.meshgrid(axis, axis)
     return np.asarray(height(shape, x, y), np.float32)
 
 
 def _round_rim(t: Array, radius: float) -> Array:
-    """Return the drop over a rim of `radius`: 0 up to t = 0, a quarter circle, then a straight steep side."""
+    """Return the drop over a rim of `radius`: 0 up to t = 0, a quarter circle, then a straight
+    steep side.
+    """
     xp = namespace(t)
     end = radius * _STEEP / math.hypot(1, _STEEP)
     inner = xp.clip(t, 0, end)
@@ -354,13 +375,17 @@ def _corner(shape: Shape, x: Array, y: Array) -> Array:
 
 
 def _cone(shape: Shape, x: Array, y: Array) -> Array:
-    """A tip of 4 mm height over a base of radius `size`; the tip's radius of curvature is a 16th of it."""
+    """A tip of 4 mm height over a base of radius `size`; the tip's radius of curvature is a 16th of
+    it.
+    """
     slope = 4.0 / shape.size
     return -slope * (namespace(x).sqrt(x * x + y * y + TIP * TIP) - TIP)
 
 
 def _flat(shape: Shape, x: Array, y: Array) -> Array:
-    """A round stamp with a flat face of radius `size`, its rim rounded by at most 0.5 mm within it."""
+    """A round stamp with a flat face of radius `size`, its rim rounded by at most 0.5 mm within
+    it.
+    """
     rim = min(0.5, shape.size / 2)
     return _round_rim(
         namespace(x).clip(namespace(x).hypot(x, y) - shape.size + rim, 0, math.inf), rim
@@ -388,7 +413,10 @@ _Line = tuple[_Point, ...]
 
 
 def _arc(centre: _Point, radius: _Point, start: float, stop: float, pieces: int) -> _Line:
-    """Return a polygon along an ellipse. Angles are in degrees, 0 to the right and growing downwards."""
+    """Return a polygon along an ellipse.
+
+    Angles are in degrees, 0 to the right and growing downwards.
+    """
     angles = [math.radians(start + (stop - start) * i / pieces) for i in range(pieces + 1)]
     return tuple(
         (centre[0] + radius[0] * math.cos(a), centre[1] + radius[1] * math.sin(a)) for a in angles
@@ -426,7 +454,9 @@ STROKES: dict[str, tuple[_Line, ...]] = {
 
 
 def _distance(letter: str, x: Array, y: Array) -> Array:
-    """Return the distance to the nearest stroke of a letter of height 1; `x`, `y` in letter heights."""
+    """Return the distance to the nearest stroke of a letter of height 1; `x`, `y` in letter
+    heights.
+    """
     xp = namespace(x)
     nearest = 0.0 * x + 4.0
     for line in STROKES[letter]:
@@ -456,7 +486,8 @@ PRIMITIVES: dict[str, Callable[[Shape, Array, Array], Array]] = {
     "edge": _edge,
     "corner": _corner,
     "cone": _cone,
-    # The upper half of a lying ring: `size` from its centre to the middle of a round bar of radius 0.3 size.
+    # The upper half of a lying ring: `size` from its centre to the middle of a round bar of radius
+    # 0.3 size.
     "ring": lambda shape, x, y: _dome(
         (namespace(x).hypot(x, y) - shape.size) ** 2, 0.3 * shape.size
     ),

@@ -9,19 +9,19 @@ from touch_world import make_touches
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import DataConfig, preset
-from anytouch_jax.data.gels import SETTLED, UnitGels
+from anytouch_jax.data.background.rule import SETTLED, UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError, SampleReader, evaluation
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.prepare.verify import verify
 from anytouch_jax.data.transforms import subtract_background
+from anytouch_jax.datasets.verify import verify
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.encoder.linear_head import ContactGate
-from anytouch_jax.encoder.stream import stream
 from anytouch_jax.errors import UserError
+from anytouch_jax.live.stream import stream
 from experiments.pouring import policy
 
 RNG = np.random.default_rng(0)

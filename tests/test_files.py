@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import anytouch_jax as at
-from anytouch_jax import bars, files
+from anytouch_jax import files
+from anytouch_jax import progress as bars
 from anytouch_jax.data.manifest.files import unpack_npy
 from anytouch_jax.encoder.embed import Features, load_index, save_npz
 from anytouch_jax.encoder.linear_head import LinearHead

@@ -25,10 +25,10 @@ import numpy as np
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import embed_rows, run_in_batches
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, load_engine
-from anytouch_jax.encoder.engines import CALIBRATION
-from anytouch_jax.encoder.export import export
-from anytouch_jax.encoder.stream import compile_for_one
 from anytouch_jax.evaluate import retrieval
+from anytouch_jax.export.engines import CALIBRATION
+from anytouch_jax.export.export import export
+from anytouch_jax.live.stream import compile_for_one
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
 from experiments.records import write_record

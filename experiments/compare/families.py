@@ -10,10 +10,10 @@ import numpy as np
 
 from anytouch_jax.config import UNIVERSAL, Config, DataConfig, ModelConfig, Stack, preset
 from anytouch_jax.encoder.base import Encoder, random_encoder
-from anytouch_jax.encoder.family import FamilyEncoder
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Vit, VitConfig
-from anytouch_jax.weights.families import FAMILIES, Family
+from anytouch_jax.zoo.encoder import FamilyEncoder
+from anytouch_jax.zoo.families import FAMILIES, Family
 
 SMALL = Stack(384, 12, 6, 1536)
 BASE = Stack(768, 12, 12, 3072)

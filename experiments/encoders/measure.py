@@ -27,13 +27,13 @@ import numpy as np
 
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
-from anytouch_jax.data.dots import DotFlow
-from anytouch_jax.encoder.fields import Measure, Scale
+from anytouch_jax.data.background.dots import DotFlow
+from anytouch_jax.fields.measure import Measure, Scale
+from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
-from anytouch_jax.ops.fields import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.sim import endless, scene
-from anytouch_jax.simulated import FIELDS, field_batch, moved_gel
+from anytouch_jax.sim.batches import FIELDS, field_batch, moved_gel
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.progress import to_stderr as log

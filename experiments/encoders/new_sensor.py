@@ -34,13 +34,13 @@ from anytouch_jax.encoder.adapt import save
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import CheckError
 from anytouch_jax.evaluate.statistics import mean_interval
-from anytouch_jax.fitting.fit import fit_sensor
-from anytouch_jax.fitting.tokens import adapt_by_simulation
-from anytouch_jax.fitting.touches import COUNT, SIZE, own_world
 from anytouch_jax.sim import endless
+from anytouch_jax.sim.batches import FIELDS, field_batch, prepared
 from anytouch_jax.sim.endless import CAMERAS, Sampling
+from anytouch_jax.sim.fitting.fit import fit_sensor
+from anytouch_jax.sim.fitting.tokens import adapt_by_simulation
+from anytouch_jax.sim.fitting.touches import COUNT, SIZE, own_world
 from anytouch_jax.sim.sensing.sensors import SENSORS, draw_unit
-from anytouch_jax.simulated import FIELDS, field_batch, prepared
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.benchmarks import machine
 from experiments.encoders.measure import subtracted, touch_errors

@@ -23,10 +23,10 @@ from typing import Any, Literal
 import jax
 
 from anytouch_jax.config import Config, preset
-from anytouch_jax.pretrain import CHECKPOINTS, pretrain
-from anytouch_jax.simulated import SIMULATED
+from anytouch_jax.sim.batches import SIMULATED
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.progress import to_stderr as log
+from anytouch_jax.training import CHECKPOINTS, pretrain
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.registry import PARTS, write_encoder
 

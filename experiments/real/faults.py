@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from anytouch_jax.encoder.health import UnitFrames
+from anytouch_jax.live.health import UnitFrames
 
 Fault = Callable[[UnitFrames, UnitFrames | None, np.random.Generator], UnitFrames]
 

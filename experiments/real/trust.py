@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder import health
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, probing, splits
 from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.files import read_arrays
+from anytouch_jax.live import health
 from anytouch_jax.sim.sensing.sensors import SENSORS, bases
 from experiments.command import run_script
 from experiments.real.faults import FAULTS, most_different

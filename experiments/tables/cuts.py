@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from anytouch_jax.data.background.contact import contact_scores, mark_contact
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.prepare.contact import contact_scores, mark_contact
 from anytouch_jax.evaluate.retrieval import deepest_rows
 
 MADE = "manifest.parquet"

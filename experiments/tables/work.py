@@ -24,10 +24,10 @@ import anytouch_jax
 from anytouch_jax.config import Config, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, lock
-from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.dataset import VERSION, simulate
 from anytouch_jax.sim.scene import Scenes as Simulated
 from anytouch_jax.sim.scene import objects_and_splits
+from anytouch_jax.training import pretrain
 from experiments.benchmarks import machine
 from experiments.tables import cuts, plan, scores
 from experiments.tables.cuts import content_hash

@@ -19,7 +19,7 @@ from std_msgs.msg import Bool, Float32MultiArray, Header
 import anytouch_jax as at
 from anytouch_jax.data.images import decode
 from anytouch_jax.encoder.linear_head import ContactGate
-from anytouch_jax.encoder.stream import open_source, stream
+from anytouch_jax.live.stream import open_source, stream
 
 
 def wrench(fields, header: Header) -> WrenchStamped:

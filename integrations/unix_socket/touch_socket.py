@@ -54,7 +54,7 @@ if __name__ == "__main__":
     import anytouch_jax as at
     from anytouch_jax.data.images import decode
     from anytouch_jax.encoder.linear_head import ContactGate
-    from anytouch_jax.encoder.stream import open_source, stream
+    from anytouch_jax.live.stream import open_source, stream
 
     parser = argparse.ArgumentParser(description=__doc__)
     for name, count in {"camera": None, "sensor": None, "address": None, "background": "?"}.items():

@@ -17,22 +17,22 @@ _HOMES = {
     "train.step": "TrainState init_state make_step",
     "train.optim": "optimizer",
     "train.loop": "fit",
-    "pretrain": "pretrain",
+    "training": "pretrain",
     "sim.recorder": "simulate_touch",
     "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",
-    "data.gels": "untouched_gel",
+    "data.background.rule": "untouched_gel",
     "data.loading.loader": "Loader",
     "data.manifest.manifest": "Manifest",
     "weights.registry": "list_encoders",
     "weights.tree": "interpolate",
     "encoder.base": "Preprocess",
     "encoder.encoder": "Encoder example_touches load_encoder random_encoder",
-    "encoder.family": "FamilyEncoder",
+    "zoo.encoder": "FamilyEncoder",
     "encoder.linear_head": "load_head",
 }
 _ALIASES = {  # public names that say more outside their module
-    "load_exported": ("encoder.export", "load"),
+    "load_exported": ("export.export", "load"),
     "read_manifest": ("data.manifest.manifest", "read"),
 }
 _HOME = {

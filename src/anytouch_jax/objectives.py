@@ -17,9 +17,9 @@ from jax import Array
 
 from anytouch_jax.batch import AlignBatch, FieldBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import CLIP_MEAN, CLIP_STD, IMAGENET_MEAN, IMAGENET_STD, Config
+from anytouch_jax.fields.outputs import FORCE, LENGTH, STRESS, TORQUE
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.ops import losses, tokens
-from anytouch_jax.ops.fields import FORCE, LENGTH, STRESS, TORQUE
 
 Params = dict[str, Any]
 Metrics = dict[str, Array]

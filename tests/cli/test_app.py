@@ -18,7 +18,7 @@ from anytouch_jax.cli.train import Sections
 from anytouch_jax.config import preset
 from anytouch_jax.config.parsing import Range
 from anytouch_jax.errors import UserError
-from anytouch_jax.view import server
+from anytouch_jax.live.page import server
 
 HELP = """
 import contextlib, io, json, sys

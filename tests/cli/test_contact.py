@@ -95,7 +95,7 @@ def test_marks_that_are_known_are_kept_reported_and_cannot_be_moved(
         edit(words, pressed, **{"label.contact": [*known[:4], "yes", *known[5:]]}),
     )
     assert "line 6 of" in named and "'yes'" in named
-    scores = "anytouch_jax.data.prepare.contact.contact_scores"
+    scores = "anytouch_jax.data.background.contact.contact_scores"
     monkeypatch.setattr(scores, lambda *_, **__: pytest.fail("scored in vain"))
     assert "--share" in mistake("data", "contact", tmp_path / "m.parquet", "--share", 0.6)
 

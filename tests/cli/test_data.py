@@ -16,8 +16,8 @@ from anytouch_jax.cli.data import DatasetOptions
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import close_shards
-from anytouch_jax.data.prepare import verify
-from anytouch_jax.data.readers import READERS, IndexOptions
+from anytouch_jax.datasets import verify
+from anytouch_jax.datasets.readers import READERS, IndexOptions
 from anytouch_jax.sim import dataset
 
 

@@ -9,9 +9,9 @@ from films import write_film
 from tiny_models import touch_model
 
 from anytouch_jax.config import SENSORS, to_json
-from anytouch_jax.encoder import export
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import CheckError
+from anytouch_jax.export import export
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import load, safetensors
 from anytouch_jax.weights.safetensors import export_safetensors

@@ -10,7 +10,7 @@ from safetensors.numpy import save_file
 from touch_world import make_touches
 
 from anytouch_jax import load_encoder
-from anytouch_jax.encoder import export
+from anytouch_jax.export import export
 from tests.weights import test_families as forms
 from tests.weights.test_start import mae
 

@@ -7,12 +7,12 @@ from anytouch_jax.cli.output import check_folder, check_home
 from anytouch_jax.errors import UserError
 
 WORK = {
-    "contact": "anytouch_jax.data.prepare.contact.contact_scores",
-    "verify": "anytouch_jax.data.prepare.verify.verify",
+    "contact": "anytouch_jax.data.background.contact.contact_scores",
+    "verify": "anytouch_jax.datasets.verify.verify",
     "export": "anytouch_jax.encoder.encoder.load_encoder",
     "label": "anytouch_jax.evaluate.probing.probe_label",
     "retrieve": "anytouch_jax.data.manifest.manifest.read",
-    "annotate": "anytouch_jax.data.prepare.captions.annotate",
+    "annotate": "anytouch_jax.datasets.captions.annotate",
     "report": "anytouch_jax.evaluate.report.demo_report",
     "adapt": "anytouch_jax.data.manifest.manifest.read",
 }

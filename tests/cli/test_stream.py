@@ -10,7 +10,7 @@ from faulty_camera import FaultyCamera, write_uneven_video
 from films import write_film
 from measuring import measuring_weights
 
-from anytouch_jax.encoder import stream as streams
+from anytouch_jax.live import stream as streams
 
 
 @pytest.fixture(scope="module")

@@ -16,16 +16,16 @@ from anytouch_jax.config import Config
 from anytouch_jax.encoder import base
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.encoder.export import export, load
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead, fit_head
 from anytouch_jax.evaluate.reconstruction import reconstruction_panels
+from anytouch_jax.export.export import export, load
 from anytouch_jax.nn.functional import build
-from anytouch_jax.pretrain import pretrain
 from anytouch_jax.sim.recorder import simulate_touch
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step
+from anytouch_jax.training import pretrain
 
 RNG = np.random.default_rng(0)
 FRAMES = RNG.integers(0, 256, (70, 1, 28, 28, 3), np.uint8)

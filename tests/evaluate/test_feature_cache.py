@@ -13,7 +13,7 @@ from tiny_models import tiny_config
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.prepare.shards import pack
+from anytouch_jax.datasets.shards import pack
 from anytouch_jax.encoder.encoder import Encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache

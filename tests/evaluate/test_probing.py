@@ -12,7 +12,7 @@ from touch_world import make_touches
 
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.datasets.readers import IndexOptions, index
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.encoder.linear_head import load_head
 from anytouch_jax.errors import UserError

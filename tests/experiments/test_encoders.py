@@ -4,7 +4,7 @@ from touch_world import make_touches
 
 from anytouch_jax.config import from_json, to_json
 from anytouch_jax.nn.functional import build
-from anytouch_jax.simulated import SIMULATED
+from anytouch_jax.sim.batches import SIMULATED
 from anytouch_jax.weights.tree import flatten
 from experiments.encoders import lookalikes, motion
 from experiments.encoders.train import configure

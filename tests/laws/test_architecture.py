@@ -376,7 +376,7 @@ def _loaded_after_each(modules: list[str]) -> dict[str, set[str]]:
 def test_a_public_name_stays_callable_when_its_module_is_imported() -> None:
     """`pretrain` is a module and the function in it: the import of one hides the other."""
     import anytouch_jax as at
-    import anytouch_jax.pretrain
+    import anytouch_jax.training
 
     assert callable(at.pretrain)
     with pytest.raises(TypeError, match="missing"):

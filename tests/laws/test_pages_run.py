@@ -32,8 +32,8 @@ from touch_world import make_touches, picture, tint
 import anytouch_jax as at
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder import stream as streams
-from anytouch_jax.encoder.stream import Mailbox
+from anytouch_jax.live import stream as streams
+from anytouch_jax.live.stream import Mailbox
 from anytouch_jax.sim import dataset
 from anytouch_jax.sim.sensing.sensors import SENSORS, bases
 from tests.data.readers import test_bags, test_corpora, test_lerobot

@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 from tiny_models import STACK, compiled, full_model, touch_model
 
-from anytouch_jax.nn.fields import convolved
+from anytouch_jax.fields.module import convolved
 from anytouch_jax.nn.functional import build
 from anytouch_jax.nn.layers import gelu, read_blocks, run_blocks, stacked_blocks, stored
 

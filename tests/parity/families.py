@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax import load_encoder
-from anytouch_jax.encoder.family import FamilyEncoder, prepare
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Vit
-from anytouch_jax.weights import families
 from anytouch_jax.weights.convert import check_arrays, file_shapes
+from anytouch_jax.zoo import families
+from anytouch_jax.zoo.encoder import FamilyEncoder, prepare
 from tests.parity.golden_files import Case
 
 # Inside the encoder, or of heads and decoders that are no part of it.

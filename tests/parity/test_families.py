@@ -13,7 +13,7 @@ from safetensors.numpy import load_file, save_file
 
 from anytouch_jax import load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.weights import families
+from anytouch_jax.zoo import families
 from tests.parity import cases
 from tests.parity.golden_files import read_cases
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.readers import IndexReport
+from anytouch_jax.datasets.readers import IndexReport
 
 PIXELS = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
 BYTES = {ending: cv2.imencode(ending, PIXELS)[1].tobytes() for ending in (".png", ".jpg")}

@@ -13,8 +13,8 @@ import numpy as np
 from tiny_models import tiny_config
 
 from anytouch_jax.config import Config
-from anytouch_jax.pretrain import pretrain
 from anytouch_jax.train.loop import FitResult
+from anytouch_jax.training import pretrain
 from anytouch_jax.weights.tree import flatten
 
 # the fields of a line that differ between equal runs

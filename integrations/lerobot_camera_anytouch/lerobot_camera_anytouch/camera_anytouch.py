@@ -13,10 +13,10 @@ from lerobot.cameras.camera import Camera
 from lerobot.cameras.opencv import OpenCVCamera, OpenCVCameraConfig
 
 from anytouch_jax import Encoder, load_encoder
-from anytouch_jax.data.gels import RunningGel
+from anytouch_jax.data.background.rule import RunningGel
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.transforms import orient_frame, subtract_background
-from anytouch_jax.encoder.fields import Fields, Measure
+from anytouch_jax.fields.measure import Fields, Measure
 from lerobot_camera_anytouch.config_anytouch import AnyTouchCameraConfig
 from lerobot_camera_anytouch.film import FilmCamera
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from anytouch_jax.bars import bar
 from anytouch_jax.cli import output
 from anytouch_jax.config.parsing import (
     Above0,
@@ -31,9 +30,10 @@ from anytouch_jax.config.parsing import (
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
+from anytouch_jax.progress import bar
 
 if TYPE_CHECKING:
-    from anytouch_jax.data.prepare.captions import CaptionResult, CostEstimate, Endpoint
+    from anytouch_jax.datasets.captions import CaptionResult, CostEstimate, Endpoint
     from anytouch_jax.sim.scene import Scenes
 
 
@@ -231,7 +231,7 @@ class DatasetOptions:
 
 def run_index(options: DatasetOptions) -> int:
     """Read the dataset, write its manifest, and print the counts with the paper's."""
-    from anytouch_jax.data import readers
+    from anytouch_jax.datasets import readers
 
     place = ("name", "root", "out", "keep")
     settings = readers.IndexOptions(
@@ -289,8 +289,8 @@ def run_contact(options: ContactOptions) -> int:
     """
     import numpy as np
 
+    from anytouch_jax.data.background import contact
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.data.prepare import contact
 
     if not options.check:
         output.refuse_unused(options, ("reference", "above"), "without --check")
@@ -385,7 +385,7 @@ class VerifyOptions:
 def run_verify(options: VerifyOptions) -> int:
     """Print the report; 1 if errors remain."""
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.data.prepare import verify
+    from anytouch_jax.datasets import verify
 
     if options.swap and options.repair is None:
         raise UserError(
@@ -490,8 +490,8 @@ _WITH_CAPTIONS = ("manifest", "out", "captions", "key", "overwrite", "sheet_coun
 def run_annotate(options: AnnotateOptions) -> int:
     """Estimate, ask for consent, annotate, and write the manifest with its captions."""
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.data.prepare.captions import annotate, sample_sheet
-    from anytouch_jax.data.prepare.prompts import attach_text
+    from anytouch_jax.datasets.captions import annotate, sample_sheet
+    from anytouch_jax.datasets.prompts import attach_text
 
     if options.captions is not None:
         asking = [name for name in vars(options) if name not in _WITH_CAPTIONS]
@@ -548,7 +548,7 @@ def run_annotate(options: AnnotateOptions) -> int:
 
 
 def _endpoint(options: AnnotateOptions) -> Endpoint:
-    from anytouch_jax.data.prepare.captions import Endpoint
+    from anytouch_jax.datasets.captions import Endpoint
 
     _, _, *names = (field.name for field in fields(Endpoint))
     return Endpoint(options.url, options.vlm, **{name: getattr(options, name) for name in names})
@@ -611,7 +611,7 @@ class PackOptions:
 def run_pack(options: PackOptions) -> int:
     """Pack the files, or continue an interrupted pack."""
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.data.prepare.shards import pack
+    from anytouch_jax.datasets.shards import pack
 
     manifest = manifests.read(options.manifests)
     folder = options.out or output.default_target(options.manifests[0], "packed", "")

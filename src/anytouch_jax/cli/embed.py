@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from anytouch_jax.bars import tracked
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.config.parsing import Count
 from anytouch_jax.errors import UserError
+from anytouch_jax.progress import tracked
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from anytouch_jax.data.gels import UnitGels
+    from anytouch_jax.data.background.rule import UnitGels
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.embed import Features
@@ -227,7 +227,7 @@ def frames_input(
 
     It logs the gel.
     """
-    from anytouch_jax.data.gels import as_taken
+    from anytouch_jax.data.background.rule import as_taken
     from anytouch_jax.encoder.base import Preprocess
     from anytouch_jax.encoder.linear_head import ContactGate
 
@@ -262,7 +262,7 @@ def choose_gel(
     folder, or the median of the frames. It is None for a camera, and for an encoder that does
     without. Raises UserError for too few frames.
     """
-    from anytouch_jax.data import gels
+    from anytouch_jax.data.background import rule as gels
     from anytouch_jax.data.images import BACKGROUND, decode, list_images
 
     stored = list_images(data)[1].get(BACKGROUND) if data.is_dir() else None
@@ -307,7 +307,7 @@ def _some_frames(data: Path) -> Iterator[np.ndarray]:
     from contextlib import suppress
 
     from anytouch_jax.data import images
-    from anytouch_jax.data.gels import FRAMES
+    from anytouch_jax.data.background.rule import FRAMES
 
     if (files := images.picture_files(data)) is None:
         yield from images.frames_from_video(data)
@@ -319,7 +319,7 @@ def _some_frames(data: Path) -> Iterator[np.ndarray]:
 
 def gels_of(preprocess: Preprocess, options: FrameOptions) -> dict[str, np.ndarray]:
     """Return the untouched gel that was subtracted, upright, by the name of the sensor."""
-    from anytouch_jax.data.gels import reduced
+    from anytouch_jax.data.background.rule import reduced
     from anytouch_jax.data.transforms import orient_frame
 
     if (gel := preprocess.background) is None:
@@ -351,7 +351,7 @@ def _embed_manifest(
 ) -> Features:
     import numpy as np
 
-    from anytouch_jax.data.gels import UnitGels
+    from anytouch_jax.data.background.rule import UnitGels
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import embed as embedding
 
@@ -412,8 +412,8 @@ def contact_of_rows(
     """Return the contact of `rows` (n,): label.contact, or by the untouched gel; NaN if unknown."""
     import numpy as np
 
-    from anytouch_jax.data.gels import UnitGels
-    from anytouch_jax.data.prepare import contact
+    from anytouch_jax.data.background import contact
+    from anytouch_jax.data.background.rule import UnitGels
 
     known = contact.known_contact(manifest)[rows]
     limits = contact.threshold_of_rows(manifest, None, 0.0)[rows]
@@ -429,7 +429,7 @@ def _write_columns(root: Path, column: str, features: Features) -> None:
     """
     import numpy as np
 
-    from anytouch_jax.data.readers.lerobot import camera_names, write_features
+    from anytouch_jax.datasets.readers.lerobot import camera_names, write_features
 
     if "index" not in features.keys or not (root / "meta" / "info.json").is_file():
         raise UserError(

@@ -100,7 +100,7 @@ def run(options: ExportOptions) -> int:
             "neither."
         )
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.encoder.export import describes, export
+    from anytouch_jax.export.export import describes, export
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_folder(options.out, read=(options.model, *options.data), suffix=".onnx" if onnx else "")
@@ -141,10 +141,10 @@ def _calibration(encoder: Encoder, options: ExportOptions) -> dict[str, Any]:
     import numpy as np
 
     from anytouch_jax.cli.embed import usable_rows
-    from anytouch_jax.data.gels import UnitGels
+    from anytouch_jax.data.background.rule import UnitGels
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
-    from anytouch_jax.encoder.engines import CALIBRATION
+    from anytouch_jax.export.engines import CALIBRATION
 
     manifest = manifests.read(options.data)
     clips = list[np.ndarray]()

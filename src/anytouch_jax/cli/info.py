@@ -15,7 +15,7 @@ from anytouch_jax.errors import UserError, shorten
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
-    from anytouch_jax.encoder.health import UnitHealth
+    from anytouch_jax.live.health import UnitHealth
     from anytouch_jax.weights.keymaps import Weights
 
 _TABLES = (".csv", ".parquet")
@@ -59,8 +59,8 @@ def _health(options: InfoOptions) -> int:
     Exit status 1 reports a fault.
     """
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder import health
     from anytouch_jax.evaluate.statistics import markdown_table
+    from anytouch_jax.live import health
 
     check_folder(options.picture, "--picture", read=options.paths, suffix=".png")
     table = manifests.read(options.paths)
@@ -103,7 +103,7 @@ def _seen_by(model: Path, table: Manifest, unit: UnitHealth) -> UnitHealth:
     from anytouch_jax.cli.embed import contact_of_rows
     from anytouch_jax.encoder.embed import embed_rows
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.encoder.health import contact_visible
+    from anytouch_jax.live.health import contact_visible
 
     here = (table.text_column("sensor") == unit.sensor) & (table.text_column("unit") == unit.unit)
     rows = np.flatnonzero(here & (table.text_column("split") != "background"))
@@ -129,7 +129,7 @@ def _lines(path: Path) -> list[str]:
     if str(path) in registry.list_encoders():
         return [_named(str(path)), *_weights(registry.locate(path))]
     if str(path) == "cameras":
-        from anytouch_jax.data.cameras import list_cameras
+        from anytouch_jax.live.cameras import list_cameras
 
         return [line for camera in list_cameras() for line in camera.lines()] or [
             "no camera is connected"
@@ -140,18 +140,18 @@ def _lines(path: Path) -> list[str]:
     description = path.with_name(f"{path.name}.json")
     weights = None
     if path.is_dir() or (suffix in _WEIGHTS and suffix != ".npz" and not description.is_file()):
-        from anytouch_jax.weights.families import load_family
+        from anytouch_jax.zoo.families import load_family
 
         model, weights = load_family(path)
         if model is not None:
-            from anytouch_jax.encoder.family import describe_family, family_encoder
+            from anytouch_jax.zoo.encoder import describe_family, family_encoder
 
             lines = describe_family(family_encoder(model, str(path), path))
             return [f"{path}: {lines[0]}", *lines[1:]]
     if path.is_dir():
         return _folder(path)
     if description.is_file():
-        from anytouch_jax.encoder.export import read_checked
+        from anytouch_jax.export.export import read_checked
 
         read_checked(path)
         return [f"{path}: an exported encoder", description.read_text("utf-8").strip()]
@@ -175,7 +175,7 @@ def _pictures(path: Path) -> list[str]:
     import cv2
 
     from anytouch_jax.data import images
-    from anytouch_jax.data.cameras import format_of
+    from anytouch_jax.live.cameras import format_of
 
     use = "use it with embed and view"
     if (files := images.picture_files(path)) is not None:

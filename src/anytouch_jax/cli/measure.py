@@ -12,17 +12,17 @@ from itertools import groupby, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from anytouch_jax.bars import tracked
 from anytouch_jax.cli import embed
 from anytouch_jax.cli.output import check_apart, check_folder, log
 from anytouch_jax.config.parsing import Above0
 from anytouch_jax.errors import UserError
+from anytouch_jax.progress import tracked
 
 if TYPE_CHECKING:
     import numpy as np
 
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.fields import Fields
+    from anytouch_jax.fields.measure import Fields
 
 _BATCH = 16  # frames, which are whole pictures of the camera
 
@@ -63,8 +63,8 @@ def run(options: MeasureOptions) -> int:
     """Write maps, numbers, and if asked a film and a surface."""
     import numpy as np
 
-    from anytouch_jax.encoder import fields
     from anytouch_jax.encoder.encoder import load_encoder
+    from anytouch_jax.fields import measure as fields
     from anytouch_jax.files import atomic_path
 
     is_manifest = embed.takes_manifest(options, options.data, ("split",))
@@ -204,7 +204,7 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     """
     import numpy as np
 
-    from anytouch_jax.data.gels import UnitGels
+    from anytouch_jax.data.background.rule import UnitGels
     from anytouch_jax.data.images import decode
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder.embed import rows_with_gel

@@ -84,7 +84,7 @@ def run_retrieve(options: RetrieveOptions) -> int:
         raise UserError("Give a manifest with --data, or features to search in with --index.")
     import numpy as np
 
-    from anytouch_jax.data.gels import UnitGels
+    from anytouch_jax.data.background.rule import UnitGels
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.encoder import encoder as features

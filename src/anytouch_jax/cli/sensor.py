@@ -41,8 +41,8 @@ class FitOptions:
 def run_fit(options: FitOptions) -> int:
     """Fit a sensor and write its folder."""
     from anytouch_jax.data.images import decode, list_images, to_rgb
-    from anytouch_jax.fitting.fit import check_name, fit_sensor
-    from anytouch_jax.fitting.touches import compare
+    from anytouch_jax.sim.fitting.fit import check_name, fit_sensor
+    from anytouch_jax.sim.fitting.touches import compare
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_name(options.name)
@@ -158,7 +158,7 @@ def run_adapt(options: AdaptOptions) -> int:
 def _simulated(options: AdaptOptions) -> int:
     """Train the tokens of a sensor of `anytouch sensor fit`."""
     from anytouch_jax.encoder.adapt import save
-    from anytouch_jax.fitting.tokens import adapt_by_simulation
+    from anytouch_jax.sim.fitting.tokens import adapt_by_simulation
 
     state = options.out.with_name(f"{options.out.name}.part.npz")
     log("compiling the simulator: about two minutes at first")

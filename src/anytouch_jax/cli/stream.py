@@ -18,11 +18,11 @@ from anytouch_jax.config.parsing import Above0, Count, NotNegative, Range
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from anytouch_jax.data.cameras import CameraSettings
     from anytouch_jax.encoder.linear_head import LinearHead
-    from anytouch_jax.encoder.stream import Embedded
-    from anytouch_jax.view.live import Live
-    from anytouch_jax.view.server import Source
+    from anytouch_jax.live.cameras import CameraSettings
+    from anytouch_jax.live.page.live import Live
+    from anytouch_jax.live.page.server import Source
+    from anytouch_jax.live.stream import Embedded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class CameraOptions:
 
     def settings(self) -> CameraSettings:
         """Return the settings. Raises UserError for a format that is not four letters."""
-        from anytouch_jax.data.cameras import CameraSettings
+        from anytouch_jax.live.cameras import CameraSettings
 
         form = self.camera_format
         if form is not None and not (len(form) == 4 and form.isascii() and form.isalnum()):
@@ -88,8 +88,8 @@ def run_stream(options: StreamOptions) -> int:
     if not options.fields:
         refuse_unused(options, ("width_mm",), "without --fields")
     from anytouch_jax.data.images import decode
-    from anytouch_jax.encoder import stream
     from anytouch_jax.encoder.embed import Features
+    from anytouch_jax.live import stream
 
     # first: it fails within a second
     source, live = stream.open_source(options.data, settings, log)
@@ -206,14 +206,14 @@ class ViewOptions(CameraOptions):
 def run_view(options: ViewOptions) -> int:
     """Serve the page until Ctrl-C."""
     try:
-        from anytouch_jax.view import server
+        from anytouch_jax.live.page import server
     except ModuleNotFoundError as error:
         if error.name not in ("starlette", "uvicorn"):
             raise
         raise UserError(
             'The page needs starlette and uvicorn: pip install "anytouch_jax[view]"'
         ) from None
-    from anytouch_jax.data.cameras import camera_of
+    from anytouch_jax.live.cameras import camera_of
 
     tables = (".csv", ".parquet", ".npz")
     played = [
@@ -255,8 +255,8 @@ def run_view(options: ViewOptions) -> int:
 def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Live:
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.linear_head import load_head
+    from anytouch_jax.live.page.live import Live
     from anytouch_jax.train.mesh import enable_compilation_cache
-    from anytouch_jax.view.live import Live
 
     enable_compilation_cache()
     if str(options.model) == DEFAULT:

@@ -136,9 +136,9 @@ def run(request: TrainRequest) -> int:
     """Train or continue, alone or as one of several processes; 0 after SIGTERM and 130 after
     Ctrl-C, both saved.
     """
-    from anytouch_jax.pretrain import pretrain
     from anytouch_jax.train.mesh import enable_compilation_cache, joined
     from anytouch_jax.train.progress import terminating
+    from anytouch_jax.training import pretrain
 
     options = request[0]
     config = _with_own_sensors(request[1])

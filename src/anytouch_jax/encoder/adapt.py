@@ -17,9 +17,8 @@ import numpy as np
 import optax
 import pyarrow as pa
 
-from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, check_spelling, to_json
-from anytouch_jax.data.gels import UnitGels
+from anytouch_jax.data.background.rule import UnitGels
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Log, unit_rows
@@ -32,10 +31,11 @@ from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
+from anytouch_jax.progress import tracked
 from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import checkpoint, convert, registry
-from anytouch_jax.weights.families import load_family
 from anytouch_jax.weights.load import Loaded, load_model
+from anytouch_jax.zoo.families import load_family
 
 Params = dict[str, Any]
 Loss = Callable[[Params, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32)

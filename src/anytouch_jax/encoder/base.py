@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
-from anytouch_jax.data.gels import RunningGel, other_unit, same_unit, untouched_gel
+from anytouch_jax.data.background.rule import RunningGel, other_unit, same_unit, untouched_gel
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
 from anytouch_jax.data.transforms import (
@@ -32,14 +32,14 @@ from anytouch_jax.data.transforms import (
 )
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import BATCH, Join, Log, Pooling, warn
-from anytouch_jax.encoder.engines import EngineChoice
-from anytouch_jax.encoder.fields import Fields, Measure, missing, scale_of
 from anytouch_jax.errors import UserError, refuse_forked
+from anytouch_jax.export.engines import EngineChoice
+from anytouch_jax.fields.measure import Fields, Measure, missing, scale_of
+from anytouch_jax.fields.outputs import FieldOutput
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_image, normalise_touch
 from anytouch_jax.ops import losses
-from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import count_of, described, leaves
 
 Params = dict[str, Any]

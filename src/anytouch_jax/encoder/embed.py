@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from anytouch_jax.bars import tracked
-from anytouch_jax.data.gels import ADVICE, UnitGels, gel_arrays, gels_of_arrays
+from anytouch_jax.data.background.rule import ADVICE, UnitGels, gel_arrays, gels_of_arrays
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import (
@@ -30,6 +29,7 @@ from anytouch_jax.encoder.arrays import (
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, read_arrays
+from anytouch_jax.progress import tracked
 from anytouch_jax.shown import described, shown_short
 
 if TYPE_CHECKING:

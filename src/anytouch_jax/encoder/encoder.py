@@ -17,18 +17,18 @@ import numpy as np
 
 from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.data.images import decode
-from anytouch_jax.encoder import export
 from anytouch_jax.encoder.arrays import METADATA, Join, Pooling, check_frames, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips, random_encoder, touch_features, touch_only
-from anytouch_jax.encoder.engines import Engine, EngineChoice
-from anytouch_jax.encoder.family import family_encoder
-from anytouch_jax.encoder.fields import missing
 from anytouch_jax.errors import UserError, refuse_forked
+from anytouch_jax.export import export
+from anytouch_jax.export.engines import Engine, EngineChoice
+from anytouch_jax.fields.measure import missing
+from anytouch_jax.fields.outputs import FieldOutput
 from anytouch_jax.files import read_arrays
-from anytouch_jax.ops.fields import FieldOutput
 from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import load, registry
-from anytouch_jax.weights.families import Size, load_family
+from anytouch_jax.zoo.encoder import family_encoder
+from anytouch_jax.zoo.families import Size, load_family
 
 __all__ = [
     "Encoder",

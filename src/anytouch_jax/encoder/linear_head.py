@@ -19,9 +19,9 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.special import expit, log_softmax, softmax
 
-from anytouch_jax.data.gels import gel_arrays, gels_of_arrays
-from anytouch_jax.data.prepare.contact import DEFAULT_THRESHOLD, THRESHOLDS
-from anytouch_jax.data.prepare.untouched_gel import UntouchedGel
+from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
+from anytouch_jax.data.background.estimate import UntouchedGel
+from anytouch_jax.data.background.rule import gel_arrays, gels_of_arrays
 from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, check_array, read_arrays

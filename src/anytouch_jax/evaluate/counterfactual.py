@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.data.gels import UnitGels
+from anytouch_jax.data.background.rule import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Log

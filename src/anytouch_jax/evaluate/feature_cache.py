@@ -17,7 +17,7 @@ import numpy as np
 from sklearn.decomposition import PCA
 
 from anytouch_jax.config import preset
-from anytouch_jax.data.gels import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, UnitGels
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest, distinct_files

@@ -15,12 +15,12 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 from threadpoolctl import ThreadpoolController
 
-from anytouch_jax.bars import tracked
 from anytouch_jax.encoder.arrays import binary_scale, unit_rows
 from anytouch_jax.encoder.embed import nearest
 from anytouch_jax.encoder.linear_head import LinearHead
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.evaluate.statistics import Array
+from anytouch_jax.progress import tracked
 from anytouch_jax.shown import shown_short
 
 if TYPE_CHECKING:

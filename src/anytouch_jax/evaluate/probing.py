@@ -21,8 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.bars import tracked
-from anytouch_jax.data.gels import UnitGels
+from anytouch_jax.data.background.rule import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Join, Log, Pooling
@@ -43,6 +42,7 @@ from anytouch_jax.evaluate.statistics import (
 )
 from anytouch_jax.evaluate.tasks import Task, TaskRows
 from anytouch_jax.files import atomic_write
+from anytouch_jax.progress import tracked
 from anytouch_jax.shown import shown_short
 
 Subsets = Mapping[str, Array]

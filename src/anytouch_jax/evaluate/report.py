@@ -16,15 +16,14 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from anytouch_jax.bars import tracked
 from anytouch_jax.config import FIELD_SENSORS
-from anytouch_jax.data.gels import UnitGels
+from anytouch_jax.data.background.contact import known_contact
+from anytouch_jax.data.background.rule import UnitGels
 from anytouch_jax.data.images import decode, encode
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
@@ -39,6 +38,7 @@ from anytouch_jax.evaluate.retrieval import contact_vector, deepest_rows
 from anytouch_jax.evaluate.statistics import Array
 from anytouch_jax.evaluate.tasks import best_rows
 from anytouch_jax.files import atomic_write
+from anytouch_jax.progress import tracked
 
 Change = tuple[float, float | None, float | None]  # a difference with its interval
 

@@ -12,12 +12,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.bars import tracked
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads
 from anytouch_jax.evaluate.heads import FittedHead, ProbeHead
 from anytouch_jax.evaluate.statistics import Array, Protocol
 from anytouch_jax.evaluate.tasks import Task, TaskRows, label_text
+from anytouch_jax.progress import tracked
 
 Sides = Mapping[str, Sequence[str] | None]  # names or patterns by SIDES
 

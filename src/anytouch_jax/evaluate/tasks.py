@@ -15,9 +15,9 @@ import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.config import FIELD_SENSORS
+from anytouch_jax.data.background.contact import known_contact
 from anytouch_jax.data.manifest.manifest import KEYS, Manifest
 from anytouch_jax.data.manifest.schema import EMPTY, spellings
-from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import GradientRecipe

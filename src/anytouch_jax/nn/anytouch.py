@@ -12,8 +12,8 @@ from flax import nnx
 from jax import Array
 
 from anytouch_jax.config import ModelConfig
+from anytouch_jax.fields.module import STATES, FieldDecoder, FieldOutput
 from anytouch_jax.nn.clip import ImageTower, Lora, TextEncoder
-from anytouch_jax.nn.fields import STATES, FieldDecoder, FieldOutput
 from anytouch_jax.nn.layers import Dense, Mlp, gelu, rows_of, table
 from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
 from anytouch_jax.ops import tokens

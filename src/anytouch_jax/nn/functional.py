@@ -20,9 +20,9 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from anytouch_jax.config import ModelConfig
+from anytouch_jax.fields.module import FieldOutput
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.clip import merge_lora
-from anytouch_jax.nn.fields import FieldOutput
 from anytouch_jax.ops import losses, tokens
 from anytouch_jax.shown import shown_short
 

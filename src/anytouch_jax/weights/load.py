@@ -27,8 +27,8 @@ from anytouch_jax.weights.convert import (
 )
 from anytouch_jax.weights.keymaps import Weights, param_shapes
 from anytouch_jax.weights.safetensors import Loaded, WeightsError
-from anytouch_jax.weights.torch_file import read_torch
 from anytouch_jax.weights.tree import flatten
+from anytouch_jax.zoo.torch_file import read_torch
 
 Params = dict[str, Any]
 

@@ -10,8 +10,8 @@ from refused import refused
 from anytouch_jax.config import preset
 from anytouch_jax.data.manifest import content, schema
 from anytouch_jax.data.manifest import manifest as m
-from anytouch_jax.data.prepare.prompts import attach_text
-from anytouch_jax.data.prepare.verify import verify
+from anytouch_jax.datasets.prompts import attach_text
+from anytouch_jax.datasets.verify import verify
 
 HEAD = "path,sensor,sequence,frame_index,split"
 

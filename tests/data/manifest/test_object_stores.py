@@ -17,7 +17,7 @@ from refused import refused
 
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import files
-from anytouch_jax.data.readers import IndexOptions, index
+from anytouch_jax.datasets.readers import IndexOptions, index
 from tests.data.loading.test_parts import config
 from tests.data.manifest.test_containers import write_tar
 

@@ -14,7 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config
-from anytouch_jax.data.gels import ADVICE, UnitGels
+from anytouch_jax.data.background.contact import known_contact
+from anytouch_jax.data.background.rule import ADVICE, UnitGels
 from anytouch_jax.data.loading.sampling import (
     EpochSampler,
     Matches,
@@ -24,7 +25,6 @@ from anytouch_jax.data.loading.sampling import (
     is_shared_touch,
 )
 from anytouch_jax.data.manifest.manifest import Manifest, ManifestError, sensor_rows
-from anytouch_jax.data.prepare.contact import known_contact
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
 from anytouch_jax.errors import UserError
 

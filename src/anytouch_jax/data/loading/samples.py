@@ -17,7 +17,7 @@ import numpy as np
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data import transforms
-from anytouch_jax.data.gels import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows

@@ -1,0 +1,1 @@
+"""Background images: the rule that finds one for each frame, estimates, contact filter and dots."""

@@ -1,1 +1,0 @@
-"""Tools that prepare a manifest for training."""

@@ -1,0 +1,1 @@
+"""Exported encoders: jax programs, ONNX, and engines that run them."""

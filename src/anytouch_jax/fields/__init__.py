@@ -1,0 +1,1 @@
+"""Fields: the head that measures depth, shear, contact and force."""

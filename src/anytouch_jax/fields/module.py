@@ -1,0 +1,168 @@
+"""Decoder of fields: depth, shear, contact and force from the states of the touch encoder and from
+its pixels.
+
+Every output is free of scale: lengths are shares of the picture's width, stresses shares of the
+gel's modulus. So a network that was trained on units of any zoom reads a sensor of any size.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jax import Array, lax
+from jax.typing import DTypeLike
+
+from anytouch_jax.config import ModelConfig
+from anytouch_jax.fields.outputs import FORCE, LENGTH, STATES, STRESS, TORQUE, FieldOutput
+from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, product, stored, table
+
+
+def windows(x: Array, side: int, stride: int = 2) -> Array:
+    """Every `stride`th window of `side` x `side` pixels (odd) of x (B, H, W, C), zeros around it:
+    (B, ceil(H / stride), ceil(W / stride), side * side * C), in the order (row, col, channel).
+    """
+    around = side // 2
+    x = jnp.pad(x, ((0, 0), (around, around), (around, around), (0, 0)))
+    ends = [size - side + 1 for size in x.shape[1:3]]
+    cut = [
+        x[:, i : i + ends[0] : stride, j : j + ends[1] : stride]
+        for i in range(side)
+        for j in range(side)
+    ]
+    return jnp.concatenate(cut, axis=-1)
+
+
+def convolved(x: Array, kernel: Array, side: int, stride: int, dtype: DTypeLike) -> Array:
+    """Convolve x (B, H, W, C) with a square kernel (side * side * C, outputs), rows in the order of
+    `windows`.
+    """
+    if (
+        jax.default_backend() != "cpu"
+    ):  # without tuning, cuDNN's gradient of so few channels takes a second
+        x = windows(x, side, stride)
+        return product(x.reshape(-1, x.shape[-1]), kernel, dtype).reshape(
+            *x.shape[:-1], kernel.shape[-1]
+        )
+    a, b = (
+        value.astype(dtype).astype(x.dtype)
+        for value in (x, kernel.reshape(side, side, x.shape[-1], -1))
+    )
+    around = [(side // 2, side // 2)] * 2
+    return lax.conv_general_dilated(
+        a, b, (stride, stride), around, dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+
+
+class Convolution(nnx.Module):
+    """A square convolution (B, H, W, C) with zeros around it, after a norm over the channels if
+    `norm`.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        side: int,
+        model: ModelConfig,
+        *,
+        stride: int = 1,
+        norm: bool = True,
+    ):
+        self.norm = LayerNorm(inputs, model.norm_eps, model.dtype) if norm else None
+        self.kernel = table(side * side * inputs, outputs)
+        self.bias = table(outputs)
+        self.side = side
+        self.stride = stride
+        self.dtype = jnp.dtype(model.dtype)
+
+    def __call__(self, x: Array) -> Array:
+        x = x if self.norm is None else gelu(self.norm(x))
+        x = convolved(
+            x.astype(stored(self.dtype)), self.kernel[...], self.side, self.stride, self.dtype
+        )
+        return x + self.bias[...].astype(x.dtype)[None, None, None]
+
+
+class FieldDecoder(nnx.Module):
+    """Patch tokens of several blocks, and a convolutional path from the pixels for sharp edges
+    (after DPT).
+
+    A deeper path on a grid of an eighth sees how slopes add up over the contact (after U-Net).
+    """
+
+    def __init__(self, model: ModelConfig) -> None:
+        few = model.fields
+        many = 2 * model.fields
+        most = 4 * model.fields
+        width = STATES * model.touch.width
+        self.read = Dense(width, many, model)
+        self.aspect = Dense(1, many, model)
+        self.stem = Convolution(6, few // 2, 5, model, stride=2, norm=False)
+        self.down = Convolution(few // 2, few, 3, model, stride=2)
+        self.middle1 = Convolution(many + few, many, 3, model)
+        self.middle2 = Convolution(many, many, 3, model)
+        self.deep = Convolution(many, most, 3, model, stride=2)
+        self.deep1, self.deep2, self.deep3, self.deep4 = (
+            Convolution(most, most, 3, model) for _ in range(4)
+        )
+        self.light = Dense(most, most, model)
+        self.up = Dense(most, many, model)
+        self.fine1 = Convolution(many + few // 2, few, 3, model)
+        self.fine2 = Convolution(few, few, 3, model)
+        self.maps = Dense(few, 7, model)
+        self.whole = Mlp(width + many, 2 * many, model, gelu, outputs=8)
+        self.special = 1 + model.sensor_tokens
+        self.grid = model.image_size // model.patch
+
+    def __call__(self, states: Array, clip: Array, aspect: Array) -> FieldOutput:
+        """Decode `states` (B, 1 + S + N, STATES * D) of normalised `clip` (B, T, H, W, 3), fields
+        of its last frame.
+
+        `aspect` (B,) is the logarithm of the height over the width that the picture shows.
+        """
+        tokens = self.read(states[:, self.special :]) + self.aspect(aspect[:, None])[:, None]
+        sharp = self.stem(jnp.concatenate([clip[:, -1], clip[:, -1] - clip[:, 0]], -1))
+        x = self.down(sharp)
+        coarse = _resized(tokens.reshape(len(clip), self.grid, self.grid, tokens.shape[-1]), x)
+        x = self.middle1(jnp.concatenate([coarse, x], -1))
+        x = x + self.middle2(x)
+        deep = self.deep(x)
+        deep = deep + self.deep1(deep)
+        deep = deep + self.deep2(deep)
+        # The whole picture shows the lights of the unit.
+        deep = deep + self.light(gelu(jnp.mean(deep, (1, 2))))[:, None, None]
+        deep = deep + self.deep3(deep)
+        deep = deep + self.deep4(deep)
+        x = x + _resized(self.up(gelu(deep)), x)
+        pooled = jnp.mean(x, (1, 2))
+        x = self.fine1(jnp.concatenate([_resized(x, sharp), sharp], -1))
+        x = x + self.fine2(x)
+        maps = self.maps(gelu(x)).astype(jnp.float32)
+        whole = self.whole(jnp.concatenate([states[:, 0], pooled.astype(states.dtype)], -1)).astype(
+            jnp.float32
+        )
+        contact = maps[..., 3]
+        pressure = STRESS * jax.nn.softplus(maps[..., 4]) * jax.nn.sigmoid(contact)
+        # The normal force is the integral of the pressure: there is none without contact.
+        normal = jnp.mean(pressure, (1, 2)) * jnp.exp(aspect)
+        force = jnp.concatenate([FORCE * whole[:, :2], normal[:, None]], -1)
+        return FieldOutput(
+            LENGTH * maps[..., 0],
+            LENGTH * maps[..., 1:3],
+            contact,
+            pressure,
+            maps[..., 5],
+            maps[..., 6],
+            force,
+            TORQUE * whole[:, 2],
+            whole[:, 3],
+            whole[:, 4:6],
+            whole[:, 6],
+            whole[:, 7],
+        )
+
+
+def _resized(x: Array, other: Array) -> Array:
+    """Resize maps (B, H, W, C) to the height and width of others."""
+    return jax.image.resize(x, (*other.shape[:3], x.shape[-1]), "linear")

@@ -1,0 +1,1 @@
+"""Live touch: cameras, streams, their health, and the page of `anytouch view`."""

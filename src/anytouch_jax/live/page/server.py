@@ -1,0 +1,423 @@
+"""The server of the page: an ASGI application with JSON, pictures and the live stream.
+
+No address names a file. Other web sites cannot read or change anything. The name of the host is
+checked, there are no CORS headers, and every change needs a header that another site cannot send.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import secrets
+import socket
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import cv2
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from anytouch_jax.config import parse_json
+from anytouch_jax.data.images import encode
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.manifest.schema import is_manifest
+from anytouch_jax.errors import UserError
+from anytouch_jax.live.cameras import list_cameras
+from anytouch_jax.live.page import tables
+from anytouch_jax.live.page.tables import (
+    LAYERS,
+    SIDE,
+    FeatureMap,
+    Run,
+    Table,
+    open_examples,
+    open_film,
+    scale_down,
+    title,
+)
+
+if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
+    from anytouch_jax.live.page.live import Live
+
+LOCAL = ("127.0.0.1", "localhost", "::1")
+# of every request that changes something: another site would need CORS to send it
+HEADER = "x-anytouch"
+_SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
+_ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' "
+    "blob: data:"
+)
+_SAFE = {
+    "Content-Security-Policy": f"{_POLICY}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+_LONGEST = 10_000  # bytes of a request body
+_TABLES = (".csv", ".parquet")
+
+Source: TypeAlias = "StartPage | Table | FeatureMap | Run | Live"
+
+
+class StartPage:
+    """The first page without anything to show: the cameras of this machine, which `open_camera`
+    opens.
+    """
+
+    kind = "start"
+    name = "start"
+
+    def __init__(self, open_camera: Callable[[str], Live]) -> None:
+        self.open_camera = open_camera
+
+    def about(self) -> dict[str, Any]:
+        """Return the cameras that are connected now."""
+        return {
+            "cameras": {
+                str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()
+            }
+        }
+
+
+def open_sources(paths: Sequence[Path]) -> list[Source]:
+    """Return what the page shows of each path: a manifest, a folder, a film, features or a run.
+
+    Raises UserError.
+
+    Features show the pictures of a table among the paths, or of the manifest in their folder that
+    they were made from.
+    """
+    tables = list[Table]()
+    sources = list[Source]()
+    features = list[Path]()
+    for path in paths:
+        if str(path) == "examples" and not path.exists():
+            tables.append(open_examples())
+        elif not path.exists():
+            raise UserError(
+                f"There is no {path}. Name a manifest, a folder, a film, features, a run or a "
+                "camera."
+            )
+        elif path.suffix.lower() == ".npz":
+            features.append(path)
+        elif path.is_dir() and (path / "metrics.jsonl").is_file():
+            sources.append(Run(path))
+        else:
+            tables.append(_open_table(path))
+    numbered = list(tables)
+    for path in features:
+        space = FeatureMap(path, numbered)
+        if space.table is None and (own := _own_manifest(path, space)) is not None:
+            numbered.append(own)
+            space = FeatureMap(path, numbered)
+        sources.append(space)
+    return [*numbered, *sources]
+
+
+def _open_table(path: Path) -> Table:
+    if path.suffix.lower() in _TABLES:
+        return Table(manifests.read(path), title(path))
+    if not path.is_dir():
+        return open_film(path)
+    inside = [
+        file
+        for file in sorted(path.iterdir())
+        if file.suffix.lower() in _TABLES and is_manifest(file)
+    ]
+    inside.sort(key=lambda file: file.stem != "manifest")
+    if inside:
+        return Table(manifests.read(inside[0]), title(inside[0]))
+    return tables.open_folder(path)
+
+
+def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
+    """Return the table that features were made from, if it lies in their folder."""
+    file = Path(space.index.about.get("input", ""))
+    inside = file.suffix.lower() in _TABLES and file.resolve().is_relative_to(
+        features.resolve().parent
+    )
+    if inside and file.is_file():
+        return Table(manifests.read(file), title(file))
+    return None
+
+
+def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
+    """Return the ASGI application of the page.
+
+    With a `token`, requests for data need it. Other names than `hosts` are refused. Cameras are
+    added to `sources`.
+    """
+
+    def source(request: Request, kind: str) -> Any:
+        number = request.path_params["source"]
+        if number >= len(sources) or sources[number].kind != kind:
+            raise UserError("There is no such source.")
+        return sources[number]
+
+    def listed(_: Request) -> Response:
+        about = [{"name": one.name, "kind": one.kind, "about": one.about()} for one in sources]
+        return _json(about)
+
+    def touch(request: Request, table: Table) -> Response:
+        filters = parse_json(request.query_params.get("filters", "{}"))
+        if not isinstance(filters, dict) or not all(
+            isinstance(value, str) for value in filters.values()
+        ):
+            raise UserError("Filters are texts by the name of their column.")
+        row = request.query_params.get("row")
+        place = (
+            _number(request, "place") if row is None else table.place_of(_number(request, "row"))
+        )
+        return _json(table.touch(place, filters))
+
+    def frame(request: Request, table: Table) -> Response:
+        view, score, fields = table.layer(request.path_params["row"], _layer(request))
+        headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
+        if fields is not None:
+            headers["X-Fields"] = json.dumps(tables.field_numbers(fields))
+        return _picture(view, headers)
+
+    def recorded(request: Request, live: Live) -> Response:
+        if live.teacher.table is None:
+            raise UserError("Nothing is recorded yet.")
+        return frame(request, live.teacher.table)
+
+    def taught(request: Request, live: Live) -> Response:
+        file = live.teacher.head_file
+        if request.path_params["file"] == "head.npz" and file.is_file():
+            return Response(file.read_bytes(), media_type="application/octet-stream", headers=_SAFE)
+        if request.path_params["file"] != "recordings.zip":
+            raise UserError("There is no such file yet.")
+        packed = live.teacher.archive()
+        blocks = iter(partial(packed.read, 1 << 20), b"")
+        return StreamingResponse(blocks, headers=_SAFE, background=BackgroundTask(packed.close))
+
+    def of(kind: str, path: str, answer: Callable[[Request, Any], Response]) -> Route:
+        return Route(
+            f"/api/{{source:int}}/{path}", lambda request: answer(request, source(request, kind))
+        )
+
+    async def control(request: Request) -> Response:
+        if request.headers.get(HEADER) is None:
+            return _json({"error": "This request did not come from the page."}, 403)
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > _LONGEST:
+                return _json({"error": "The request is too long."}, 413)
+        order = parse_json(body.decode())
+        number = request.path_params["source"]
+        if number < len(sources) and isinstance(start := sources[number], StartPage):
+            return _json({"source": await run_in_threadpool(_open, start, order, sources)})
+        await run_in_threadpool(_control, source(request, "live"), order)
+        return _json({"done": True})
+
+    def page(request: Request) -> Response:
+        name = request.path_params.get("name", "")
+        if name not in _ASSETS:
+            return Response("not found", 404, _SAFE)
+        data = (files("anytouch_jax.live.page") / (name or "page.html")).read_bytes()
+        return Response(
+            data, media_type=_ASSETS[name], headers=_SAFE | {"Cache-Control": "no-cache"}
+        )
+
+    routes = [
+        Route("/", page),
+        Route("/{name:str}", page),
+        Route("/api/sources", listed),
+        of("table", "touch", touch),
+        of("table", "frame/{row:int}", frame),
+        of(
+            "table",
+            "photo/{row:int}",
+            lambda request, table: _picture(table.photo(request.path_params["row"])),
+        ),
+        of("space", "map", lambda request, space: _json(space.map(_method(request)))),
+        of(
+            "space",
+            "colours",
+            lambda request, space: _json(
+                space.colours(_method(request), request.query_params.get("column", ""))
+            ),
+        ),
+        of(
+            "space",
+            "neighbours",
+            lambda request, space: _json(
+                space.neighbours(
+                    _number(request, "row"), others=request.query_params.get("others") == "1"
+                )
+            ),
+        ),
+        of("run", "losses", lambda request, run: _json(run.losses(_number(request, "after")))),
+        of(
+            "run",
+            "figure/{name:str}",
+            lambda request, run: _picture(run.figure(request.path_params["name"]), side=4000),
+        ),
+        of(
+            "live",
+            "stream",
+            lambda request, live: StreamingResponse(
+                live.packets(_layer(request)), media_type="application/octet-stream", headers=_SAFE
+            ),
+        ),
+        of("live", "taught", lambda _, live: _json(live.teacher.about())),
+        of("live", "recorded/{row:int}", recorded),
+        of("live", "taught/{file:str}", taught),
+        Route("/api/{source:int}/control", control, methods=["POST"]),
+    ]
+    guards = [
+        Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)),
+        Middleware(_Token, token=token),
+    ]
+    return Starlette(
+        routes=routes,
+        middleware=guards,
+        exception_handlers={UserError: _refuse, ValueError: _refuse},
+    )
+
+
+def serve(sources: list[Source], host: str, port: int, show: Callable[[str], None]) -> None:
+    """Serve the page until Ctrl-C. `show` gets its address.
+
+    Raises UserError if the port is taken.
+    """
+    is_local = host in LOCAL
+    token = "" if is_local else secrets.token_urlsafe(18)
+    config = uvicorn.Config(
+        app(sources, token=token, hosts=[*LOCAL, "[::1]"] if is_local else ["*"]),
+        host=host,
+        port=port,
+        log_level="error",
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        lifespan="off",
+    )
+    try:
+        listener = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
+    except OSError as error:
+        raise UserError(
+            f"Port {port} of {host} cannot be used: {error.strerror}. Choose another --port."
+        ) from None
+    shown = f"[{host}]" if ":" in host else host
+    show(f"http://{shown}:{listener.getsockname()[1]}/{f'#token={token}' if token else ''}")
+    try:
+        for one in _live(sources):
+            one.start()
+        uvicorn.Server(config).run([listener])
+    finally:
+        for one in _live(sources):
+            one.stop()
+        listener.close()
+
+
+def _live(sources: Sequence[Source]) -> list[Any]:
+    return [source for source in sources if source.kind == "live"]
+
+
+class _Token:
+    """Refuses requests for data without the token."""
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self._app = app
+        self._token = token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if self._token and scope["type"] == "http" and scope["path"].startswith("/api"):
+            given = dict(scope["headers"]).get(b"authorization", b"")
+            if not hmac.compare_digest(given, f"Bearer {self._token}".encode()):
+                await _json({"error": "The token is missing or wrong."}, 401)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+
+def _open(start: StartPage, order: Any, sources: list[Source]) -> int:
+    """Open the camera that the page asks for, unless it is open, and return its place.
+
+    Raises UserError.
+    """
+    camera = order.get("camera") if isinstance(order, dict) else None
+    if not isinstance(camera, str) or camera not in start.about()["cameras"]:
+        raise UserError("There is no such camera. Plug it in, and look again.")
+    for one in _live(sources):
+        if one.source == camera:
+            return sources.index(one)
+        raise UserError("One camera can be shown at a time. Start another page for the next.")
+    live = start.open_camera(camera)
+    live.start()
+    sources.append(live)
+    return len(sources) - 1
+
+
+def _control(live: Live, order: Any) -> None:
+    """Do what the page asks of a live source. Raises UserError for anything else."""
+    order = order if isinstance(order, dict) else {}
+    action, name, sequence = (order.get(key) for key in ("do", "object", "sequence"))
+    rotate = order.get("rotate")
+    flip = order.get("flip")
+    if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
+        if live.recorder.state()["on"]:
+            raise UserError("A recording is on. Stop it before you turn the picture.")
+        live.orient(rotate, flip)
+    elif action == "background":
+        live.capture_background()
+    elif action == "no background":
+        live.set_background(None)
+    elif action == "record" and isinstance(name, str):
+        live.recorder.start(name, live.gel)
+    elif action == "stop":
+        live.recorder.stop()
+        live.teacher.reload()
+    elif action == "train":
+        live.teacher.train()
+    elif action == "leave out" and isinstance(sequence, str):
+        live.teacher.leave_out(sequence)
+    else:
+        raise UserError("The page asked for something that this source cannot do.")
+
+
+def _refuse(_: Request, error: Exception) -> Response:
+    return _json({"error": str(error)}, 400)
+
+
+def _method(request: Request) -> str:
+    return request.query_params.get("method", "pca")
+
+
+def _layer(request: Request) -> str:
+    if (name := request.query_params.get("layer", LAYERS[0])) not in LAYERS:
+        raise UserError(f"A touch has the layers {', '.join(LAYERS)}.")
+    return name
+
+
+def _number(request: Request, name: str) -> int:
+    text = request.query_params.get(name, "0")
+    if not (text.isascii() and text.isdecimal() and len(text) < 16):
+        raise UserError(f"{name} must be a whole number.")
+    return int(text)
+
+
+def _json(value: Any, status: int = 200) -> Response:
+    return JSONResponse(value, status, _SAFE | {"Cache-Control": "no-store"})
+
+
+def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = SIDE) -> Response:
+    headers = _SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
+    data = encode(scale_down(picture, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
+    return Response(data, media_type="image/jpeg", headers=headers)

@@ -1,0 +1,312 @@
+"""From a few pictures of a sensor to a folder NAME.sensor that the simulator takes.
+
+`see` finds what the pictures show by themselves: the untouched gel, presses, dots and noise.
+`fit_sensor` adds the colours by slope, and writes the folder. Lengths of pictures are in pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from anytouch_jax.config import FIELD_SENSORS, OWN_SENSOR, SENSORS, check_spelling
+from anytouch_jax.data.background.dots import Dots, find_dots, hidden
+from anytouch_jax.data.background.estimate import (
+    DIFFERENT,
+    UntouchedGel,
+    change_of_light,
+    median_gel,
+    scale_picture,
+)
+from anytouch_jax.data.background.rule import FEWEST, TINT, median, reduced
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.fitting import colour
+from anytouch_jax.sim.fitting.colour import Colour
+from anytouch_jax.sim.sensing import own
+from anytouch_jax.sim.sensing.own import MM, OwnSensor
+from anytouch_jax.sim.sensing.sensors import Markers
+
+Array = np.ndarray
+WORK = 96  # pixels of the long side on which the colour change is fitted
+BASE = 40  # pixels of the long side of a stored untouched gel
+ANOTHER = 0.15  # share of the pictures that shows another unit
+DARK = 14  # grey levels: the corners of a round picture
+# keeps the deviation of white noise
+_CURVED = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+NOT_FLAT = ("allsight", "tactip", "taclink", "digit360", "digit_360", "omnitact", "insight")
+
+
+class Seen(NamedTuple):
+    """Pictures of one unit u8 (N, h, w, 3), its untouched gel, and the colour change f32 (N, H, W,
+    3) of the presses.
+
+    `clear` bool (N, H, W) is where no dots hide the change, and no colour is at its limit.
+    """
+
+    frames: Array
+    gel: Array
+    pressed: Array  # bool (N,)
+    change: Array
+    clear: Array
+    dots: Dots | None
+    noise: float
+    noise_spread: float  # relative, from picture to picture
+    source: str  # of the untouched gel, in words
+
+
+def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
+    """Return what pictures RGB u8 (h, w, 3) of one unit show.
+
+    Raises UserError for pictures that cannot be fitted.
+    """
+    frames = [reduced(picture) for picture in pictures]
+    if len(frames) < FEWEST:
+        raise UserError(
+            f"{len(frames)} pictures are too few to fit a sensor; take {FEWEST} or more, 20 are "
+            "good"
+        )
+    if len(shapes := {frame.shape for frame in frames}) > 1:
+        raise UserError(
+            f"the pictures have {len(shapes)} sizes; give those of one camera and one setting"
+        )
+    _check_one_unit(frames)
+    small = [scale_picture(frame) for frame in frames]
+    if background is None:
+        gel = median(frames)
+        source = f"median of {len(frames)} pictures"
+    else:
+        gel = reduced(background)
+        source = "given"
+        if abs(gel.shape[1] / gel.shape[0] / (frames[0].shape[1] / frames[0].shape[0]) - 1) > 0.02:
+            raise UserError(
+                "the background has other proportions than the pictures; take it with the same "
+                "camera"
+            )
+        gel = cv2.resize(gel, frames[0].shape[1::-1], interpolation=cv2.INTER_AREA)
+    _check_flat(gel)
+    untouched = UntouchedGel(gel)
+    pressed = np.array([untouched.score(frame) >= DIFFERENT for frame in frames])
+    if not pressed.any():
+        raise UserError(
+            "no picture shows a press; press objects of all kinds into the gel, at changing places"
+        )
+    if background is None and median_gel(small) is None:
+        raise UserError(
+            "every picture shows a press at the same place; name the untouched gel with "
+            "--background"
+        )
+    dots = find_dots(gel)
+    noise, spread = _noise(np.stack(frames), gel, dots)
+    change, clear = _changes([frames[i] for i in np.flatnonzero(pressed)], gel, dots)
+    return Seen(np.stack(frames), gel, pressed, change, clear, dots, noise, spread, source)
+
+
+def _check_one_unit(frames: Sequence[Array]) -> None:
+    """Raise UserError if a part of the pictures differs from the rest in most places, and not from
+    each other.
+    """
+    small = np.stack(
+        [
+            cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
+            for one in frames
+        ]
+    )
+    apart = np.array([np.median(np.abs(small - one), axis=(1, 2)).max(1) for one in small])
+    near = apart <= TINT
+    rest = np.flatnonzero(~near[np.argmax(near.sum(1))])
+    enough = len(rest) >= max(2, ANOTHER * len(frames))
+    if enough and near[np.ix_(rest, rest)].sum(1).max() >= max(2, 0.5 * len(rest)):
+        raise UserError(
+            f"{len(rest)} of {len(frames)} pictures differ from the others in most places, as if "
+            "taken with another "
+            "unit or in other light; fit each unit by itself"
+        )
+
+
+def _check_flat(gel: Array) -> None:
+    """Raise UserError for a round picture: four black corners around a bright middle."""
+    height, width = (side // 10 for side in gel.shape[:2])
+    corners = [
+        gel[rows, columns]
+        for rows in (slice(height), slice(-height, None))
+        for columns in (slice(width), slice(-width, None))
+    ]
+    if (
+        max(float(corner.max(-1).mean()) for corner in corners)
+        < DARK
+        < gel[3 * height : -3 * height].mean() / 3
+    ):
+        raise UserError(
+            "the picture is round, so the sensor is not flat; a flat gel that fills the picture "
+            "can be fitted"
+        )
+
+
+class Fitted(NamedTuple):
+    """A fitted sensor: its folder, its numbers, what the pictures show, and the colour change."""
+
+    folder: Path
+    numbers: OwnSensor
+    seen: Seen
+    colour: Colour
+
+
+def check_name(name: str) -> None:
+    """Raise UserError for a name that another sensor has, or that belongs to a sensor which cannot
+    be fitted.
+    """
+    word = name.lower().replace("-", "_").replace(" ", "_")
+    if word in FIELD_SENSORS:
+        raise UserError(
+            f"{name} measures a field and has no camera; a sensor with a camera can be fitted"
+        )
+    if word in NOT_FLAT:
+        raise UserError(f"{name} is not flat; a flat gel that fills the picture can be fitted")
+    if word in SENSORS:
+        raise UserError(
+            f"{name} is a sensor of the table; give yours another name, such as my_{word}"
+        )
+    if not word.isidentifier() and not word.replace("_", "").isalnum():
+        raise UserError(f"the name {name!r} must be letters, digits and _")
+    check_spelling(name)
+
+
+def fit_sensor(
+    pictures: Sequence[np.ndarray],
+    name: str,
+    width_mm: float,
+    out: str | Path,
+    *,
+    background: np.ndarray | None = None,
+    ball_mm: float | None = None,
+) -> Fitted:
+    """Fit pictures RGB u8 (h, w, 3) of one unit, whose width shows `width_mm`, and write the folder
+    `out`.
+
+    All presses are of a ball of `ball_mm`, if that is given. Raises UserError for pictures that
+    cannot be fitted.
+    """
+    check_name(name)
+    if Path(out).suffix != OWN_SENSOR:
+        raise UserError(f"{out} must end in {OWN_SENSOR}; choose another --out")
+    height, width = pictures[0].shape[:2]
+    height_mm = width_mm * height / width
+    if not all(MM.low <= side <= MM.high for side in (width_mm, height_mm)):
+        raise UserError(
+            f"a picture of {width} x {height} pixels that is {width_mm:g} mm wide shows "
+            f"{width_mm:g} x {height_mm:.3g} "
+            f"mm; the sides of a gel are {MM.words}. Check --width-mm."
+        )
+    if ball_mm is not None and not 1 <= ball_mm <= 40:
+        raise UserError(f"a ball of {ball_mm:g} mm cannot be used; take one of 3 to 12 mm")
+    seen = see(pictures, background)
+    if ball_mm is None:
+        found = colour.fit_presses(seen.change, seen.clear)
+    else:
+        found = colour.fit_balls(seen.change, seen.clear, width_mm, ball_mm)
+    pixel = width_mm / seen.gel.shape[1]
+    dots = seen.dots
+    markers = None
+    if dots is not None:
+        ink: Any = tuple(round(float(value), 3) for value in dots.ink)
+        step = round(dots.pitch * pixel, 4)
+        radius = round(dots.radius * pixel, 4)
+        markers = Markers(step, radius, round(dots.aspect, 3), 1.0, ink, round(dots.bend, 4))
+    sure = {
+        "pictures": f"{len(pictures)}, of which {int(seen.pressed.sum())} show a press",
+        "untouched gel": f"{seen.source}; its lights and vignette are in it",
+        "dots": "none seen"
+        if dots is None
+        else f"steps from dot to dot {dots.spread:.1%} around the lattice",
+        "noise": f"{seen.noise_spread:.0%} from picture to picture",
+        "colour": f"explains {found.explained:.0%} of the change, from {found.source}",
+        "size": "as given",
+        "thickness_mm, halo_mm": "not seen" if ball_mm is None else "the best of a few",
+        "modulus_kpa, skin_mm": "not seen in pictures: usual values, edit what you know",
+    }
+    numbers = OwnSensor(
+        name,
+        float(width_mm),
+        round(height_mm, 4),
+        (height, width),
+        round(seen.noise, 3),
+        markers,
+        thickness_mm=found.thickness,
+        halo_mm=found.halo,
+        sure=sure,
+    )
+    return Fitted(
+        own.write_sensor(out, numbers, without_dots(seen)[None], found.look), numbers, seen, found
+    )
+
+
+def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
+    """Return the deviation of a pixel from picture to picture where nothing presses, and its
+    relative spread.
+    """
+    fine = []
+    calm = []
+    for frame in frames:
+        change = frame.astype(np.float32) - gel
+        quiet = np.abs(cv2.GaussianBlur(change - change_of_light(change), (0, 0), 3)).max(2) < 2.0
+        calm.append(quiet if dots is None else quiet & ~dots.mask)
+        fine.append(cv2.filter2D(frame.astype(np.float32), -1, _CURVED))
+    weight = np.stack(calm)[..., None].astype(np.float32)
+    count = weight.sum(0)
+    left = (np.stack(fine) - (np.stack(fine) * weight).sum(0) / np.maximum(count, 1)) * np.sqrt(
+        count / np.maximum(count - 1, 1)
+    )
+    found = []
+    for one, quiet in zip(left, np.stack(calm) & (count[..., 0] > 2), strict=True):
+        if quiet.sum() > 100:
+            values = one[quiet]
+            most = 3 * max(1.4826 * float(np.median(np.abs(values))), 0.3)
+            found.append(float(np.mean(np.clip(values, -most, most) ** 2)))
+    if not found:
+        return 1.0, 1.0
+    # of rounding
+    deviations = np.sqrt(np.maximum(np.array(found) - 1 / 12, 0.01))
+    return float(np.median(deviations)), float(np.std(deviations) / np.median(deviations))
+
+
+def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Array, Array]:
+    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, without light and dots, and
+    where they show.
+    """
+    height, width = gel.shape[:2]
+    size = (round(width * WORK / max(height, width)), round(height * WORK / max(height, width)))
+    changes = []
+    clear = []
+    for frame in frames:
+        weight = np.ones((height, width), np.float32)
+        if dots is not None:
+            weight[hidden(frame, dots)] = 0
+        share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+        change = frame.astype(np.float32) - gel
+        change -= change_of_light(change)
+        small = cv2.resize(change * weight[..., None], size, interpolation=cv2.INTER_AREA)
+        own = small / np.maximum(share, 1e-3)[..., None]
+        if dots is not None:  # what the dots hide is as around them
+            near = cv2.GaussianBlur(share, (0, 0), 2)
+            around = cv2.GaussianBlur(small, (0, 0), 2) / np.maximum(near, 1e-3)[..., None]
+            own = np.where(share[..., None] > 0.3, own, around)
+        changes.append(own / 255)
+        limited = weight * ((frame.min(2) < 3) | (frame.max(2) > 252))
+        clear.append(
+            (share > 0.3) & (cv2.resize(limited, size, interpolation=cv2.INTER_AREA) < 0.1)
+        )
+    return np.stack(changes), np.stack(clear)
+
+
+def without_dots(seen: Seen) -> Array:
+    """Return the untouched gel u8 (h, w, 3) of at most BASE pixels a side, with paint in the place
+    of dots.
+    """
+    gel: Any = seen.gel
+    if seen.dots is not None:
+        gel = cv2.inpaint(gel, seen.dots.mask.astype(np.uint8), 3, cv2.INPAINT_TELEA)
+    return scale_picture(cv2.GaussianBlur(gel, (0, 0), 1.5), BASE)

@@ -1,0 +1,206 @@
+import pickle
+import threading
+import time
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+from press_films import LOOKS, SENSORS, gel_frame, press_film
+from refused import refused
+
+from anytouch_jax.data.background import rule as gels
+from anytouch_jax.data.background.contact import THRESHOLDS
+from anytouch_jax.data.background.estimate import UntouchedGel
+from anytouch_jax.data.manifest import manifest as manifests
+
+
+def presses(count, look="coloured", tint=0, seed=0):
+    """Frames of single touches at changing places, all pressed."""
+    frames = [
+        gel_frame(look, 1, shift=float(shift), seed=seed + number)
+        for number, shift in enumerate(np.linspace(-70, 70, count))
+    ]
+    return [np.clip(frame.astype(int) + tint, 0, 255).astype(np.uint8) for frame in frames]
+
+
+def distance(picture, look="coloured", tint=0):
+    return float(np.abs(picture.astype(int) - gel_frame(look, 0).astype(int) - tint).mean())
+
+
+@pytest.mark.parametrize("look", ["coloured", "darkening"])
+def test_the_median_of_pressed_frames_is_the_untouched_gel(look):
+    frames = presses(30, look)
+    free = UntouchedGel(gel_frame(look, 0))
+    assert free.score(gels.untouched_gel(frames)) < 3 < 6 < min(map(free.score, frames[5:25]))
+    assert np.array_equal(gels.untouched_gel(iter(frames)), gels.untouched_gel(np.stack(frames)))
+    refused("too few", gels.untouched_gel, frames[:2])
+    refused("2 sizes", gels.untouched_gel, [*frames, frames[0][:50]])
+
+
+@pytest.fixture
+def world(tmp_path):
+    """world([(frames, cells)]): a manifest of frames with equal cells; "gel.png" is a stored
+    picture, all grey.
+    """
+
+    def build(*groups):
+        cv2.imwrite(str(tmp_path / "gel.png"), np.full((120, 160, 3), 90, np.uint8))
+        rows = []
+        for frames, cells in groups:
+            for frame in frames:
+                path = f"{len(rows)}.png"
+                cv2.imwrite(str(tmp_path / path), frame[..., ::-1])
+                usual = {"sensor": "digit", "unit": None, "split": "train", "background_path": None}
+                rows.append({"path": path, "sequence": path, "frame_index": 0} | usual | cells)
+        return manifests.from_columns(
+            {name: [row[name] for row in rows] for name in rows[0]}, tmp_path / "m.parquet"
+        )
+
+    return build
+
+
+def test_a_stored_picture_comes_first_and_the_median_of_training_frames_of_the_unit_next(world):
+    table = world(
+        (presses(12), {"unit": "a"}),
+        (presses(12, tint=40), {"unit": "a", "split": "test"}),
+        (presses(6, tint=20), {"unit": "b"}),
+        (presses(2), {"unit": "b", "background_path": "gel.png"}),
+        ([gel_frame("coloured", 0)], {"unit": "c", "split": "background"}),
+        (presses(2), {"unit": "c"}),
+        (presses(2, tint=60), {"unit": "d"}),
+        (presses(3), {"sensor": "taxim", "unit": "e"}),
+        (presses(2), {"unit": "f"}),
+        (presses(8, tint=20), {"unit": "f", "split": "test"}),
+    )
+    rule = gels.UnitGels(table)
+    rows = table.text_column("unit")
+    first = {unit: int(np.flatnonzero(rows == unit)[0]) for unit in set(rows)}
+    assert distance(rule.read(first["a"])) < 3 and rule.read(first["a"] + 20) is rule.read(
+        first["a"]
+    )
+    # its other rows have a stored picture
+    assert distance(rule.read(first["b"]), tint=20) < 4
+    stored = int(np.flatnonzero(table.present("background_path"))[0])
+    assert rule(stored) is None and (rule.read(stored) == 90).all()
+    # the picture of split background, not the median
+    assert distance(rule.read(first["c"] + 1)) < 2
+    # too few frames: the median of the sensor, not of its own tint
+    assert distance(rule.read(first["d"])) < 25
+    # two training frames are too few: all of the unit count
+    assert distance(rule.read(first["f"]), tint=16) < 8
+    everything = np.arange(len(table))
+    assert rows[~rule.has(everything)].tolist() == ["e"] * 3
+    report = rule.report(everything)
+    assert "a stored picture for 2 rows" in report and "none for 3 rows" in report
+    assert set(rule.pictures(everything)) == {"digit a", "digit b", "digit c", "digit d", "digit f"}
+    assert rule.digest() == gels.UnitGels(table).digest()
+
+
+def test_a_unit_of_few_sequences_does_not_subtract_its_own_press(world):
+    """Such as a column `unit` that names the object.
+
+    A unit of another look has only its own frames.
+    """
+
+    def press(number, tint=0):
+        frames = [
+            gel_frame("coloured", 1, shift=40.0 * number - 60, seed=10 * number + seed)
+            for seed in range(8)
+        ]
+        frames = [np.clip(frame.astype(int) + tint, 0, 255).astype(np.uint8) for frame in frames]
+        return frames, {"unit": f"object {number}", "sequence": f"film {number}"}
+
+    rule = gels.UnitGels(world(*map(press, range(4)), press(9, tint=60)))
+    assert (
+        all(distance(rule.read(8 * number)) < 2 for number in range(4))
+        and distance(rule.read(32), tint=60) < 12
+    )
+    assert rule.report(np.arange(40)) == (
+        "untouched gel: the median of its sensor of 40 frames for 32 rows; the median of 8 frames "
+        "for 8 rows"
+    )
+
+
+def test_the_same_unit_gets_the_picture_of_a_head_and_another_one_warning(world):
+    known = {"digit a": gel_frame("coloured", 0, seed=9)}
+    table = world(
+        (presses(8, seed=20), {"unit": "a"}),
+        (presses(8, tint=40), {"unit": "b"}),
+        (presses(8, tint=60), {"unit": "c"}),
+    )
+    said: list[str] = []
+    rule = gels.UnitGels(table, known, said.append)
+    rows = table.text_column("unit")
+    assert all(rule(int(row)) is known["digit a"] for row in np.flatnonzero(rows == "a"))
+    assert distance(rule.read(8), tint=40) < 4 and distance(rule.read(16), tint=60) < 4
+    assert len(said) == 1 and "in tint" in said[0]
+    assert gels.same_unit(known, np.zeros((160, 120, 3), np.uint8)) == (None, "in size")
+    assert gels.same_unit({}, known["digit a"]) == (None, "")
+    # a press covers the smaller part of a picture
+    for frame in presses(5):
+        assert gels.same_unit(known, frame)[1] == ""
+
+
+@pytest.mark.parametrize(("look", "share"), list(zip(LOOKS, (0.0, 0.4, 0.6), strict=True)))
+def test_a_live_source_that_begins_with_a_press_settles_on_the_free_gel(look, share):
+    frames, contact = press_film(look, share, frames=60)
+    begin = int(np.argmax(contact))  # the first frame is pressed, if any is
+    running = gels.RunningGel()
+    seen = []
+    for frame in [*frames[begin:], *frames[:begin]] * 9:
+        # while a thread is at work
+        running = pickle.loads(pickle.dumps(running)) if len(seen) == 13 else running
+        running.add(frame)
+        seen.append((running.settled, running.picture))
+    assert not seen[0][0] and running.settled and len({id(picture) for _, picture in seen}) > 6
+    gel = UntouchedGel(gel_frame(look, 0))
+    assert gel.score(running.picture) < THRESHOLDS[SENSORS[look]] / 2
+
+
+def test_no_frame_waits_for_an_estimate_and_equal_frames_have_equal_pictures(monkeypatch):
+    estimate = gels.estimate
+    pictures = list[list[np.ndarray]]()
+    begun = time.perf_counter()
+    for _ in range(2):
+        running = gels.RunningGel()
+        seen = []
+        is_due = threading.Semaphore(0)
+        held = partial(
+            lambda is_due, frames: is_due.acquire(timeout=60) and estimate(frames), is_due
+        )
+        monkeypatch.setattr(gels, "estimate", held)
+        for number, frame in enumerate(presses(24), 1):
+            if number in (2, 4, 8, 16):  # twice as many frames as when the estimate was begun
+                is_due.release()
+            running.add(frame)
+            seen.append(running.picture)
+        is_due.release()
+        pictures.append(seen)
+    assert time.perf_counter() - begun < 60 and len({id(one) for one in seen}) == 5
+    assert all(map(np.array_equal, *pictures))
+
+
+def test_pictures_by_unit_are_read_from_the_arrays_that_were_written():
+    known = {"a/b": gel_frame("coloured", 0), "ü": gel_frame("darkening", 0)[:50]}
+    read = gels.gels_of_arrays(gels.gel_arrays(known))
+    assert list(read) == list(known) and all(
+        np.array_equal(read[name], known[name]) for name in known
+    )
+    assert gels.gels_of_arrays({}) == {} == gels.gel_arrays({})
+    with pytest.raises((KeyError, ValueError)):
+        gels.gels_of_arrays({"gels": np.array(["a"])})
+    with pytest.raises((KeyError, ValueError)):
+        gels.gels_of_arrays({"gels": np.array(["a"]), "gel/0": np.zeros((4, 4))})
+
+
+@pytest.mark.parametrize(
+    ("rotate", "flip"), [(0, "none"), (90, "across"), (270, "down"), (180, "none")]
+)
+def test_a_picture_as_the_camera_takes_it_is_turned_upright_again(rotate, flip):
+    from anytouch_jax.data.transforms import orient_frame
+
+    picture = gel_frame("dotted", 1, shift=20)[:100]
+    np.testing.assert_array_equal(
+        orient_frame(gels.as_taken(picture, rotate, flip), rotate, flip), picture
+    )

@@ -1,0 +1,374 @@
+import os
+
+import cv2
+import numpy as np
+import pytest
+from films import write_film
+from reader_world import fill
+from refused import refused
+
+from anytouch_jax.data.images import decode
+from anytouch_jax.datasets.readers import IndexOptions
+from anytouch_jax.datasets.readers.recordings import ranked_split
+from anytouch_jax.errors import UserError
+
+
+def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):
+    fill(tmp_path, [f"mug/{take}/{n}.png" for take in ("one", "two") for n in range(12)])
+    fill(tmp_path, [f"ball/{n}.jpg" for n in (3, 4, 6)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {
+        "mug",
+        "ball",
+    }
+    assert set(table["sensor"]) == {"digit"} and set(table["dataset"]) == {tmp_path.name}
+    assert [row["frame_index"] for path, row in table.rows.items() if "mug/one" in path] == list(
+        range(12)
+    )
+    of_ball = [clip for clip in table.clips(2) if "ball" in clip[0]]
+    # 5 is not there: no clip reaches over it
+    assert of_ball == [["ball/3.jpg", "ball/4.jpg"]]
+
+
+def test_files_in_or_above_the_folder_belong_to_a_recording(tmp_path, read):
+    fill(
+        tmp_path,
+        ["background.png", "mug/photo.jpg", "mug/one/0.png", "mug/one/1.png", "mug/two/0.png"],
+    )
+    fill(tmp_path, ["mug/two/Background.png", "ball/0.png"])
+    (tmp_path / "mug" / "caption.txt").write_text("smooth,\n cold\n", encoding="utf-8")
+    (tmp_path / "mug" / "one" / "film.mp4").write_bytes(b"")
+    table = read("recordings", sensor="digit", val=0, test=0)
+    one, two, ball = (table.rows[path] for path in ("mug/one/1.png", "mug/two/0.png", "ball/0.png"))
+    assert len(table.rows) == 4
+    named = [
+        [row[name] for name in ("background_path", "image_path", "text")]
+        for row in (one, two, ball)
+    ]
+    assert named[0] == ["background.png", "mug/photo.jpg", "smooth, cold"]
+    assert named[1][:2] == ["mug/two/Background.png", "mug/photo.jpg"]
+    assert named[2] == ["background.png", None, None]
+    assert table.reasons == {"video (--export writes its frames as pictures)": 1}
+
+
+def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
+    fill(tmp_path / "mine", ["0.png", "1.png"])
+    table = read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0)
+    assert list(table.rows) == ["0.png", "1.png"] and set(table["sequence"]) == {"."}
+    notes = read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0.001).report.notes
+    assert "too few objects or recordings for split test" in " ".join(notes)
+
+
+def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, read):
+    splits = []
+    for name in ("mine", "renamed"):
+        fill(tmp_path / name, [f"thing {n}/{take}/0.png" for n in range(3) for take in (0, 1)])
+        table = read("recordings", tmp_path / name, sensor="digit")
+        splits.append({row["object"]: row["split"] for row in table.rows.values()})
+    assert splits[0] == splits[1] and sorted(splits[0].values()) == ["test", "train", "val"]
+    assert any("--split-by recording" in note for note in table.report.notes)
+
+
+def test_ranked_splits_have_their_shares_and_hardly_move():
+    names = [f"o{n}" for n in range(40)]
+    before = ranked_split(names, IndexOptions(0.2, 0.3))
+    assert [list(before.values()).count(split) for split in ("val", "train", "test")] == [8, 20, 12]
+    for new in (f"new {n}" for n in range(20)):
+        after = ranked_split([*names, new], IndexOptions(0.2, 0.3))
+        assert sum(after[name] != before[name] for name in names) <= 2
+    few = {n: sorted(ranked_split(names[:n], IndexOptions(0.05, 0.05)).values()) for n in (1, 2, 3)}
+    assert few == {1: ["train"], 2: ["test", "train"], 3: ["test", "train", "val"]}
+    assert sorted(ranked_split(names[:3], IndexOptions(0.05, 0.9)).values()) == [
+        "test",
+        "train",
+        "val",
+    ]
+    assert set(ranked_split(names, IndexOptions(0, 1)).values()) == {"test"}
+    assert set(ranked_split(names, IndexOptions(0, 0)).values()) == {"train"}
+
+
+def test_by_recording_every_object_is_in_every_split(tmp_path, read):
+    fill(
+        tmp_path,
+        [f"thing {n}/{take}/{k}.png" for n in range(5) for take in range(4) for k in (0, 1)],
+    )
+    table = read("recordings", sensor="digit", split_by="recording")
+    for n in range(5):
+        of = {
+            row["sequence"]: row["split"]
+            for row in table.rows.values()
+            if row["object"] == f"thing {n}"
+        }
+        assert sorted(of.values()) == ["test", "train", "train", "val"]
+
+
+def test_labels_are_joined_by_object_and_sequence(tmp_path, read):
+    fill(tmp_path, [f"{name}/0.png" for name in ("mug/one", "mug/two", "ball/one", "cup/one")])
+    labels = tmp_path / "labels.csv"
+    labels.write_text(
+        "object,sequence,material,label.hardness,code,unit\nmug,,clay,9,007,\n,mug/two,glass,,,left\nball,ball/one,,2.5,1,\n"
+        "vase,,clay,1,1,\n"
+    )
+    table = read("recordings", sensor="digit", val=0, test=0, labels=labels)
+    of = {row["sequence"]: row for row in table.rows.values()}
+    names = ("label.material", "label.hardness", "label.code", "unit")
+    assert {name: tuple(row[one] for one in names) for name, row in of.items()} == {
+        "mug/one": ("clay", 9.0, "007", None),
+        "mug/two": ("glass", 9.0, "007", "left"),
+        "ball/one": (None, 2.5, "1", None),
+        "cup/one": (None, None, None, None),
+    }
+    skipped = {reason: example for reason, (_, example) in table.report.skipped.items()}
+    assert skipped == {
+        "key of labels.csv that no recording has": "vase",
+        "recording without a line in labels.csv": "cup/one",
+    }
+
+
+def test_a_folder_as_macos_writes_it_matches_its_label(tmp_path, read):
+    fill(tmp_path, ["a\u0301/0.png"])
+    (tmp_path / "labels.csv").write_text(
+        "object,kind,weight\n\u00e1,oak  wood,?\n", encoding="utf-8"
+    )
+    table = read("recordings", sensor="digit", val=0, test=0, labels=tmp_path / "labels.csv")
+    assert (
+        table["label.kind"] == ["oak wood"]
+        and table.rows["a\u0301/0.png"].get("label.weight") is None
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "name,material\nmug,clay\n",
+            "no column object or sequence, by which labels are joined; it has name, mat",
+        ),
+        ("object,a,a\nmug,1,2\n", "has the column 'a' twice"),
+        ("object,a\nmug,1\nmug,2\n", "line 3: mug is there twice"),
+        ("object,a\n\nmug,1,2\n", "line 3: 3 cells for 2 columns"),
+        ("object,a,b\nmug,1\n", "line 2: 2 cells for 3 columns"),
+        (
+            "object,a\nmug,Wood\n\nball,wood\n",
+            "line 4: column 'a' has 'wood', and .* line 2 has 'Wood'",
+        ),
+        ('object,a\nmug,"x\ny"\n,1\n', "line 4: there"),
+        ("object,a\n,1\n", "line 2: there is neither an object nor a sequence"),
+    ],
+)
+def test_tables_of_labels_that_cannot_be_joined(tmp_path, read, text, says):
+    fill(tmp_path, ["mug/0.png"])
+    (tmp_path / "labels.csv").write_text(text)
+    refused(says, read, "recordings", sensor="digit", labels=tmp_path / "labels.csv")
+    refused("cannot be read", read, "recordings", sensor="digit", labels=tmp_path / "none.csv")
+
+
+def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
+    fill(tmp_path, [f"mug/one/{finger}_{n}.png" for finger in ("left", "right") for n in range(4)])
+    fill(tmp_path, [f"{finger}{n}.png" for finger in ("a", "b") for n in range(2)])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    units = {row["sequence"]: (row["unit"], row["object"]) for row in table.rows.values()}
+    assert units == {
+        "mug/one/left": ("left", "mug"),
+        "mug/one/right": ("right", "mug"),
+        "a": ("a", None),
+        "b": ("b", None),
+    }
+    assert sum("mug" in clip[0] for clip in table.clips(3)) == 4
+    assert all(len({path[:10] for path in clip}) == 1 for clip in table.clips(3))
+
+
+def test_videos_become_folders_of_pictures(tmp_path, read):
+    root = tmp_path / "mine"
+    for name in ("one", "two"):
+        write_film(
+            root / "mug" / f"{name}.avi",
+            [np.full((32, 32, 3), (200, 20 * n, 10), np.uint8) for n in range(5)],
+        )
+    (root / "mug" / "broken.mp4").write_bytes(b"no film")
+    fill(root, ["ball/0.png"])
+    table = read("recordings", root, sensor="digit", val=0, test=0)
+    assert len(table.rows) == 1 and table.reasons == {
+        "video (--export writes its frames as pictures)": 3
+    }
+    table = read("recordings", root, sensor="digit", val=0, test=0, export=True)
+    assert len(table.clips(5)) == 2 and table.reasons["video that cannot be read"] == 1
+    assert set(table["sequence"]) == {"mug/one", "mug/two", "ball"} and set(table["object"]) == {
+        "mug",
+        "ball",
+    }
+    # red first
+    assert decode(root / "mug" / "two" / "000004.png")[0, 0] == pytest.approx([10, 80, 200], abs=6)
+
+
+@pytest.mark.parametrize(
+    ("form", "splits"),
+    [
+        ("{split}/{kind}", ("train", "val", "test")),
+        ("{kind}/{split}", ("Training", "valid", "TEST")),
+        ("data/{split}/{kind}", ("train_set", "dev", "testing")),
+        ("{kind}/{split}/take", ("trn", "Validation", "eval")),
+        ("{split}/{kind}", ("train2017", "val2017", "test_unseen")),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 4])
+def test_split_words_decide_splits_and_name_nothing(tmp_path, read, form, splits, count):
+    kinds = ("cotton", "denim")
+    parts = ("train", "val", "test")
+    fill(
+        tmp_path,
+        [
+            f"{form.format(split=split, kind=kind)}/{n:03d}.png"
+            for split in splits
+            for kind in kinds
+            for n in range(count)
+        ],
+    )
+    table = read("recordings", sensor="digit", films=True)
+    of = dict(zip(splits, parts, strict=True))
+    for path, row in table.rows.items():
+        assert row["object"] in kinds and row["object"] in path and row["object"] in row["sequence"]
+        assert row["split"] == next(part for split, part in of.items() if f"{split}/" in f"{path}/")
+        assert not {*splits, *parts} & {*row["sequence"].split("/")}
+    assert len(set(table["sequence"])) == 6
+    assert "<split>/" in table.report.notes[0]
+    assert (f"{splits[1]} is split val" in table.report.notes[0]) == ("val" not in splits)
+
+
+def test_a_path_in_two_splits_is_refused_and_folders_outside_are_ranked(tmp_path, read):
+    fill(tmp_path, ["test/a/0.png", "train/a/0.png", *(f"more {k}/0.png" for k in range(3))])
+    rows = read("recordings", sensor="digit").rows.values()
+    assert sorted(row["split"] for row in rows if "more" in row["sequence"]) == [
+        "test",
+        "train",
+        "val",
+    ]
+    fill(tmp_path, ["train/a/valid/0.png"])
+    refused("train/a/valid names two splits, train and valid", read, "recordings", sensor="digit")
+
+
+def _presses(folder, names, seconds=0.0, film=False):
+    """Write pictures of presses at random places, or of one that moves on, and the times of their
+    files.
+    """
+    rng = np.random.default_rng(list(folder.name.encode()))
+    folder.mkdir(parents=True, exist_ok=True)
+    for at, name in enumerate(names):
+        picture = np.full((48, 64, 3), 90, np.uint8)
+        place = (8 + 4 * at, 24) if film else tuple(int(x) for x in rng.integers(8, 40, 2))
+        cv2.imwrite(str(folder / name), cv2.circle(picture, place, 8, (220, 160, 90), -1))
+        os.utime(folder / name, (1.7e9 + seconds * at,) * 2)
+
+
+@pytest.mark.parametrize(
+    ("names", "single", "made"),
+    [
+        ([f"{n:03d}.png" for n in range(9)], False, {"film": True}),
+        ([f"{n:03d}.png" for n in range(9)], True, {}),  # numbered too: the pictures decide
+        (
+            [f"{n:03d}.png" for n in range(9)],
+            True,
+            {"film": True, "seconds": 60},
+        ),  # or the times of the files
+        ([f"1731000000.{33 * n:03d}.png" for n in range(9)], False, {"film": True}),
+        ([f"IMG_20240105_12{n:02d}{n * n % 60:02d}.png" for n in range(9)], True, {"film": True}),
+        ([f"17310000{n}7.png" for n in range(9)], True, {"film": True}),  # seconds
+        ([f"{n * 7919 % 4096:x}f{n * n * 31 % 17}a.png" for n in range(9)], True, {"film": True}),
+    ],
+)
+def test_pictures_that_look_like_no_film_are_single_touches(tmp_path, read, names, single, made):
+    for kind in ("nut", "pin", "cap"):
+        _presses(tmp_path / kind, names, **made)
+    table = read("recordings", sensor="digit")
+    assert len(set(table["sequence"])) == (27 if single else 3)
+    assert len({row["object"] for row in table.rows.values() if row["split"] == "test"}) == (
+        3 if single else 1
+    )
+    assert ("<touch>" in table.report.notes[0]) == single
+    for choice, count in (("singles", 27), ("films", 3)):
+        assert len(set(read("recordings", sensor="digit", **{choice: True})["sequence"])) == count
+
+
+def test_single_touches_are_split_by_a_group_of_the_user(tmp_path, read):
+    fill(
+        tmp_path,
+        [
+            f"{kind}/p{person}_{n}.png"
+            for kind in ("nut", "pin")
+            for person in range(4)
+            for n in range(3)
+        ],
+    )
+    lines = [
+        f"{kind}/p{p}_{n}.png,{p}" for kind in ("nut", "pin") for p in range(4) for n in range(3)
+    ]
+    (tmp_path / "labels.csv").write_text("\n".join(["sequence,person", *lines]))
+    for options in (
+        {"split_by": r"p(\d)_"},
+        {"split_by": "person", "labels": tmp_path / "labels.csv"},
+    ):
+        table = read("recordings", sensor="digit", singles=True, **options)
+        splits = {}
+        for path, row in table.rows.items():
+            splits.setdefault(path.split("/p")[1][0], set()).add(row["split"])
+        assert sorted(map(list, splits.values())) == [["test"], ["train"], ["train"], ["val"]]
+    for wrong, words in (
+        ("nobody", "is no column; give"),
+        ("(x", "is no pattern"),
+        ("(x)", "is in no path"),
+    ):
+        refused(words, read, "recordings", sensor="digit", split_by=wrong)
+    refused("exclude each other", read, "recordings", sensor="digit", singles=True, films=True)
+
+
+def test_frames_without_order_in_their_names_come_by_time_when_asked(tmp_path, read):
+    names = [f"{word}.png" for word in ("one", "two", "three", "four")]
+    _presses(tmp_path / "mug", names, seconds=1)
+    table = read("recordings", sensor="digit", films=True)
+    assert any(
+        "names do not order 1 recordings clearly (first: mug); --order times" in x
+        for x in table.report.notes
+    )
+    assert [
+        path.split("/")[1] for path in read("recordings", sensor="digit", order="times")["path"]
+    ] == names
+
+
+def test_mistakes(tmp_path, read):
+    fill(tmp_path, ["a/0.png"])
+    refused("sensor 'DIGIT' is not known: did you mean digit", read, "recordings", sensor="DIGIT")
+    for sensor in (None, "tac3d", "universal"):
+        refused("--sensor: gelsight", read, "recordings", sensor=sensor)
+    (tmp_path / "a" / "caption.txt").write_bytes(b"\xff\xfe\x00")
+    refused(r"caption\.txt cannot be read as UTF-8 text", read, "recordings", sensor="digit")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "film.mp4").write_bytes(b"")
+    with pytest.raises(UserError, match=r"no frame of recordings .*--export writes its frames"):
+        read("recordings", tmp_path / "empty", sensor="digit")
+
+
+def test_arrays_count_where_there_is_nothing_else(tmp_path, read):
+    fill(tmp_path, ["a/1.png", "a/2.png", "a/4.png"])
+    for name in ("a/force.npy", "a/2.npy", "b/0.npy"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        np.save(tmp_path / name, np.zeros((8, 8, 3), np.uint8))
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert {path: row["frame_index"] for path, row in table.rows.items()} == {
+        "a/1.png": 1,
+        "a/2.png": 2,
+        "a/4.png": 4,
+        "b/0.npy": 0,
+    }
+    assert table.reasons == {"array next to pictures": 2}
+
+
+def test_what_is_no_recording(tmp_path, read):
+    fill(tmp_path, ["mug/background/0.png", "mug/1700000000.5.png", "mug/1700000000.1234567.png"])
+    fill(tmp_path, [f"{tmp_path.name}/0.png", "0.png"])
+    table = read("recordings", sensor="digit", val=0, test=0)
+    assert [path for path in table.rows if "mug" in path] == [
+        "mug/1700000000.1234567.png",
+        "mug/1700000000.5.png",
+    ]
+    assert table.reasons == {"folder called background or photo, where one picture is expected": 1}
+    assert set(table["sequence"]) == {".", "mug", tmp_path.name}

@@ -1,0 +1,335 @@
+"""The page in a real browser: Debian's Chromium, alone for a smoke test, and driven by Playwright
+for the others.
+
+`make test-all` installs Playwright, and axe from npm, which checks that everybody can use the page.
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import uvicorn
+from view_world import SCRIPT, PressCamera
+
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder.encoder import load_encoder
+from anytouch_jax.live.page import live as live_module
+from anytouch_jax.live.page import server
+from anytouch_jax.live.page.live import Live
+
+CHROMIUM = shutil.which("chromium")
+AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
+SIGNS = "of 2 touches", "Click a point", "Teach it a touch", "What do you want"  # of each tab
+FRAMES = "Number(document.getElementById('main').dataset.frames)"
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="there is no Chromium: apt-get install chromium"
+)
+
+
+@contextmanager
+def serving(sources: list) -> Iterator[str]:
+    """Serve the page of `sources` by a thread, and give its address."""
+    running = uvicorn.Server(
+        uvicorn.Config(server.app(sources), port=0, log_level="error", lifespan="off")
+    )
+    thread = threading.Thread(target=running.run, daemon=True)
+    thread.start()
+    while not running.started:
+        time.sleep(0.01)
+    yield f"http://127.0.0.1:{running.servers[0].sockets[0].getsockname()[1]}/"
+    running.should_exit = running.force_exit = True
+    thread.join(10)
+
+
+def test_chromium_shows_the_page(touches, features, tmp_path):
+    command = [
+        CHROMIUM,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        f"--user-data-dir={tmp_path}",
+        "--dump-dom",
+    ]
+    with serving(server.open_sources([touches, features])) as address:
+        command += ["--virtual-time-budget=10000", address]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert "features: touches" in done.stdout and "of 2 touches" in done.stdout
+
+
+@pytest.fixture(scope="module")
+def camera() -> PressCamera:
+    return PressCamera()
+
+
+@pytest.fixture(scope="module")
+def address(touches, features, camera, tiny_run, tmp_path_factory) -> Iterator[str]:
+    """The page without anything named, of touches, features and a film in the place of a camera."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(live_module, "open_source", lambda *_: (camera, True))
+        out = tmp_path_factory.mktemp("taught") / "touches"
+        live = Live(
+            "0", load_encoder(tiny_run), sensor="gelsight_mini", out=out, log=lambda _: None
+        )
+        live.start()
+        start = server.StartPage(lambda _: live)
+        with serving([*server.open_sources([touches, features]), live, start]) as place:
+            yield place
+            live.stop()
+
+
+@pytest.fixture
+def browse(address) -> Iterator[Callable[..., object]]:
+    """browse(tab, width): the page at a tab.
+
+    In the end nothing may be in the console of any of them.
+    """
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        faults: list[str] = []
+
+        def opened(tab: int, width: int = 1200, theme: str = "light", **options):
+            page = browser.new_page(
+                viewport={"width": width, "height": 800}, color_scheme=theme, **options
+            )
+            page.on("console", lambda message: faults.append(message.text))
+            page.on("pageerror", lambda error: faults.append(str(error)))
+            page.on("dialog", lambda dialog: faults.append(f"dialog {dialog.message}"))
+            page.goto(address)
+            page.locator("nav button").nth(tab).click()
+            return page
+
+        yield opened
+        browser.close()
+        # orders that are refused
+        assert [fault for fault in faults if "400 (Bad Request)" not in fault] == []
+
+
+def until(page, expression: str, argument: object = None, seconds: float = 60) -> None:
+    """Wait until a JavaScript expression is true.
+
+    The page's policy forbids eval, which Playwright's own wait needs.
+    """
+    end = time.monotonic() + seconds
+    while not page.evaluate(expression, argument):
+        assert time.monotonic() < end, expression
+        page.wait_for_timeout(50)
+
+
+def drawn(page, selector: str = ".stage canvas") -> str:
+    """What a canvas shows, once it is not empty."""
+    until(page, "s => document.querySelector(s)?.width === 48", selector)
+    return page.locator(selector).first.evaluate("canvas => canvas.toDataURL()")
+
+
+@pytest.mark.slow
+def test_touches_are_filtered_and_played(browse):
+    page = browse(0)
+    page.wait_for_selector("text=of 2 touches")
+    assert page.locator("section h3").all_inner_texts() == ["digit", "gelsight_mini"]
+    before = drawn(page)
+    page.get_by_role("button", name="Contact").click()
+    until(page, "before => document.querySelector('.stage canvas').toDataURL() !== before", before)
+    page.locator("button", has_text="Play").click()
+    until(page, "document.querySelector('input[type=range]').value === '2'")
+    page.wait_for_selector("button:has-text('Play')")
+    slider, curve = (
+        page.locator(name).first.bounding_box() for name in ("input[type=range]", ".time canvas")
+    )
+    # one time axis
+    assert slider["x"] == curve["x"] and slider["width"] == curve["width"]
+    page.get_by_role("combobox", name="split", exact=True).select_option("test")
+    page.wait_for_selector("text=of 1 touches")
+    # text, and no more
+    assert page.get_by_text(SCRIPT).count() >= 2 and page.title() == "anytouch view"
+    page.get_by_role("combobox", name="sensor", exact=True).select_option("digit")
+    until(page, "document.querySelectorAll('.clip').length === 1")
+
+
+@pytest.mark.slow
+def test_a_surface_is_turned(browse):
+    page = browse(0)
+    page.get_by_role("button", name="Surface").click()
+    page.wait_for_selector("text=times as high")
+    canvas = page.locator(".stage canvas").first
+    seen = set()
+    seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
+    for key in ("ArrowLeft", "ArrowDown"):
+        canvas.press(key)
+        seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
+    canvas.hover()
+    page.mouse.down()
+    page.mouse.move(500, 400, steps=3)
+    page.mouse.up()
+    seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
+    # still the first touch
+    assert len(seen) == 4 and page.locator("input[type=number]").input_value() == "1"
+    page.wait_for_selector("text=measured force, N")  # its curve
+    page.get_by_role("button", name="Picture").click()
+    assert drawn(page) not in seen
+
+
+@pytest.mark.slow
+def test_keyboard_alone(browse):
+    page = browse(0)
+    page.wait_for_selector("text=of 2 touches")
+    number = page.locator("input[type=number]")
+    page.keyboard.press("ArrowRight")
+    until(page, "document.querySelector('input[type=number]').value === '2'")
+    page.keyboard.press("ArrowLeft")
+    until(page, "document.querySelector('input[type=number]').value === '1'")
+    page.keyboard.press(".")
+    until(page, "document.querySelector('input[type=range]').value === '1'")
+    page.keyboard.press("Space")
+    until(page, "document.querySelector('input[type=range]').value === '2'")
+    page.keyboard.press("f")  # to the filters: the first is the sensor
+    page.keyboard.press("ArrowDown")
+    until(page, "document.querySelectorAll('.clip').length === 1")
+    assert number.input_value() == "1"
+    # Tab reaches everything, and what has the focus can be seen
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.ariaLabel") == "next touch":
+            break
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none"
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('input[type=number]').value === '2'")
+
+
+@pytest.mark.slow
+def test_a_point_of_the_map_shows_its_neighbours(browse):
+    page = browse(1)
+    page.wait_for_selector(".legend >> text=gelsight_mini")
+    page.locator("canvas.map").click()
+    page.wait_for_selector("text=nearest, of other sensors")
+    assert 1 <= page.locator(".thumbs figure").count() <= 10
+    assert drawn(page)
+    chosen = "[...document.querySelectorAll('dd')].map(one => one.textContent).join()"
+    shown = {page.evaluate(chosen)}
+    # a neighbour lies on one side at least
+    for key in ("ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"):
+        page.locator("canvas.map").press(key)
+        page.wait_for_timeout(500)
+        shown.add(page.evaluate(chosen))
+    assert len(shown) > 1
+    page.get_by_role("combobox", name="map", exact=True).select_option("tsne")
+    page.wait_for_selector("text=12 features")
+    page.locator(".thumbs button").first.click()
+    page.wait_for_selector("text=of 2 touches")
+
+
+@pytest.mark.slow
+def test_a_classifier_is_taught_by_touching(browse, camera):
+    page = browse(2)
+    until(page, f"{FRAMES} > 15")
+    name = page.get_by_label("name of what you touch")
+    record = page.locator("button.record")
+
+    def press(shape: str, called: str, by_key: bool) -> None:
+        camera.shape = shape
+        name.fill(called)
+        page.wait_for_timeout(300)
+        record.focus()
+        if by_key:
+            page.keyboard.down(" ")
+        else:
+            record.hover()
+            page.mouse.down()
+        page.wait_for_selector(f"text=Recording {called}")
+        page.wait_for_timeout(1000)
+        page.keyboard.up(" ") if by_key else page.mouse.up()
+        page.wait_for_selector("text=Hold to record")
+        camera.shape = ""
+        page.wait_for_timeout(300)
+
+    page.keyboard.press("b")
+    record.click()  # an empty name
+    page.wait_for_selector("text=Type a name")
+    assert page.get_by_role("button", name="Train").is_disabled()
+    names = ("ball", SCRIPT, "../../" + 294 * "x")
+    for turn in range(2):
+        for shape, called in zip(("ball", "bar", "pins"), names, strict=True):
+            press(shape, called[:100], by_key=bool(turn))
+    page.wait_for_selector("text=2 recordings")
+    other = browse(2)  # a second tab has them, too
+    until(other, "document.querySelectorAll('.names li').length === 3")
+    page.get_by_role("button", name="Train").click()
+    camera.shape = "bar"
+    until(page, "text => document.querySelector('h2.felt').textContent === text", SCRIPT)
+    camera.shape = "ball"
+    for each in (page, other):
+        until(each, "document.querySelector('h2.felt').textContent === 'ball'", seconds=20)
+    measured = "document.body.innerText.includes('recordings that were left out')"
+    until(page, measured, seconds=180)
+    page.reload()
+    until(page, measured)
+    until(page, "document.querySelector('h2.felt').textContent === 'ball'", seconds=20)
+    assert page.title() == "anytouch view"
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download recordings").click()
+    assert download.value.suggested_filename.endswith(".zip")
+
+
+@pytest.mark.slow
+def test_ctrl_c_loses_no_recording(film, tiny_run, tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api")
+    words = (
+        f"view {film} --live --model {tiny_run} --sensor digit --out {tmp_path / 'out'} --port 8798"
+    )
+    command = [sys.executable, "-m", "anytouch_jax", *words.split()]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
+        place = next(line.split()[1] for line in running.stdout if line.startswith("Open "))
+        with playwright.sync_playwright() as driver:
+            browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+            page = browser.new_page()
+            page.goto(place)
+            page.get_by_label("name of what you touch").fill("cup")
+            # a short press records until the next
+            page.locator("button.record").click()
+            page.wait_for_selector("text=/Recording cup: [1-9]/")
+            running.send_signal(signal.SIGINT)
+            running.send_signal(signal.SIGINT)  # impatient
+            running.communicate(timeout=60)
+            browser.close()
+    table = manifests.read(tmp_path / "out" / "manifest.parquet")
+    assert set(table.text_column("object")) == {"cup"} and not list((tmp_path / "out").glob(".*"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_everybody_can_use_it(browse, theme):
+    """Labels, contrast and roles, by axe."""
+    if not AXE.is_file():
+        pytest.skip("there is no axe: make test-all")
+    for tab, sign in enumerate(SIGNS):
+        page = browse(tab, theme=theme, bypass_csp=True)
+        page.wait_for_selector(f"text={sign}")
+        if tab == 0:
+            page.get_by_role("button", name="Surface").click()
+            page.wait_for_selector("text=times as high")
+        page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        page.wait_for_timeout(1000)
+        page.evaluate(AXE.read_text())
+        found = page.evaluate("axe.run()")["violations"]
+        assert [(one["id"], node["html"]) for one in found for node in one["nodes"]] == [], sign
+        page.close()
+
+
+@pytest.mark.slow
+def test_a_narrow_screen(browse):
+    for tab, sign in enumerate(SIGNS):
+        page = browse(tab, 375)
+        page.wait_for_selector(f"text={sign}")
+        page.wait_for_timeout(500)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 375

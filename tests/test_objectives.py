@@ -198,7 +198,7 @@ def test_towers_that_nothing_is_shown_to_cost_nothing_and_need_not_exist():
     none = ALIGN._replace(**{name: getattr(ALIGN, name)[:0] for name in slots})
     terms = lambda p, b: objectives.stage2_terms(
         p, Stage2Batch(b, None), None, net=NET2, config=CONFIG2
-    )  # noqa: E731
+    )
     # no towers, no decoder, no matching head
     touch = {name: PARAMS2[name] for name in ("touch", "logit_scale")}
     encode = flops(lambda p: NET2.encode_touch(p, ALIGN.clip, SENSOR), touch)
@@ -354,7 +354,7 @@ def drawn(monkeypatch, config, progress, rows=64):
     batch = Stage2Batch(AlignBatch(one, sensor, *empty, *text), MatchBatch(*(one, sensor) * 3))
     run = lambda p: (objectives.stage2_loss({}, batch, KEY, p, net=NET2, config=config), received)[
         1
-    ]  # noqa: E731
+    ]
     own, *rows = map(np.asarray, jax.jit(run)(np.float32(progress)))
     # the decoder gets the sensor's own tokens
     np.testing.assert_array_equal(own, sensor)

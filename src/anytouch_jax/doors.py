@@ -1,0 +1,65 @@
+"""Doors between the core and the rings: tables of names, imported when they are used.
+
+The core (AnyTouch: trained, loaded, probed) imports no ring (`sim`, `fields`, `datasets`, `live`,
+`zoo`, `export`). Where it needs one, it asks here by name. So `load_encoder` on an AnyTouch run and
+`pretrain` on a manifest load no module of a ring, and a plain install needs no package of one.
+
+To join in, add a row to a table. A row is "module:attribute" below `anytouch_jax`, and the extra
+of `pip install "anytouch_jax[extra]"` that brings what the module imports.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any, NamedTuple
+
+from anytouch_jax.errors import UserError
+
+
+class Door(NamedTuple):
+    """Where a ring's object is found: "module:attribute", and the extra that it needs, if any."""
+
+    target: str
+    extra: str = ""
+
+
+# Readers of weights that are not in AnyTouch's own layouts. `family` is asked about every file.
+WEIGHTS = {
+    "family": Door("zoo.families:load_family"),
+    "family encoder": Door("zoo.encoder:family_encoder"),
+    "torch": Door("zoo.torch_file:read_torch"),
+}
+# Sources of training batches, by the word of --data. Each has the interface of `batch.BatchSource`.
+BATCHES = {
+    "simulated": Door("sim.batches:SimulatedLoader", "sim"),
+}
+# Heads beside the embedding: what builds their module, their loss and what they measure.
+HEADS = {
+    "fields": Door("fields.head:HEAD"),
+}
+# Further terms of the training objectives, weighted by `objective.terms`.
+OBJECTIVES = {
+    "fields": Door("fields.loss:field_terms"),
+}
+# What computes the features of touch instead of XLA.
+ENGINES = {
+    "cached": Door("export.export:cached_export"),
+    "onnx": Door("export.export:load", "engines"),
+}
+
+
+def enter(door: Door) -> Any:
+    """Import and return what lies behind a door.
+
+    Raises UserError with the command that installs what is missing.
+    """
+    module, _, attribute = door.target.partition(":")
+    try:
+        return getattr(import_module(f"anytouch_jax.{module}"), attribute)
+    except ModuleNotFoundError as error:
+        if not door.extra or (error.name or "").startswith("anytouch_jax"):
+            raise
+        raise UserError(
+            f"{module} needs the package {error.name}, which is not installed: "
+            f'pip install "anytouch_jax[{door.extra}]"'
+        ) from None

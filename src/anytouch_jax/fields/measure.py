@@ -21,6 +21,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.files import atomic_write
 from anytouch_jax.live.health import UnitFrames, check_layout, known_gels
+from anytouch_jax.sensors import RECORDS
 from anytouch_jax.shown import shown_short
 
 
@@ -35,12 +36,9 @@ class KnownGel(NamedTuple):
 
 
 GELS = {
-    "gelsight": KnownGel(18.88, 0.75, 150),
-    "gelsight_mini": KnownGel(18.88, 0.75, 180),
-    "gelslim": KnownGel(20.0, 0.75, 220),
-    "digit": KnownGel(14.25, 4 / 3, 120),
-    "9dtact": KnownGel(24.0, 0.75, 120),
-    "duragel": KnownGel(18.7, 0.75, 350),
+    name: KnownGel(record.size_mm[1], record.proportions, record.modulus_kpa)
+    for name, record in RECORDS.items()
+    if record.size_mm and record.proportions and record.modulus_kpa
 }
 # kPa of an unknown gel, and its deviation as a share
 OTHER_MODULUS = 170.0

@@ -31,7 +31,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 
 # real untouched gels, in the package
-_LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "looks.npz"
+_LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "photometry.npz"
 # that are read of a unit, and of a recording
 RECORDINGS = 24
 FRAMES = 6

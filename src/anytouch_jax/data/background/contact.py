@@ -45,6 +45,7 @@ from anytouch_jax.data.manifest.schema import shown
 from anytouch_jax.datasets.scan import EXAMPLES
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
+from anytouch_jax.sensors import RECORDS
 
 # of a recording, and of a unit, from which the untouched gel is estimated
 _MAX_FRAMES = 48
@@ -54,15 +55,13 @@ _MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
 _Scored = tuple[int, float, str]  # row, score, reason
 _Pictures = Callable[[np.ndarray], list[np.ndarray]]  # some frames of rows
 
-# Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without
-# dots), gelslim and gelsight. The one of 9dtact is below its one light press. The default of the
-# other sensors is untested.
+# Score above which a frame is contact, where it was measured. The default of the other sensors is
+# untested.
 DEFAULT_THRESHOLD = 6.5
 THRESHOLDS: Mapping[str, float] = {
-    "gelsight_mini": 6.5,
-    "gelslim": 6.5,
-    "gelsight": 6.5,
-    "9dtact": 4.0,
+    name: record.contact_threshold
+    for name, record in RECORDS.items()
+    if record.contact_threshold is not None
 }
 # Columns that report contact, in order of preference, and the value above which they do.
 REFERENCES: Mapping[str, float] = {

@@ -1,7 +1,8 @@
 """Tokens for your own sensor, trained on simulated touches of it.
 
 Each touch is felt by your sensor and by a known one. The features of yours are drawn to those that
-the frozen encoder has of the known one, among the features of other touches. No touch repeats.
+the frozen encoder has of the known one, among the features of other touches (InfoNCE with the known
+sensor as a fixed target). No touch repeats.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from anytouch_jax.config import Config
 from anytouch_jax.encoder.adapt import Adapted, Params, put_tokens, read_model, with_row
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.encoder.base import precision
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.files import atomic_write, read_arrays
 from anytouch_jax.nn.attention import usable
-from anytouch_jax.nn.functional import build
+from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
 from anytouch_jax.progress import bar
@@ -33,13 +35,15 @@ from anytouch_jax.sim.batches import prepared
 from anytouch_jax.sim.endless import CAMERAS, SimulatedTouches
 from anytouch_jax.sim.fitting.touches import COUNT, own_touches, own_world
 from anytouch_jax.sim.sensing.own import read_numbers
+from anytouch_jax.weights.load import Loaded
 
 # of Adam, for tokens and for blocks
 RATE = 1e-3
 DEEP_RATE = 1e-4
 FIRST = 2  # blocks that are trained with `deep`
-KEPT = 480  # features of touches before, that a touch must not be taken for
-HEAT = 0.07  # temperature of the contrast
+KEPT = 480  # features of earlier touches, which serve as negatives
+HEAT = 0.07  # temperature of InfoNCE
+HOLD = 10.0  # weight that holds the features of known sensors with `deep`
 REUSE = 4  # steps with the same touches in other light
 BATCHES = 10  # of held-out touches, before and after
 TIMED = 4 * REUSE  # steps whose speed decides how many there are
@@ -59,116 +63,54 @@ def adapt_by_simulation(
     known: Sequence[str] = CAMERAS,
     log: Log = print,
 ) -> Adapted | None:
-    """Return the model of `run` with tokens for the sensor of a folder NAME.sensor, trained for
-    `minutes`.
+    """Train tokens for the sensor of a folder NAME.sensor.
 
-    `known` are the simulated sensors that take part. With `deep` the first blocks are trained too,
-    and the features of known sensors are held where they are. `before` and `after` are the shares
-    of held-out touches that are found among some 200 by a known sensor, with universal tokens and
-    with the new ones. After Ctrl-C the result is None: the next call continues from the file
-    `state`. Raises UserError, and CheckError if the new tokens find fewer.
+    Args:
+        run: The model, as `load_encoder` takes it.
+        sensor: The folder.
+        minutes: Of training.
+        deep: Train the first blocks too, and hold the features of known sensors where they are.
+        state: A file for the state after Ctrl-C, from which the next call continues.
+        seed: Of touches and light.
+        known: Simulated sensors that take part.
+        log: Called with sentences about the progress.
+
+    Returns:
+        The model with the new tokens. `before` and `after` are the fractions of held-out touches
+        that are found among some 200 by a known sensor, with universal tokens and with the new
+        ones. None after Ctrl-C.
+
+    Raises:
+        UserError: For a model or a sensor that cannot be used.
+        CheckError: If the new tokens find fewer touches.
     """
     numbers = read_numbers(sensor)
     loaded, params = read_model(run)
-    stored = loaded.metadata if loaded.from_run else {}
     config, params, row = with_row(loaded, params, numbers.name, str(run), log)
     known = tuple(name for name in loaded.trained_sensors or CAMERAS if name in known)
     if not known:
         raise UserError(f"{run} was trained on no sensor that is simulated; name another run")
-    size = config.model.image_size
     rows = np.array([row, *(config.model.sensor_row(name) for name in known)], np.int32)
-    net = build(
-        usable(replace(config.model, image=None, text=None, match_head="none", lora_rank=0))
-    )
-    plain = config.with_settings(
-        {"data.background": "subtract" if config.data.background != "keep" else "keep"}
-    )
+    task = _Task(config, touch_net(config), rows, deep)
     frozen = jax.device_put({"touch": params["touch"]})
-
-    def encode(weights: Params, clip: Any, of: Any) -> Any:
-        return losses.normalise(net.encode_touch(weights, normalise_touch(clip), of))
-
-    def merged(train: State, frozen: Params) -> Params:
-        touch = frozen["touch"] | {name: part for name, part in train.items() if name != "tokens"}
-        return put_tokens({"touch": touch}, row, train["tokens"])
-
-    def loss(
-        train: State, frozen: Params, key: Any, touches: SimulatedTouches, queue: Any, seen: Any
-    ) -> Any:
-        keys = jax.random.split(key)
-        other, own = (
-            prepared(keys[m], touches.clip[:, m], touches.background[:, m], config) for m in (0, 1)
-        )
-        of = jnp.asarray(rows)[touches.sensor]
-        target = jax.lax.stop_gradient(encode(frozen, other, of[:, 0]))
-        z = encode(merged(train, frozen), own, of[:, 1])
-        among = jnp.where(seen[None], z @ queue.T, -1.0)  # -1 is no rival
-        logits = jnp.concatenate([z @ target.T, among], 1) / HEAT
-        by_known = touches.sensor[:, 0] > 0
-        cost = optax.softmax_cross_entropy_with_integer_labels(logits, jnp.arange(len(z)))
-        value = jnp.sum(cost * by_known) / jnp.maximum(by_known.sum(), 1)
-        if deep:
-            held = encode(merged(train, frozen), other, of[:, 0])
-            value = value + 10.0 * jnp.mean(1 - jnp.sum(held * target, 1))
-        return value, target
-
-    tx = optax.scale_by_adam()
-
-    @jax.jit
-    def step(
-        kept: Kept, frozen: Params, key: Any, touches: Any, number: Any, rate: Any
-    ) -> tuple[Kept, Any]:
-        (train, moments, queue) = kept
-        at = number // REUSE * COUNT
-        seen = jnp.arange(KEPT) < jnp.where(number % REUSE == 0, at, at + COUNT)
-        (value, target), grad = jax.value_and_grad(loss, has_aux=True)(
-            train, frozen, key, touches, queue, seen
-        )
-        updates, moments = tx.update(grad, moments)
-        rates = {name: RATE if name == "tokens" else DEEP_RATE for name in train}
-        moved = {
-            name: jax.tree.map(lambda x, r=rates[name]: -rate * r * x, part)
-            for name, part in updates.items()
-        }
-        if deep:
-            moved["blocks"] = jax.tree.map(lambda x: x.at[FIRST:].set(0), moved["blocks"])
-        new = jax.lax.dynamic_update_slice(queue, target.astype(queue.dtype), (at % KEPT, 0))
-        return (
-            optax.apply_updates(train, moved),
-            moments,
-            jnp.where(number % REUSE == 0, new, queue),
-        ), value
-
-    @jax.jit
-    def features(train: State, frozen: Params, touches: Any) -> tuple[Any, Any]:
-        key = jax.random.key(0)
-        of = jnp.asarray(rows)[touches.sensor]
-        other, own = (
-            prepared(key, touches.clip[:, m], touches.background[:, m], plain, jitter=False)
-            for m in (0, 1)
-        )
-        return encode(merged(train, frozen), own, of[:, 1]), encode(
-            merged(train, frozen), other, of[:, 0]
-        )
-
-    train: State = {"tokens": jnp.asarray(params["touch"]["sensor_tokens"][row])}
-    if deep:
-        train |= {
-            name: jax.tree.map(jnp.asarray, params["touch"][name]) for name in ("patch", "blocks")
-        }
+    features = jax.jit(task.features)
+    train = task.start(params)
     identity = f"{numbers} {loaded.trained_sensors} {deep} {minutes} {seed}"
+    size = config.model.image_size
     with precision(config):
         world, test = (own_world(sensor, split, known) for split in ("train", "test"))
         root = jax.random.key(seed)
+        # Keys of held-out touches are far from those of steps.
         held = [
             own_touches(jax.random.fold_in(root, (1 << 29) + n), test, size=size)
             for n in range(BATCHES)
         ]
         score = partial(_found, held, lambda train, touches: features(train, frozen, touches))
         before = score(train)
+        moments = optax.scale_by_adam().init(train)
         (train, *_), history, finished = _train(
-            (train, tx.init(train), jnp.zeros((KEPT, config.model.embed))),
-            step,
+            (train, moments, jnp.zeros((KEPT, config.model.embed))),
+            task.make_step(),
             frozen,
             60 * minutes,
             root,
@@ -183,31 +125,152 @@ def adapt_by_simulation(
     if after < before:
         raise CheckError(
             f"the new tokens find {after:.1%} of held-out simulated touches by a known sensor, and "
-            "the universal ones "
-            f"{before:.1%}: nothing is saved. Look at look.png of {sensor}, or give more --minutes."
+            f"the universal ones {before:.1%}: nothing is saved. Look at look.png of {sensor}, or "
+            "give more --minutes."
         )
-    source = {
+    metadata = _metadata(loaded, config, run, numbers.name, minutes, deep)
+    fitted = params | task.merged(train, params)
+    return Adapted(config, fitted, history, before, after, "simulated", metadata)
+
+
+def touch_net(config: Config) -> Net:
+    """Return the network of a model without its towers: touch alone is encoded."""
+    model = replace(config.model, image=None, text=None, match_head="none", lora_rank=0)
+    return build(usable(model))
+
+
+def _metadata(
+    loaded: Loaded, config: Config, run: str | Path, name: str, minutes: float, deep: bool
+) -> dict[str, Any]:
+    """Return the metadata of the new run: that of the old one, its sensors, and its source."""
+    stored = loaded.metadata if loaded.from_run else {}
+    metadata: dict[str, Any] = {
+        part: stored[part] for part in ("preprocessing", "data") if part in stored
+    }
+    metadata["sensors"] = list(config.model.sensors)
+    metadata["source"] = {
         "run": str(run),
-        "sensor": numbers.name,
+        "sensor": name,
         "frames": 0,
         "minutes": minutes,
         "deep": deep,
     }
-    metadata: dict[str, Any] = {
-        name: stored[name] for name in ("preprocessing", "data") if name in stored
-    }
-    metadata |= {"sensors": list(config.model.sensors), "source": source}
-    metadata |= (
-        {} if loaded.trained_sensors is None else {"seen": [*loaded.trained_sensors, numbers.name]}
-    )
-    return Adapted(
-        config, params | merged(train, params), history, before, after, "simulated", metadata
-    )
+    if loaded.trained_sensors is not None:
+        metadata["seen"] = [*loaded.trained_sensors, name]
+    return metadata
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What is trained, and for what. `rows` are those of the families in a world, yours first."""
+
+    config: Config
+    net: Net
+    rows: np.ndarray
+    deep: bool
+
+    def start(self, params: Params) -> State:
+        """Return what is trained, as it is in a model."""
+        touch = params["touch"]
+        train: State = {"tokens": jnp.asarray(touch["sensor_tokens"][self.rows[0]])}
+        if self.deep:
+            for name in ("patch", "blocks"):
+                train[name] = jax.tree.map(jnp.asarray, touch[name])
+        return train
+
+    def merged(self, train: State, frozen: Params) -> Params:
+        """Return the parameters of touch with what is trained in its place."""
+        trained = {name: part for name, part in train.items() if name != "tokens"}
+        touch = frozen["touch"] | trained
+        return put_tokens({"touch": touch}, int(self.rows[0]), train["tokens"])
+
+    def encode(self, weights: Params, clip: jax.Array, of: jax.Array) -> jax.Array:
+        """Return normalised features of clips u8 by the sensors of rows `of`."""
+        return losses.normalise(self.net.encode_touch(weights, normalise_touch(clip), of))
+
+    def loss(
+        self,
+        train: State,
+        frozen: Params,
+        key: jax.Array,
+        touches: SimulatedTouches,
+        queue: jax.Array,
+        seen: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return InfoNCE from your sensor to a known one, and the features by the known one.
+
+        `queue` (KEPT, E) are features of earlier touches, of which `seen` (KEPT,) are filled.
+        """
+        keys = jax.random.split(key)
+        other, own = (
+            prepared(keys[m], touches.clip[:, m], touches.background[:, m], self.config)
+            for m in (0, 1)
+        )
+        of = jnp.asarray(self.rows)[touches.sensor]
+        # The frozen encoder is the teacher, so it is not drawn to the new sensor.
+        target = jax.lax.stop_gradient(self.encode(frozen, other, of[:, 0]))
+        z = self.encode(self.merged(train, frozen), own, of[:, 1])
+        among = jnp.where(seen[None], z @ queue.T, -1.0)  # -1 is the least similar of all
+        logits = jnp.concatenate([z @ target.T, among], 1) / HEAT
+        # A touch that your sensor felt twice has no target by a known one.
+        by_known = touches.sensor[:, 0] > 0
+        cost = optax.softmax_cross_entropy_with_integer_labels(logits, jnp.arange(len(z)))
+        value = jnp.sum(cost * by_known) / jnp.maximum(by_known.sum(), 1)
+        if self.deep:
+            held = self.encode(self.merged(train, frozen), other, of[:, 0])
+            value = value + HOLD * jnp.mean(1 - jnp.sum(held * target, 1))
+        return value, target
+
+    def make_step(self) -> Callable[..., tuple[Kept, jax.Array]]:
+        """Return a compiled step of Adam."""
+        tx = optax.scale_by_adam()
+
+        @jax.jit
+        def step(
+            kept: Kept, frozen: Params, key: Any, touches: Any, number: Any, rate: Any
+        ) -> tuple[Kept, jax.Array]:
+            train, moments, queue = kept
+            # Touches are shown REUSE times. Their features enter the queue once, at the first time,
+            # and are negatives from the next batch on.
+            at = number // REUSE * COUNT
+            seen = jnp.arange(KEPT) < jnp.where(number % REUSE == 0, at, at + COUNT)
+            (value, target), grad = jax.value_and_grad(self.loss, has_aux=True)(
+                train, frozen, key, touches, queue, seen
+            )
+            updates, moments = tx.update(grad, moments)
+            moved = {}
+            for name, part in updates.items():
+                own_rate = RATE if name == "tokens" else DEEP_RATE
+                moved[name] = jax.tree.map(lambda x, r=own_rate: -rate * r * x, part)
+            if self.deep:
+                moved["blocks"] = jax.tree.map(lambda x: x.at[FIRST:].set(0), moved["blocks"])
+            new = jax.lax.dynamic_update_slice(queue, target.astype(queue.dtype), (at % KEPT, 0))
+            queue = jnp.where(number % REUSE == 0, new, queue)
+            return (optax.apply_updates(train, moved), moments, queue), value
+
+        return step
+
+    def features(
+        self, train: State, frozen: Params, touches: SimulatedTouches
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return features of touches by your sensor and by the other one, in the light as it is."""
+        key = jax.random.key(0)
+        of = jnp.asarray(self.rows)[touches.sensor]
+        # A score must not depend on a draw, so "either" is "subtract" here.
+        background = "keep" if self.config.data.background == "keep" else "subtract"
+        plain = self.config.with_settings({"data.background": background})
+        other, own = (
+            prepared(key, touches.clip[:, m], touches.background[:, m], plain, jitter=False)
+            for m in (0, 1)
+        )
+        weights = self.merged(train, frozen)
+        return self.encode(weights, own, of[:, 1]), self.encode(weights, other, of[:, 0])
 
 
 def _found(held: list[SimulatedTouches], features: Callable[..., Any], train: State) -> float:
-    """Return the share of held-out touches by your sensor that are nearest to the same touch by a
-    known one.
+    """Return the fraction of held-out touches that are found: recall@1 from your sensor to a known.
+
+    A touch by your sensor is found if the nearest one by a known sensor is the same touch.
     """
     parts = [features(train, touches) for touches in held]
     own, other = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))

@@ -144,9 +144,9 @@ def look(sensor: Sensor) -> Photometry:
 class Unit(NamedTuple):
     """How a device differs from others of its family.
 
-    The f32 arrays are those of one unit, or of several units stacked. `rotation` and `offset` move the *object* before contact (`gel_to_object`). `mirror`, `zoom` and
-    `window` move the *image*: they choose the visible part of the gel and its side. Only the
-    renderer uses them.
+    The f32 arrays are those of one unit, or of several units stacked. `rotation` and `offset` move
+    the *object* before contact (`gel_to_object`). `mirror`, `zoom` and `window` move the *image*:
+    they choose the visible part of the gel and its side. Only the renderer uses them.
     """
 
     base: Leaf  # (h, w, 3) untouched gel of the whole field, 0..1

@@ -3,26 +3,15 @@ from dataclasses import replace
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from batch_leaves import assert_same
 
-from anytouch_jax.config import DataConfig, Stack, preset
-from anytouch_jax.config.augmentation import TouchAugmentation
+from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.data.transforms import touch_transform
-from anytouch_jax.sim.batches import (
-    MOVED,
-    SIMULATED,
-    SimulatedLoader,
-    _partners,
-    _warped,
-    augmented,
-    caption_tokenizer,
-    load_real,
-    moved_gel,
-)
+from anytouch_jax.sim.batches import SIMULATED, SimulatedLoader, _partners, caption_tokenizer
+from anytouch_jax.sim.preparation import MOVED, moved_gel
+from anytouch_jax.sim.real import load_real
 from anytouch_jax.training import pretrain
 
 TINY = Stack(width=16, depth=1, heads=2, mlp=16)
@@ -69,9 +58,11 @@ def recordings(tmp_path_factory):
             name = f"{unit}{number}.png"
             cv2.imwrite(str(folder / name), rng.integers(0, 255, (40, 40, 3), np.uint8))
             gel = "left.png" if unit == "left" else ""
-            lines.append(
-                f"{name},gelsight_mini,{unit}{number // 4},{number % 4},train,p{number // 4},{unit},{gel},soft"
+            place = number // 4
+            row = (
+                f"{name},gelsight_mini,{unit}{place},{number % 4},train,p{place},{unit},{gel},soft"
             )
+            lines.append(row)
     (folder / "manifest.csv").write_text("\n".join(lines) + "\n")
     return folder / "manifest.csv"
 
@@ -129,68 +120,6 @@ def test_real_partners_are_of_the_same_place_and_another_unit(recordings):
     assert len(gels) == 2 and np.any(np.all(gels[:, 0] == 90, axis=(1, 2, 3))), (
         "one stored picture, one median"
     )
-
-
-def test_augmentation_moves_all_frames_alike():
-    clip = np.zeros((3, 2, 20, 20, 3), np.uint8)
-    clip[:, :, 4:9, 11:15] = 200
-    config = tiny(**{"data.affine": (20.0, 0.1, 0.2), "data.flip": 0.5})
-    moved = np.asarray(augmented(jax.random.key(2), clip, config))
-    np.testing.assert_array_equal(moved[:, 0], moved[:, 1])
-    assert np.abs(moved[0].astype(int) - clip[0]).max() > 0 and moved.max() > 150
-
-
-class FixedDraws:
-    """A generator whose next draws are given."""
-
-    def __init__(self, tosses, draws):
-        self.tosses = tosses
-        self.draws = draws
-
-    def random(self, count):
-        return np.array(self.tosses[:count])
-
-    def uniform(self, low, high, count):
-        assert (low, high, count) == (-1, 1, len(self.draws))
-        return np.array(self.draws)
-
-
-@pytest.mark.parametrize(
-    ("tosses", "turn", "zoom", "across", "down"),
-    [
-        ((0.9, 0.9), 0.0, 0.0, 0.0, 0.0),
-        ((0.1, 0.9), 0.0, 0.0, 0.6, 0.0),
-        ((0.9, 0.1), 0.7, 0.0, 0.0, 0.0),
-        ((0.9, 0.9), 0.0, -0.8, 0.0, -0.5),
-        ((0.1, 0.1), -0.9, 0.6, -0.7, 0.4),
-    ],
-)
-def test_numpy_and_jax_augment_alike(tosses, turn, zoom, across, down):
-    """The same draws give the same picture, to the rounding of OpenCV's fixed point."""
-    # Turns are drawn to both sides alike, and the two forms count them in opposite directions.
-    config = DataConfig(flip=0.5, affine=(30.0, 0.2, 0.5), jitter=(0.0,) * 4)
-    size = 40
-    row, column = np.mgrid[:size, :size] / size
-    waves = [np.sin(5 * row + 3 * column), np.cos(7 * column - 2 * row), row * column]
-    picture = np.stack([120 + 100 * wave for wave in waves], -1).astype(np.uint8)
-    host = touch_transform(
-        picture[None], size, FixedDraws(tosses, (turn, zoom, across, down)), config
-    )
-    flipped = picture[:, :: -1 if tosses[0] < 0.5 else 1][:: -1 if tosses[1] < 0.5 else 1]
-    draws = jnp.array([-turn, zoom, down, across, 0.0], jnp.float32)
-    device = _warped(flipped[None], draws, TouchAugmentation.of(config))
-    apart = np.abs(host.astype(int) - np.asarray(device, int))
-    assert apart.max() <= 4 and apart.mean() < 0.5
-
-
-def test_a_run_flips_on_the_device_as_often_as_in_the_loader():
-    clip = np.zeros((400, 1, 8, 8, 3), np.uint8)
-    clip[:, :, :2, :3] = 200
-    for flip in (0.0, 0.3, 1.0):
-        moved = np.asarray(augmented(jax.random.key(0), clip, tiny(**{"data.flip": flip})))
-        across = (moved[:, 0, :, -1, 0] > 0).any(1).mean()
-        down = (moved[:, 0, -1, :, 0] > 0).any(1).mean()
-        np.testing.assert_allclose((across, down), flip, atol=0.07)
 
 
 def test_a_gel_moves_by_fractions_of_a_pixel_since_its_picture():

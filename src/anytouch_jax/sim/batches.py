@@ -5,7 +5,7 @@ are kept on the device at the model's size, because a batch is put together ther
 on the seed and the step alone, so a run that was stopped continues to the bit.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -13,91 +13,42 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.ndimage import map_coordinates
 
-from anytouch_jax.batch import AlignBatch, FieldBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config
-from anytouch_jax.config.augmentation import TouchAugmentation
-from anytouch_jax.data.loading.pools import CLIP, STILL, MatchPool, Pools, epoch_weights, find_pools
-from anytouch_jax.data.loading.samples import SampleReader, read_image
+from anytouch_jax.data.loading.pools import CLIP, STILL
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
-from anytouch_jax.data.transforms import UNTOUCHED, touch_evaluation
+from anytouch_jax.data.tokenizer import Tokenizer
 from anytouch_jax.errors import UserError, refuse_forked
-from anytouch_jax.sim import endless, scene
-from anytouch_jax.sim.contact.mechanics import KPA_MM2
+from anytouch_jax.sim import endless
 from anytouch_jax.sim.draws import Leaf
 from anytouch_jax.sim.endless import Sampling, SimulatedTouches, World
+from anytouch_jax.sim.modalities import (
+    WORDINGS,
+    Texts,
+    caption_tokenizer,
+    photo_bank,
+    real_captions,
+    training_objects,
+    wordings,
+)
+from anytouch_jax.sim.preparation import augmented, field_batch, moved_gel, prepared
+from anytouch_jax.sim.real import Pairs, Real, load_real
 from anytouch_jax.sim.sensing.own import find_sensor
-from anytouch_jax.sim.sensing.photo import seeded_photograph
-from anytouch_jax.sim.world.objects import Object, caption
+
+# `caption_tokenizer` is used by those who make a loader, which needs its result.
+__all__ = ["FIELDS", "SIMULATED", "SimulatedLoader", "caption_tokenizer"]
 
 SIMULATED = "simulated"  # the word of --data that stands for simulated touches
-WORDINGS = 8  # captions of each object
-VOCABULARY = 2048
 WEIGHT = 9.0  # of simulated touches (--data.weights simulated) over all real ones
 # share of the touches of stage 1 and 2 that show an untouched gel, if fields are learned
 FREE = (0.06, 0.02)
 TRIES = 8  # draws in which a partner by another unit is looked for
-MOST_PIXELS = 4_000_000_000  # bytes of real frames that are kept on the device
 FIELD_SHARE = 0.5  # of a batch's touches: those whose fields are learned
 FIELDS = ("displacement", "shear", "pressure")
-# Share of touches whose background is subtracted, by --data.background.
-SUBTRACTED = {"keep": 0.0, "subtract": 1.0, "either": 0.7}
 MEDIAN = 0.4  # share of real touches whose background is the median, and not the stored picture
-# Largest deviation, in pixels, of the place of a gel since its picture: 0.2 on still recordings of
-# a GelSight Mini.
-MOVED = 0.5
 Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
-
-
-class Windows(NamedTuple):
-    """Stills or clips of real frames."""
-
-    rows: Leaf  # i32 (W, T)
-    share: Leaf  # f32 (W,) cumulative probability
-
-
-class _Pairs(NamedTuple):
-    """Stills or clips of places that others touched too.
-
-    Those of one place are neighbours in `order`: those of touch n are the `many[n]` from `low[n]`.
-    """
-
-    rows: Leaf  # i32 (W, T)
-    share: Leaf  # f32 (W,) cumulative probability
-    order: Leaf  # i32 (W,)
-    low: Leaf  # i32 (W,)
-    many: Leaf  # i32 (W,)
-    place: Leaf  # i32 (W,)
-    unit: Leaf  # i32 (W,)
-
-
-class Real(NamedTuple):
-    """Real frames on the device.
-
-    `windows` and `pairs` have an entry for stills and one for clips, or None.
-    """
-
-    frame: Leaf  # u8 (N, S, S, 3)
-    # u8 (G, 2, S, S, 3): the stored picture of the untouched gel, and the median of the unit
-    gel: Leaf
-    gel_of: Leaf  # i32 (N,)
-    sensor: Leaf  # i32 (N,)
-    caption: Leaf  # i32 (N,), -1 without
-    windows: tuple[Windows | None, ...]
-    pairs: tuple[_Pairs | None, ...]
-
-
-class Texts(NamedTuple):
-    """Token ids and masks (n, S) of all captions.
-
-    They are WORDINGS for each simulated object, then those of real rows, then an empty one.
-    """
-
-    ids: Leaf
-    mask: Leaf
 
 
 # One program for all loaders of one form.
@@ -258,160 +209,6 @@ class SimulatedLoader:
         return self._assemble(key, self.touches(step), self._real, self._photos, self._texts)
 
 
-def training_objects(config: Config) -> tuple[Object, ...]:
-    """Return the objects that are touched in training: the train split, and variants of it."""
-    scenes = scene.training_scenes(config.simulated)
-    return endless.objects_of(scenes, "train", variants=config.simulated.variants)
-
-
-def wordings(things: Sequence[Object], count: int = WORDINGS) -> list[str]:
-    """Return `count` captions of each object."""
-    return [
-        caption(thing, np.random.default_rng([thing.seed, scene.CAPTION, number]))
-        for thing in things
-        for number in range(count)
-    ]
-
-
-def real_captions(manifest: Manifest | None) -> list[str]:
-    """Return the distinct captions of a manifest, in the order of their codes."""
-    if manifest is None:
-        return []
-    encoded = manifest.column("text").combine_chunks().dictionary_encode()
-    return [str(text) for text in encoded.dictionary.to_pylist()]
-
-
-def caption_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
-    """Return the tokenizer `data.tokenizer`, or one trained on captions of the objects and of the
-    manifest.
-    """
-    if config.data.tokenizer is not None:
-        return load_tokenizer(config.data.tokenizer)
-    assert config.model.text is not None
-    texts = [*wordings(training_objects(config), 4 * WORDINGS), *real_captions(manifest)]
-    return train_tokenizer(texts, min(VOCABULARY, config.model.text.vocab))
-
-
-def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.ndarray:
-    """Return photographs of places (objects, places, 2) mm on each object.
-
-    They are u8 (objects, places, size, size, 3).
-    """
-    jobs = [
-        (thing, place, (thing.seed, scene.PHOTO))
-        for thing, spots in zip(things, places, strict=True)
-        for place in spots
-    ]
-    pictures = endless.over_cores(partial(seeded_photograph, size=size), jobs)
-    return np.stack(pictures).reshape(*places.shape[:2], size, size, 3)
-
-
-def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) -> Real:
-    """Return the real frames of the training split on the device.
-
-    Raises UserError if they are too many.
-    """
-    plain = config.with_settings({"data.background": "keep"})
-    pools: Pools = find_pools(manifest, plain.with_settings({"data.tokenizer": None}), None, 1)
-    for note in pools.notes:
-        log(note)
-    size = config.model.image_size
-    windows = [pool.windows for pool in pools.touch]
-    windows += [pool.windows for pool in pools.match if pool is not None]
-    rows = np.unique(np.concatenate([part.ravel() for part in windows]))
-    if len(rows) * size * size * 3 > MOST_PIXELS:
-        raise UserError(
-            f"{len(rows)} real frames of {size} x {size} pixels do not fit on the device next to "
-            "simulated touches; give fewer recordings, or train on them without `simulated`"
-        )
-    # From a row of the manifest to its place on the device.
-    place = np.full(len(manifest), -1, np.int32)
-    place[rows] = np.arange(len(rows))
-    reader = SampleReader(manifest, plain)
-    frame = np.concatenate([reader.touch(row[None], None) for row in rows])
-    gels, gel_of = _real_gels(manifest, rows, frame, size)
-    texts = manifest.column("text").combine_chunks().dictionary_encode()
-    caption = texts.indices.fill_null(-1).to_numpy(False)[rows].astype(np.int32)
-    weights, _ = epoch_weights(manifest, config, rows)
-    if weights is None:
-        weights = np.ones(len(manifest))
-    kinds: list[Windows | None] = [
-        Windows(place[pool.windows], _cumulative(weights[pool.windows[:, -1]]))
-        for pool in pools.touch
-    ]
-    kinds += [None] * (2 - len(kinds))
-    real = Real(
-        frame=frame,
-        gel=gels,
-        gel_of=gel_of,
-        sensor=pools.sensor[rows].astype(np.int32),
-        caption=caption,
-        windows=tuple(kinds),
-        pairs=tuple(_pairs(manifest, match, place, weights) for match in pools.match),
-    )
-    return jax.device_put(real)
-
-
-def _real_gels(
-    manifest: Manifest, rows: np.ndarray, frame: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return pictures of untouched gels u8 (G, 2, S, S, 3), and the number of each row's.
-
-    A gel has its stored picture and the median of its unit, which is both where none is stored.
-    """
-    stored = manifest.codes("background_path")[rows]
-    unit = manifest.codes("unit")[rows]
-    sensor = manifest.codes("sensor")[rows]
-    # Rows without a unit belong to one of their sensor.
-    owner = np.where(unit >= 0, unit, -1 - sensor)
-    _, first, group = np.unique(
-        np.stack([owner, stored]), axis=1, return_index=True, return_inverse=True
-    )
-    medians = dict[int, np.ndarray]()
-    gels = []
-    for place in first:
-        own = int(owner[place])
-        if own not in medians:
-            same = np.flatnonzero(owner == own)
-            # Some 300 frames are enough for a median.
-            some = frame[same[:: max(1, len(same) // 300)]]
-            medians[own] = np.median(some, axis=0).astype(np.uint8)
-        picture = medians[own]
-        if stored[place] >= 0:
-            image = read_image(manifest, int(rows[place]), "background_path")
-            picture = touch_evaluation([image], size)[0]
-        gels.append(np.stack([picture, medians[own]]))
-    return np.stack(gels), group.ravel().astype(np.int32)
-
-
-def _cumulative(weights: np.ndarray) -> np.ndarray:
-    """Return cumulative probabilities f32 of weights."""
-    return (np.cumsum(weights) / weights.sum()).astype(np.float32)
-
-
-def _pairs(
-    manifest: Manifest, match: MatchPool | None, place: np.ndarray, weights: np.ndarray
-) -> _Pairs | None:
-    """Return the windows of a pool for matching, sorted by place."""
-    if match is None:
-        return None
-    windows = match.windows[match.matches.anchors]
-    last = windows[:, -1]
-    touch = manifest.codes("touch", own=True)[last]
-    order = np.argsort(touch, kind="stable")
-    low = np.searchsorted(touch[order], touch)
-    count = np.searchsorted(touch[order], touch, side="right") - low
-    return _Pairs(
-        rows=place[windows],
-        share=_cumulative(weights[last]),
-        order=order.astype(np.int32),
-        low=low.astype(np.int32),
-        many=count.astype(np.int32),
-        place=touch.astype(np.int32),
-        unit=manifest.codes("unit")[last].astype(np.int32),
-    )
-
-
 class _Touches(NamedTuple):
     """Prepared touches."""
 
@@ -553,7 +350,7 @@ def _drawn(key: Array, share: Leaf, count: int) -> Array:
     return jnp.minimum(jnp.searchsorted(share, jax.random.uniform(key, (count,))), len(share) - 1)
 
 
-def _partners(key: Array, pairs: _Pairs, at: Array) -> Array:
+def _partners(key: Array, pairs: Pairs, at: Array) -> Array:
     """Return a touch of the same place for each of `at`.
 
     It is by another unit if TRIES draws find one, else another touch, else the same.
@@ -573,121 +370,4 @@ def _real_touches(key: Array, real: Real, rows: Array, config: Config) -> _Touch
     moved = augmented(warp, jnp.concatenate([real.frame[rows], background[:, None]], 1), config)
     return _Touches(
         prepared(prepare, moved[:, :-1], moved[:, -1], config), real.sensor[rows[:, -1]]
-    )
-
-
-def augmented(key: Array, clip: Leaf, config: Config) -> Array:
-    """Return clips u8 (B, T, S, S, 3), mirrored, turned, shifted, zoomed and stretched.
-
-    Frames of a clip move alike. This is `data.transforms.touch_transform` on the device.
-    """
-    settings = TouchAugmentation.of(config.data)
-    toss, turn = jax.random.split(key)
-    across, down = jax.random.bernoulli(toss, settings.flip, (2, len(clip), 1, 1, 1, 1))
-    clip = jnp.where(across, clip[:, :, :, ::-1], clip)
-    clip = jnp.where(down, clip[:, :, ::-1], clip)
-    if not any((settings.turn, settings.shift, settings.zoom)):
-        return clip
-    draws = jax.random.uniform(turn, (len(clip), 5), minval=-1.0)
-    return jax.vmap(partial(_warped, settings=settings))(clip, draws)
-
-
-def _warped(clip: Array, draw: Array, settings: TouchAugmentation) -> Array:
-    """Turn, zoom, stretch and shift a clip u8 (T, S, S, 3) about its centre.
-
-    `draw` (5,) in -1..1 are parts of the largest turn, zoom, shift down, shift across and stretch.
-    """
-    angle = jnp.deg2rad(draw[0] * settings.turn)
-    zoom = (1 + settings.zoom) ** draw[1]
-    stretch = settings.stretch ** draw[4]
-    height, width = clip.shape[1:3]
-    # From a place in the result back to its source: shift, turn, then zoom, each inverted.
-    y, x = jnp.mgrid[:height, :width]
-    y = y - (height - 1) / 2 - draw[2] * settings.shift * height
-    x = x - (width - 1) / 2 - draw[3] * settings.shift * width
-    source = jnp.stack(
-        [jnp.cos(angle) * y - jnp.sin(angle) * x, jnp.sin(angle) * y + jnp.cos(angle) * x]
-    )
-    source = source / (zoom * jnp.stack([stretch**0.5, stretch**-0.5]))[:, None, None]
-    source = source + jnp.array([(height - 1) / 2, (width - 1) / 2])[:, None, None]
-    planes = jnp.moveaxis(clip, -1, 1).reshape(-1, height, width).astype(jnp.float32)
-    warped = jax.vmap(lambda plane: map_coordinates(plane, list(source), order=1, mode="mirror"))(
-        planes
-    )
-    warped = jnp.round(warped).astype(jnp.uint8).reshape(clip.shape[0], 3, height, width)
-    return jnp.moveaxis(warped, 1, -1)
-
-
-def prepared(
-    key: Array, clip: Leaf, background: Leaf, config: Config, *, jitter: bool = True
-) -> Array:
-    """Return clips u8 (B, T, S, S, 3), the background (B, S, S, 3) subtracted or not.
-
-    `jitter` changes brightness and colours, about the grey of an untouched gel.
-    """
-    settings = TouchAugmentation.of(config.data)
-    choice, light = jax.random.split(key)
-    frames = clip.astype(jnp.float32)
-    gel = background[:, None].astype(jnp.float32)
-    size = (len(clip), 1, 1, 1, 3)
-    share = SUBTRACTED[config.data.background]
-    subtract = jax.random.bernoulli(choice, share, (len(clip), 1, 1, 1, 1))
-    x = jnp.where(subtract, frames - gel, frames - UNTOUCHED)
-    if jitter:
-        gain, colour, level = jax.random.normal(light, (3, *size))
-        factor = jnp.exp(settings.brightness * gain[..., :1] + settings.colour * colour)
-        x = x * factor + settings.level * level
-    return jnp.round(jnp.clip(x + UNTOUCHED, 0, 255)).astype(jnp.uint8)
-
-
-def moved_gel(key: Array, touches: SimulatedTouches, most: float = MOVED) -> SimulatedTouches:
-    """Return touches whose backgrounds are shifted by fractions of a pixel.
-
-    A gel gives way in its mount, so a real background is never quite in register.
-    """
-    share, to = jax.random.split(key)
-    size = touches.background.shape[:2]
-    shift = most * jax.random.uniform(share, (*size, 1)) * jax.random.normal(to, (*size, 2))
-
-    def moved(picture: Leaf, by: Array) -> Array:
-        picture = picture.astype(jnp.float32)
-        return jax.image.scale_and_translate(
-            picture, picture.shape, (0, 1), jnp.ones(2), by, "linear", antialias=False
-        )
-
-    return touches._replace(background=jax.vmap(jax.vmap(moved))(touches.background, shift))
-
-
-def field_batch(
-    key: Array, touches: SimulatedTouches, sensor: Array, config: Config, count: int
-) -> FieldBatch:
-    """Return the first `count` touches of the last take with their fields, free of scale.
-
-    Lengths are over the width of the picture, pressure is over the gel's modulus, and forces are
-    over modulus times width squared. So a gel of twice the size that is touched by an object of
-    twice the size has the same fields. `sensor` (B, M) are rows of the sensor table.
-    """
-    assert touches.fields is not None
-    clip = touches.clip[:count, -1, -config.model.frames :]
-    width = touches.width[:count, -1]
-    labels = {name: x[:count, -1, -1] for name, x in touches.labels.items()}
-    fields = touches.fields[:count, -1]
-    stiff = touches.modulus[:count, -1]
-    aspect = touches.aspect[:count, -1]
-    scale = stiff * width**2 * KPA_MM2
-    force = jnp.stack([labels["force_x"], labels["force_y"], labels["force"]], -1) / scale[:, None]
-    shown = fields[..., 3] / stiff[:, None, None]
-    # Force outside of the picture cannot be seen, so the normal force is the sum of what is shown:
-    # the mean pressure times the area, which is width times height.
-    force = force.at[:, 2].set(jnp.mean(shown, (1, 2)) * jnp.exp(aspect))
-    return FieldBatch(
-        prepared(key, clip, touches.background[:count, -1], config, jitter=False),
-        sensor[:count, -1],
-        aspect,
-        fields[..., 0] / width[:, None, None],
-        fields[..., 1:3] / width[:, None, None, None],
-        shown,
-        force,
-        labels["torque"] / (scale * width),
-        labels["slip"],
     )

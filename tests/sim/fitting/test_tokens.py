@@ -16,7 +16,7 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import CheckError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.sim.endless import SimulatedTouches
-from anytouch_jax.sim.fitting import tokens
+from anytouch_jax.sim.fitting import task, tokens
 from anytouch_jax.sim.sensing.own import OwnSensor, write_sensor
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
 from anytouch_jax.weights import checkpoint
@@ -143,7 +143,7 @@ def test_tokens_that_find_fewer_touches_are_not_saved(run, mine, tmp_path, monke
 
 def test_training_finds_touches_that_the_universal_tokens_do_not(run, mine, monkeypatch):
     monkeypatch.setattr(tokens, "BATCHES", 2)
-    monkeypatch.setattr(tokens, "DEEP_RATE", 3e-3)
+    monkeypatch.setattr(task, "DEEP_RATE", 3e-3)
     adapted = tokens.adapt_by_simulation(run, mine, minutes=0.25, deep=True)
     assert len(adapted.losses) == 150 and adapted.after > adapted.before
 

@@ -17,6 +17,7 @@ from anytouch_jax.errors import CheckError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.sim.endless import SimulatedTouches
 from anytouch_jax.sim.fitting import task, tokens
+from anytouch_jax.sim.fitting.touches import COUNT
 from anytouch_jax.sim.sensing.own import OwnSensor, write_sensor
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
 from anytouch_jax.weights import checkpoint
@@ -26,16 +27,10 @@ from anytouch_jax.weights.tree import flatten
 def felt(key, world, *, size):
     """Touches of random patterns. Your sensor shows their negative."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    seen = (
-        rng.integers(80, 176, (tokens.COUNT, 1, 1, 4, 4, 3))
-        .repeat(size // 4, 3)
-        .repeat(size // 4, 4)
-    )
+    seen = rng.integers(80, 176, (COUNT, 1, 1, 4, 4, 3)).repeat(size // 4, 3).repeat(size // 4, 4)
     clip = np.concatenate([seen, 255 - seen], 1).astype(np.uint8)
-    sensor = np.stack([1 + np.arange(tokens.COUNT) % 2, np.zeros(tokens.COUNT, int)], 1).astype(
-        np.int32
-    )
-    none = np.zeros(tokens.COUNT, np.int32)
+    sensor = np.stack([1 + np.arange(COUNT) % 2, np.zeros(COUNT, int)], 1).astype(np.int32)
+    none = np.zeros(COUNT, np.int32)
     return SimulatedTouches(
         clip, np.full_like(clip[:, :, 0], 128), sensor, none, none, None, None, None, None, {}
     )

@@ -1,7 +1,10 @@
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Literal
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.interpolation import sample, sample_sharp
@@ -202,3 +205,45 @@ def test_mistakes_get_a_sentence():
         simulate_touch(ball(6.0), [[0, 0, 0, 0.5]], "tac3d")
     with pytest.raises(UserError, match="a pose"):
         simulate_touch(ball(6.0), [[0, 0, 0]], "digit")
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "exact"])
+def test_xla_is_given_no_large_products_of_constants(fidelity):
+    """Such products are computed while XLA compiles, slowly and with alarms on the terminal.
+
+    The matrices that enlarge a coarse grid are small. Those of the gel and of the picture took 14
+    million multiplications.
+    """
+
+    def press(height_map, pose):
+        return simulate_touch(height_map, pose, "gelsight_mini", fidelity=fidelity)
+
+    program = jax.make_jaxpr(press)(ball(6.0), jnp.zeros((1, 4)))
+    assert sum(constant_products(program.jaxpr)) < 500_000
+
+
+def constant_products(jaxpr, known=frozenset()):
+    """Multiplications of the products in a program whose inputs are all constants."""
+    constants = {*jaxpr.constvars, *known}
+    found = []
+    for equation in jaxpr.eqns:
+        is_known = [isinstance(one, Literal) or one in constants for one in equation.invars]
+        is_loop = equation.primitive.name in ("scan", "while")
+        for inner in inner_programs(equation.params):
+            passed = [] if is_loop else zip(inner.invars, is_known, strict=True)
+            found += constant_products(inner, {one for one, sure in passed if sure})
+        if all(is_known) and equation.primitive.name != "optimization_barrier":
+            constants.update(equation.outvars)
+            if equation.primitive.name == "dot_general":
+                (summed, _), _ = equation.params["dimension_numbers"]
+                length = math.prod(equation.invars[0].aval.shape[axis] for axis in summed)
+                found.append(length * equation.outvars[0].aval.size)
+    return found
+
+
+def inner_programs(params):
+    for value in params.values():
+        for one in value if isinstance(value, tuple) else (value,):
+            program = getattr(one, "jaxpr", one)
+            if hasattr(program, "eqns"):
+                yield program

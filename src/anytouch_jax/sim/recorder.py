@@ -475,8 +475,8 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
     *,
     drag: npt.ArrayLike | Array = (0.0, 0.0, 0.0),
     size: int = 224,
-    modulus: float = 1e6,
-    friction: float = 0.6,
+    modulus: float | Array = 1e6,
+    friction: float | Array = 0.6,
     fidelity: Fidelity = "fast",
     unit: Unit | None = None,
 ) -> SimulatedTouch:
@@ -518,6 +518,17 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
     _check_heights(height_map)
     moves = jnp.broadcast_to(jnp.atleast_2d(jnp.asarray(drag, jnp.float32)), (len(pose), 3))
     device = identity_unit(kind) if unit is None else unit
+    # The device is a constant, so XLA would compute what depends on it alone while it compiles: by
+    # an interpreter, which takes seconds for products of matrices, and prints alarms. Behind a
+    # barrier they are a part of the program, which takes a millisecond for them. The tables of the
+    # gel are for numpy (`elastic._library`), so its two numbers stay in front of the barrier.
+    hidden, seed = jax.lax.optimization_barrier((device, jnp.uint32(0)))
+    device = hidden._replace(thickness=device.thickness, modulus=device.modulus)
+    hardness: Leaf
+    if isinstance(modulus, jax.core.Tracer):
+        hardness = jnp.asarray(modulus, jnp.float32)
+    else:
+        hardness = np.asarray(modulus, np.float32)
 
     def one(pose: Array, drag: Array) -> SimulatedTouch:
         clip = ClipInput(
@@ -527,11 +538,11 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
             motion=drag[None],
             depth=pose[3:],
             tilt=jnp.zeros(2),
-            modulus=jnp.float32(modulus),
+            modulus=hardness,
             friction=jnp.float32(friction),
             unit=device,
             drift=jnp.zeros((1, 3, 3)),
-            seed=jnp.uint32(0),
+            seed=seed,
         )
         out = simulate_clip(
             clip, sensor=kind, fidelity=fidelity, size=size, fields=FIELDS, surface=user_surfaces

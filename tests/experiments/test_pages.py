@@ -147,14 +147,6 @@ def test_a_page_has_at_most_five_findings_and_counts_the_others():
     )
 
 
-def test_the_pages_are_few_and_short_and_so_are_the_studies(committed):
-    texts = [file.read_text() for file in RESULTS.glob("*.md")]
-    assert len(committed) <= 12 and sum(len(text.split()) for text in texts) <= 9000
-    lines = [len(file.read_text().splitlines()) for file in (EXPERIMENTS / "pages").glob("*.py")]
-    assert sum(lines) <= 600
-    assert sum(len(file.read_text().splitlines()) for file in EXPERIMENTS.rglob("*.py")) <= 9500
-
-
 def planted(gain):
     """Every seed has a level; `gain(question, name)` is what a model is better by, and there is
     noise of 0.3 points.

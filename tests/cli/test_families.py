@@ -11,8 +11,8 @@ from touch_world import make_touches
 
 from anytouch_jax import load_encoder
 from anytouch_jax.export import export
-from tests.weights import test_families as forms
 from tests.weights.test_start import mae
+from tests.zoo import test_families as forms
 
 OTHERS = ROOT / "tests" / "parity" / "golden_others"
 # small files of the other families: title, (width, depth, heads, mlp), patch, what else differs,

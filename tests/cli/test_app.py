@@ -23,7 +23,7 @@ from anytouch_jax.live.page import server
 HELP = """
 import contextlib, io, json, sys
 from anytouch_jax.cli.app import COMMANDS, GROUPS, main
-heavy = {'jax', 'flax', 'optax', 'orbax', 'numpy', 'scipy', 'sklearn', 'cv2', 'pyarrow', 'matplotlib', 'tokenizers'}
+heavy = set('jax flax optax orbax numpy scipy sklearn cv2 pyarrow matplotlib tokenizers'.split())
 pages = {}
 for name in ['', *GROUPS, *COMMANDS]:
     with contextlib.redirect_stdout(io.StringIO()) as page:

@@ -224,7 +224,8 @@ def test_what_is_written_is_read_in_the_order_of_the_keys(tmp_path):
 def test_processes_lose_no_record(tmp_path):
     path = tmp_path / "study.jsonl"
     code = "import sys; from pathlib import Path; from experiments.records import write_record\n"
-    code += "for number in range(10): write_record(Path(sys.argv[1]), f'{sys.argv[2]}{number}', {'value': number})"
+    code += "for number in range(10):\n"
+    code += "    write_record(Path(sys.argv[1]), f'{sys.argv[2]}{number}', {'value': number})"
     writers = [
         subprocess.Popen([sys.executable, "-c", code, str(path), name], cwd=ROOT) for name in "abc"
     ]

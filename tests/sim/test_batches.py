@@ -65,8 +65,10 @@ def recordings(tmp_path_factory):
             name = f"{unit}{number}.png"
             cv2.imwrite(str(folder / name), rng.integers(0, 255, (40, 40, 3), np.uint8))
             gel = "left.png" if unit == "left" else ""
+            sequence = number // 4
             lines.append(
-                f"{name},gelsight_mini,{unit}{number // 4},{number % 4},train,p{number // 4},{unit},{gel},soft"
+                f"{name},gelsight_mini,{unit}{sequence},{number % 4},train,p{sequence},{unit},{gel},"
+                "soft"
             )
     (folder / "manifest.csv").write_text("\n".join(lines) + "\n")
     return folder / "manifest.csv"

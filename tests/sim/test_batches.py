@@ -67,8 +67,8 @@ def recordings(tmp_path_factory):
             gel = "left.png" if unit == "left" else ""
             sequence = number // 4
             lines.append(
-                f"{name},gelsight_mini,{unit}{sequence},{number % 4},train,p{sequence},{unit},{gel},"
-                "soft"
+                f"{name},gelsight_mini,{unit}{sequence},{number % 4},train,p{sequence},{unit},"
+                f"{gel},soft"
             )
     (folder / "manifest.csv").write_text("\n".join(lines) + "\n")
     return folder / "manifest.csv"

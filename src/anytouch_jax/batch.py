@@ -34,31 +34,6 @@ class FieldBatch(NamedTuple):
     slip: Array
 
 
-class FieldOutput(NamedTuple):
-    """What the head of fields predicts (B, h, w) at half the picture's resolution, free of scale.
-
-    `*_log` are logarithms of Laplace deviations.
-
-    `depth`, `shear` (..., 2) along x and y of the picture, `pressure` over the gel's modulus.
-    `contact` are logits. `force` (B, 3): tangential x and y and normal, over modulus times width
-    squared. `torque` (B,) over modulus times width cubed. `slip` (B,) logits of the fraction of the
-    contact that slides.
-    """
-
-    depth: Array
-    shear: Array
-    contact: Array
-    pressure: Array
-    depth_log: Array
-    shear_log: Array
-    force: Array
-    torque: Array
-    slip: Array
-    force_log: Array  # (B, 2): tangential, and of the logarithm of the normal force
-    torque_log: Array
-    slip_log: Array
-
-
 @shown_short
 class TouchBatch(NamedTuple):
     """Stage 1: `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,) rows of the sensor table, touches with

@@ -25,7 +25,9 @@ class ContactGate:
 
     def __call__(self, frame: Array) -> float:
         """Return 1 (contact), 0 (none) or NaN (unknown) of a frame RGB u8 (h, w, 3)."""
-        picture = getattr(self._source, "background", self._source)
+        source = self._source
+        # A picture stays, and what prepares live frames may have a better one by now.
+        picture: Array | None = getattr(source, "background", source)  # type: ignore[arg-type]
         if picture is not self._picture:
             self._picture = picture
             self._gel = None if picture is None else UntouchedGel(picture)

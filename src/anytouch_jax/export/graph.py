@@ -14,12 +14,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
 from anytouch_jax.encoder.arrays import Pooling
+from anytouch_jax.encoder.field_outputs import (
+    FORCE,
+    HALF,
+    LENGTH,
+    STATES,
+    STRESS,
+    TORQUE,
+)
 from anytouch_jax.errors import UserError
 from anytouch_jax.export.packages import needed
-from anytouch_jax.fields.outputs import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE
 
 OPSET = 20  # the first with Gelu
 BLOCK = "block"  # start of the names of nodes in blocks
@@ -323,24 +329,25 @@ class _FieldGraph:
         mean = graph("ReduceMean", pressure, [1, 2], keepdims=0)
         normal = graph("Mul", mean, graph("Exp", "aspect"))
         sideways = graph("Mul", graph.part_of(whole, 0, 2, 1), FORCE)
-        out = FieldOutput(
-            depth=graph("Mul", graph.one_of(maps, 0, 3), LENGTH),
-            shear=graph("Mul", graph.part_of(maps, 1, 3, 3), LENGTH),
-            contact=graph.one_of(maps, 3, 3),
-            pressure=pressure,
-            depth_log=graph.one_of(maps, 5, 3),
-            shear_log=graph.one_of(maps, 6, 3),
-            force=graph("Concat", sideways, graph("Unsqueeze", normal, [1]), axis=1),
-            torque=graph("Mul", graph.one_of(whole, 2, 1), TORQUE),
-            slip=graph.one_of(whole, 3, 1),
-            force_log=graph.part_of(whole, 4, 6, 1),
-            torque_log=graph.one_of(whole, 6, 1),
-            slip_log=graph.one_of(whole, 7, 1),
-        )
-        for name, value in out._asdict().items():
+        # In the order of `FieldOutput`: a session takes outputs by their place.
+        out = {
+            "depth": graph("Mul", graph.one_of(maps, 0, 3), LENGTH),
+            "shear": graph("Mul", graph.part_of(maps, 1, 3, 3), LENGTH),
+            "contact": graph.one_of(maps, 3, 3),
+            "pressure": pressure,
+            "depth_log": graph.one_of(maps, 5, 3),
+            "shear_log": graph.one_of(maps, 6, 3),
+            "force": graph("Concat", sideways, graph("Unsqueeze", normal, [1]), axis=1),
+            "torque": graph("Mul", graph.one_of(whole, 2, 1), TORQUE),
+            "slip": graph.one_of(whole, 3, 1),
+            "force_log": graph.part_of(whole, 4, 6, 1),
+            "torque_log": graph.one_of(whole, 6, 1),
+            "slip_log": graph.one_of(whole, 7, 1),
+        }
+        for name, value in out.items():
             graph.name_output(value, name)
         half = self._half
-        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(FieldOutput._fields, ())
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(out, ())
         shapes |= dict.fromkeys(
             ("depth", "contact", "pressure", "depth_log", "shear_log"), (half, half)
         )

@@ -62,7 +62,8 @@ _SYSTEM = (
 )
 _FORM = (
     'Answer with one JSON object and nothing else: {"object": "<what is touched, at most six '
-    'words>", "caption": "<one or two sentences, at most 40 words, that say how the touched place feels>"}.'
+    'words>", "caption": "<one or two sentences, at most 40 words, that say how the touched place '
+    'feels>"}.'
 )
 _TEXTS: dict[Family, str] = {
     "photograph": (

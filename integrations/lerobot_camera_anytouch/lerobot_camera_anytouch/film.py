@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.live.page.live import LoopedFilm
+from anytouch_jax.live.cameras import LoopedFilm
 
 
 class FilmCamera:

@@ -29,9 +29,9 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.page import live as live_module
 from anytouch_jax.live.page import server
+from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.live import Live
-from anytouch_jax.live.page.tables import FeatureMap
-from anytouch_jax.live.page.teach import SCORE, LiveRecorder
+from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
 
 PAGE = {"X-Anytouch": "1"}
 # picture, contact score and features

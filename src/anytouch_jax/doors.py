@@ -36,6 +36,7 @@ BATCHES = {
 # Heads beside the embedding: what builds their module, their loss and what they measure.
 HEADS = {
     "fields": Door("fields.head:HEAD"),
+    "fields measure": Door("fields.measure:measure_of"),
 }
 # Further terms of the training objectives, weighted by `objective.terms`.
 OBJECTIVES = {
@@ -43,8 +44,8 @@ OBJECTIVES = {
 }
 # What computes the features of touch instead of XLA.
 ENGINES = {
-    "cached": Door("export.export:cached_export"),
-    "onnx": Door("export.export:load", "engines"),
+    "cached": Door("export.cache:cached_export"),
+    "onnx": Door("export.encoder:load_engine", "engines"),
 }
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from anytouch_jax.data.images import QUIET, frame_time, to_rgb
 from anytouch_jax.encoder.arrays import Join, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.base import Preprocess, precision
-from anytouch_jax.encoder.encoder import Encoder, EngineEncoder, check_frames
+from anytouch_jax.encoder.encoder import Encoder, check_frames
 from anytouch_jax.errors import UserError, handled
 from anytouch_jax.fields.measure import Fields, Measure
 
@@ -309,7 +309,7 @@ def compile_for_one(
     if measures:
         encoder.encode_and_measure(touch, row, np.zeros(1, np.float32), pooling)
         return lambda clip, aspect: encoder.encode_and_measure(clip, row, aspect, pooling)
-    if isinstance(encoder, EngineEncoder) or encoder.exported(frames, pooling) is not None:
+    if not encoder.runs_in_jax or encoder.exported(frames, pooling) is not None:
         call = partial(encoder.encode_touch, sensor=np.full(1, sensor), pooling=pooling, join=join)
         call(touch)
         return call

@@ -327,7 +327,9 @@ OPENCLIP = KeyMap(
     ),
     towers={
         "image": r"visual\..*",
-        "text": r"text_projection|token_embedding\..*|positional_embedding|transformer\..*|ln_final\..*",
+        "text": (
+            r"text_projection|token_embedding\..*|positional_embedding|transformer\..*|ln_final\..*"
+        ),
         "logit_scale": r"logit_scale",
     },
 )

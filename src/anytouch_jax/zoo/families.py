@@ -28,8 +28,8 @@ from anytouch_jax.config.parsing import Above0, Count, check, read_value
 from anytouch_jax.errors import ConfigError, UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Resample, Vit, VitConfig
-from anytouch_jax.weights import convert, keymaps, load, registry
-from anytouch_jax.weights.convert import KEYMAPS, check_arrays, file_shapes, fill, refuse_unknown
+from anytouch_jax.weights import convert, keymaps, load
+from anytouch_jax.weights.convert import check_arrays, file_shapes, fill, refuse_unknown
 from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten, nest
@@ -367,10 +367,15 @@ class FamilyModel:
     params: dict[str, np.ndarray] = field(repr=False)
 
 
-_UNREAD = {  # an array of a relative of these families: why it is not read
-    "dist_token": "is a distilled DeiT, which has a second class token; give a DeiT without distillation",
-    "fc_norm.weight": "classifies by the mean of its patches (fc_norm) and has no norm of its tokens, as a fine-tuned "
-    "MAE does; give weights from before the fine-tuning",
+# An array that only a relative of these families has, and why such a file is not read.
+_UNREAD = {
+    "dist_token": (
+        "is a distilled DeiT, which has a second class token; give a DeiT without distillation"
+    ),
+    "fc_norm.weight": (
+        "classifies by the mean of its patches (fc_norm) and has no norm of its tokens, as a "
+        "fine-tuned MAE does; give weights from before the fine-tuning"
+    ),
     **dict.fromkeys(
         (
             "blocks.0.mlp.w1.weight",
@@ -594,36 +599,6 @@ def _completed(
         if re.sub(r"\d", "", other) not in known:
             own[other] = np.zeros(len(own[key]))
     return own
-
-
-def load_start(
-    fresh: dict[str, Any],
-    config: Config,
-    *,
-    init: str | Path | None = None,
-    clip: str | Path | None = None,
-) -> load.Start:
-    """Return the first parameters of a run, as `load.load_init`, where `init` may also be an
-    encoder of photographs.
-
-    DINOv2, ViT-MAE, ViT and DeiT start the touch encoder. CLIP weights do so in stage 1, as `clip`.
-    Raises UserError.
-    """
-    model, weights = (None, None) if init is None else load_family(registry.locate(init))
-    if model is None:
-        towers = any(
-            re.fullmatch(KEYMAPS[name].mark, key)
-            for name in ("clip", "openclip")
-            for key in weights or ()
-        )
-        if towers and clip is None and config.stage == 1:
-            return load.load_init(fresh, config, clip=init)
-        return load.load_init(fresh, config, init=init, clip=clip)
-    start = (
-        load.load_init(fresh, config, clip=clip) if clip is not None else load.Start(fresh, [], ())
-    )
-    touch, notes = touch_of_photographs(model, str(init), config, start.params["touch"])
-    return start._replace(params={**start.params, "touch": touch}, notes=[*start.notes, *notes])
 
 
 def touch_of_photographs(

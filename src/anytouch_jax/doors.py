@@ -27,7 +27,7 @@ class Door(NamedTuple):
 WEIGHTS = {
     "family": Door("zoo.families:load_family"),
     "family encoder": Door("zoo.encoder:family_encoder"),
-    "image encoder": Door("zoo.families:touch_of_photographs"),
+    "image encoder": Door("zoo.start:touch_of_photographs"),
     "torch": Door("zoo.torch_file:read_torch"),
 }
 # Sources of training batches, by the word of --data. Each has the interface of `batch.BatchSource`.

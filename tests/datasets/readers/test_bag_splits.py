@@ -1,6 +1,6 @@
 """The topics of one recording show one touch, so they are in one split."""
 
-from tests.data.readers.test_bags import image, write_topics
+from tests.datasets.readers.test_bags import image, write_topics
 
 RECORDINGS = 30
 TOPICS = ("/gel/left", "/gel/right")

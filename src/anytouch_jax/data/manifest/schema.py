@@ -28,6 +28,7 @@ PATHS = ("path", "image_path", "image2_path", "background_path", "field_path")
 # Spellings of an unknown value, in small letters. Spreadsheets write #N/A, and pandas <NA>.
 EMPTY = ("", "na", "n/a", "n.a.", "#n/a", "<na>", "nan", "none", "null", "nil", "-", "--", "?")
 
+EXAMPLES = 5  # rows that a report on many rows names
 MAX_ROWS = 20_000_000  # of a manifest file
 MAX_TEXT = 10_000  # bytes of a text cell in the columns that are used
 _SPACES = r"[\s\p{Z}\x{200B}\x{FEFF}]+"

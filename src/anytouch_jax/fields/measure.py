@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from anytouch_jax.data.background.dots import DotFlow
+from anytouch_jax.data.background.layout import UnitFrames, check_layout, known_gels
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import METADATA, Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.files import atomic_write
-from anytouch_jax.live.health import UnitFrames, check_layout, known_gels
 from anytouch_jax.shown import shown_short
 
 

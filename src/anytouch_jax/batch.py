@@ -5,12 +5,13 @@ Pixels are uint8, channel last (RGB), because a quarter of the bytes travel; nor
 on the device. B batch, V image slots, L text slots, S text length.
 
 A loader fills batches of numpy arrays, `TouchBatch[np.ndarray]`. A step sees the same batches with
-jax arrays, `TouchBatch[jax.Array]`.
+jax arrays, `TouchBatch[jax.Array]`. Where they come from is a `BatchSource`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
 
 from anytouch_jax.shown import shown_short
 
@@ -127,3 +128,36 @@ class Stage2Batch(NamedTuple, Generic[A]):
     align: AlignBatch[A] | None
     match: MatchBatch[A] | None
     fields: FieldBatch[A] | None = None
+
+
+class BatchSource(Protocol):
+    """Batches of a run: `data.loading.loader.Loader`, or what a row of `doors.BATCHES` names.
+
+    The batch of a step depends on the seed and the step alone, so that a run that continues gets
+    what it would have got.
+
+    Attributes:
+        notes: Sentences for the user.
+    """
+
+    notes: list[str]
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Steps until every sample was drawn once."""
+
+    @property
+    def trained_sensors(self) -> list[str]:
+        """Names of the sensors that batches are drawn from."""
+
+    @property
+    def examples(self) -> Sequence[tuple[Any, Callable[[], Any]]]:
+        """A batch of each structure, as shapes and a function that makes it.
+
+        Their steps are compiled side by side. Empty: each is compiled when it comes.
+        """
+
+    def stream(
+        self, start: int, stop: int
+    ) -> Iterator[tuple[int, TouchBatch[Any] | Stage2Batch[Any], Mapping[str, Any]]]:
+        """Yield (step, batch, numbers for the log) for steps start .. stop - 1."""

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.batch import AlignBatch, MatchBatch, Stage2Batch, TouchBatch
+from anytouch_jax.batch import AlignBatch, BatchSource, MatchBatch, Stage2Batch, TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data.loading.pools import CLIP, STILL, MatchPool, Pool, find_pools
 from anytouch_jax.data.loading.samples import NAMED, SampleReader, fill_slot
@@ -67,7 +67,7 @@ class _Place(NamedTuple):
     text: int | None
 
 
-class Loader:
+class Loader(BatchSource):
     """Batches for `config.stage` from the split `config.data.split` of a manifest.
 
     Args:
@@ -160,6 +160,11 @@ class Loader:
         align = self._align.at(step)[0]
         match = self._match.at(step)[0]
         return _KINDS[match if align == _NONE else align]
+
+    @property
+    def examples(self) -> tuple[()]:
+        """Nothing: a batch of each structure is compiled when it comes."""
+        return ()
 
     @property
     def steps_per_epoch(self) -> int:

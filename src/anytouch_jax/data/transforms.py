@@ -126,9 +126,7 @@ def touch_evaluation(
 
 
 def orient_frame(frame: np.ndarray, rotate: int = 0, flip: Flip = "none") -> np.ndarray:
-    """Return a frame (h, w, c) turned clockwise by multiples of 90 degrees, then mirrored across or
-    down.
-    """
+    """Return a frame (h, w, c) turned clockwise by multiples of 90 degrees, then mirrored."""
     if rotate:
         frame = np.rot90(frame, -rotate // 90)
     if flip == "across":

@@ -7,10 +7,11 @@ independently of it, an error of weighting or a leak cannot be seen.
 import numpy as np
 import pytest
 
-from anytouch_jax.evaluate import heads, probing
+from anytouch_jax.evaluate import heads, task_scores
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore
 from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.splits import RowRoles
+from anytouch_jax.evaluate.task_plans import Plan
 from anytouch_jax.evaluate.tasks import Task, TaskRows
 
 WIDTH = 6
@@ -58,14 +59,14 @@ def test_the_components_of_pixels_are_those_of_rows_that_are_not_tested():
     everything = np.ones(count, bool)
     roles = RowRoles(y, groups, tested, everything, everything)
     task = Task("shape", "label.shape")
-    plan = probing._Plan(task, rows, roles, np.array(["0", "1"]), 1, [])
+    plan = Plan(task, rows, roles, np.array(["0", "1"]), 1, [])
     pixels = rng.standard_normal((count, 200)).astype(np.float32)
     others = np.where(tested[:, None], 50 * rng.standard_normal((count, 200)), pixels)
     seen = []
     for values in (pixels, others.astype(np.float32)):
         store = FeatureStore(lambda ids, frames, values=values: values[ids])
         source = FeatureSource("raw pixels", store, None, "common")
-        seen.append(probing._labelled(source, plan).x)
+        seen.append(task_scores._labelled(source, plan).x)
     np.testing.assert_allclose(seen[0][~tested], seen[1][~tested], atol=1e-4)
     assert np.abs(seen[0][tested] - seen[1][tested]).max() > 1
 

@@ -14,7 +14,7 @@ from anytouch_jax import load_encoder
 from anytouch_jax.config import Config, Stack, preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.zoo.families import load_start
+from anytouch_jax.weights.start import load_start
 from tests.support.weights_world import assert_same
 from tests.zoo.test_families import MAE, made
 

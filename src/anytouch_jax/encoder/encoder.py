@@ -25,7 +25,7 @@ from anytouch_jax.encoder.interface import TouchEncoder as TouchEncoder
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.files import read_arrays
 from anytouch_jax.shown import shown_short
-from anytouch_jax.weights import load, registry, safetensors
+from anytouch_jax.weights import load, registry
 
 # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg of the untouched gel
 FOLDER = Path(__file__).parent / "examples"
@@ -67,7 +67,7 @@ def load_encoder(
         return load_engine(path, None if engine == "auto" else engine)
     if engine not in ENGINE_CHOICES:
         raise UserError(f"engine is one of {', '.join(ENGINE_CHOICES)}, not {engine!r}")
-    model, weights = open_family(path, heads=heads, image_size=image_size)
+    model, weights = load.open_family(path, heads=heads, image_size=image_size)
     if model is not None:
         if engine not in ("auto", "xla"):
             raise UserError(
@@ -114,23 +114,6 @@ def _refuse_features(path: Path) -> None:
             f"{path} contains features, not an encoder; pass it to `anytouch probe label "
             "--features`"
         )
-
-
-def open_family(
-    path: Path, *, heads: int | None = None, image_size: int | Size | None = None
-) -> tuple[Any, Any]:
-    """Return the model of another family in a file or folder, or None, and arrays that were read.
-
-    The readers of other families are asked about every file that does not say itself that it is of
-    AnyTouch: the authors' .pth files do not. They are not loaded for a run, and not for weights
-    that this package wrote.
-    """
-    if not path.exists() or load.is_run_folder(path):
-        return None, None
-    if path.is_file() and safetensors.MODEL_KEY in safetensors.read_file_metadata(path):
-        return None, None
-    model, weights = enter(WEIGHTS["family"])(path, heads=heads, image_size=image_size)
-    return model, weights
 
 
 def cached_export(encoder: Encoder, frames: int, pooling: Pooling, *, fields: bool = False) -> Any:

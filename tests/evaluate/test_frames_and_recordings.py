@@ -7,7 +7,7 @@ independently of it, an error of weighting or a leak cannot be seen.
 import numpy as np
 import pytest
 
-from anytouch_jax.evaluate import heads, task_scores
+from anytouch_jax.evaluate import heads, probing, saved_heads, task_scores
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore
 from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.splits import RowRoles
@@ -92,7 +92,7 @@ def test_a_head_that_knows_only_its_recordings_is_calibrated_as_one_that_guesses
     about = {"label": "object", "pooling": "class", "frames": 1, "fingerprint": "f"}
     head = heads.linear_head(model, classes, **about)
     assert (head(x)[0] == names).mean() > 0.95
-    head = probing.calibrated(head, x, rows, 0.001, lambda _: None)
+    head = saved_heads.calibrated(head, x, rows, 0.001, lambda _: None)
     known = head.calibration
     assert known.recordings == 60 and known.temperature > 2
     x, names, _ = drawn(rng, 200)

@@ -1,7 +1,6 @@
-"""A head fitted on recordings of live touch, its calibration, and its accuracy.
+"""A head fitted on recordings of live touch, and its calibration.
 
-It is fitted as `anytouch probe label --save` does. Recordings are left out to calibrate it, and to
-compare it with raw pixels.
+It is fitted as `anytouch probe label --save` does. Recordings are left out to calibrate it.
 """
 
 from __future__ import annotations
@@ -15,38 +14,21 @@ import numpy as np
 
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.background.rule import UnitGels
-from anytouch_jax.encoder.arrays import Array
-from anytouch_jax.encoder.embed import Pooling, embed_rows
+from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS, LinearHead
-from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import feature_cache, heads, probing, splits
+from anytouch_jax.evaluate import heads, probing, splits
 from anytouch_jax.live.page.recorder import SCORE
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.evaluate.heads import Scaling
     from anytouch_jax.evaluate.tasks import TaskRows
 
-# of a measured head
-RESULT = (
-    "once",
-    "right",
-    "right_low",
-    "right_high",
-    "pixels",
-    "pixels_low",
-    "pixels_high",
-    "chance",
-)
 _FRAMES = 20  # frames of a recording that are fitted on, evenly spread
-# penalties, of measuring a head: all that there are take three times as long
-_TRIED = (1.0, 0.1, 0.01)
-_BATCH = 4  # frames embedded at once: live touch waits for them
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class TaughtHead:
     """A head, and what it was fitted on.
 
     Attributes:
@@ -71,9 +53,9 @@ def fit_head(
     table: Manifest,
     sensor: str,
     pooling: Pooling,
-    known: dict[str, Array],
+    embed: Callable[[Array], Array],
     log: Callable[[str], None],
-) -> Fitted:
+) -> TaughtHead:
     """Fit a head on the recordings of a manifest, and calibrate it.
 
     Args:
@@ -81,7 +63,7 @@ def fit_head(
         table: the manifest of the recordings.
         sensor: the sensor of the recordings that are used.
         pooling: that of the features.
-        known: features of frames by their path, to which those that are missing are added.
+        embed: gives features f32 (n, E) of rows (n,) of the manifest.
         log: gets what the calibration promises.
 
     Raises:
@@ -90,7 +72,7 @@ def fit_head(
     rows, _ = probing.label_rows(table, "object", group="sequence", sensor=sensor)
     rows = rows.take(_typical(table, rows, THRESHOLDS.get(sensor, DEFAULT_THRESHOLD)))
     ids = rows.rows[:, 0]
-    x = _embed(encoder, table, ids, pooling, known, log)
+    x = embed(ids)
     data, cut, _ = splits.check_rows(x, rows.labels, rows.groups, rows.split, tested=False)
     # Without rows for validation, the penalty is chosen on recordings that are left out in turn.
     penalty = splits.select_option(
@@ -122,60 +104,7 @@ def fit_head(
         head = probing.calibrated(
             head, x, rows, penalty, log, coverage=coverage, false_alarms=false_alarms
         )
-    return Fitted(head, x, ids, rows, names[times > 1], once)
-
-
-def measure_head(table: Manifest, fitted: Fitted) -> dict[str, float]:
-    """Return the accuracy of a head and of raw pixels on recordings that are left out.
-
-    Only names that were recorded more than once are counted.
-    """
-    rows = fitted.rows
-    pixels = feature_cache.pixel_components(
-        feature_cache.pixel_features(table, gels=UnitGels(table)), rows
-    )
-    result = _accuracies(fitted.x, pixels, rows, np.isin(rows.labels, fitted.repeated))
-    result["once"] = fitted.once
-    return result
-
-
-def _embed(
-    encoder: Encoder,
-    table: Manifest,
-    ids: Array,
-    pooling: Pooling,
-    known: dict[str, Array],
-    log: Callable[[str], None],
-) -> Array:
-    """Return features (n, E) of rows: those that live touch had, and those of earlier frames."""
-    paths = table.text_column("path")[ids].tolist()
-    unknown = [place for place, path in enumerate(paths) if path not in known]
-    if unknown:
-        found, values = embed_rows(
-            encoder, table, ids[unknown], pooling=pooling, batch=_BATCH, log=log
-        )
-        if len(found) < len(unknown):
-            raise UserError(
-                f"{len(unknown) - len(found)} recorded frames have no picture of the untouched gel."
-            )
-        known.update({paths[place]: one for place, one in zip(unknown, values, strict=True)})
-    return np.stack([known[path] for path in paths])
-
-
-def _accuracies(x: Array, pixels: Array, rows: TaskRows, tested: Array) -> dict[str, float]:
-    """Return the accuracies of features and of raw pixels, for `tested` (n,) bool rows."""
-    _, counts = np.unique(rows.labels[tested], return_counts=True)
-    result = {"chance": float(counts.max() / tested.sum())}
-    scalings: dict[str, Scaling] = {"right": "column", "pixels": "common"}
-    for name, values in (("right", x), ("pixels", pixels)):
-        arrays = values[tested], rows.labels[tested], rows.groups[tested]
-        found = probing.leave_groups_out(
-            *arrays, folds=splits.FOLDS, penalties=_TRIED, scaling=scalings[name]
-        )
-        result[name] = found.accuracy
-        if found.low is not None and found.high is not None:
-            result |= {f"{name}_low": found.low, f"{name}_high": found.high}
-    return result
+    return TaughtHead(head, x, ids, rows, names[times > 1], once)
 
 
 def _typical(table: Manifest, rows: TaskRows, threshold: float) -> Array:

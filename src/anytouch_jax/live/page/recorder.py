@@ -133,8 +133,8 @@ class LiveRecorder:
             if gel is not None:
                 (part / "background.png").write_bytes(encode(gel, ".png", *_QUICK))
             while (frame := waiting.get()) is not None:
-                file = part / f"{self._written:06d}.png"
-                file.write_bytes(encode(frame.picture, ".png", *_QUICK))
+                data = encode(frame.picture, ".png", *_QUICK)
+                (part / f"{self._written:06d}.png").write_bytes(data)
                 is_unknown = frame.score != frame.score
                 scores.append(None if is_unknown else round(frame.score, 3))
                 features.append(frame.values)

@@ -414,13 +414,13 @@ def _control(live: Live, order: Any) -> None:
     if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
         if live.recorder.state()["on"]:
             raise UserError("A recording is on. Stop it before you turn the picture.")
-        live.orient(rotate, flip)
+        live.frames.orient(rotate, flip)
     elif action == "background":
-        live.capture_background()
+        live.frames.capture_background()
     elif action == "no background":
-        live.set_background(None)
+        live.frames.set_background(None)
     elif action == "record" and isinstance(name, str):
-        live.recorder.start(name, live.gel)
+        live.recorder.start(name, live.frames.setup.gel)
     elif action == "stop":
         live.recorder.stop()
         live.teacher.reload()

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.data.background.estimate import UntouchedGel
-from anytouch_jax.data.background.rule import RunningGel, other_unit, same_unit
+from anytouch_jax.data.background.rule import RunningGel
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.base import Preprocess
@@ -52,7 +50,7 @@ class Setup(NamedTuple):
 
 def make_setup(
     encoder: Encoder,
-    sensor: str | None,
+    sensor: str,
     rotate: int,
     flip: Flip,
     gel: Array | None,
@@ -62,7 +60,7 @@ def make_setup(
 
     Args:
         encoder: what frames are prepared for.
-        sensor: its name, None for the universal tokens.
+        sensor: its name, or that of the universal tokens.
         rotate: degrees clockwise.
         flip: after the rotation.
         gel: the background RGB u8 (h, w, 3), turned as frames are, None to estimate it.
@@ -75,7 +73,7 @@ def make_setup(
         small = scale_down(gel), UntouchedGel(gel)
     measure = None
     if encoder.measures:
-        measure = encoder.measure_of(sensor or UNIVERSAL, gel, log=lambda _: None)
+        measure = encoder.measure_of(sensor, gel, log=lambda _: None)
     # Frames are turned before, so the encoder's preprocessing does not.
     return Setup(rotate, flip, running, gel, small, Preprocess(encoder, gel), measure)
 
@@ -97,17 +95,3 @@ def measure_last(
     aspect = np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
     raw = encoder.encode_and_measure(clip[None], rows, aspect)[1]
     return measure(raw, [picture])
-
-
-def known_gel(
-    gels: Mapping[str, Array], picture: Array, log: Callable[[str], None]
-) -> Array | None:
-    """Return the background of the sensor instance that a picture is of, if it is one of `gels`.
-
-    `log` gets a sentence if the picture is of another instance.
-    """
-    known, why = same_unit(gels, picture)
-    if known is not None and not why:
-        return known
-    log(other_unit(why))
-    return None

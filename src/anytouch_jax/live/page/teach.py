@@ -6,17 +6,20 @@ import os
 import threading
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from tempfile import TemporaryFile
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.encoder.embed import Features, Pooling, save_npz
+from anytouch_jax.encoder.arrays import Array, Pooling
+from anytouch_jax.encoder.embed import Features, embed_rows, save_npz
 from anytouch_jax.encoder.linear_head import load_head, save_head
 from anytouch_jax.errors import UserError
+from anytouch_jax.live.page.accuracy import RESULT, measure_head
 from anytouch_jax.live.page.feature_map import FeatureMap
-from anytouch_jax.live.page.fitting import RESULT, fit_head, measure_head
+from anytouch_jax.live.page.fitting import fit_head
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
 from anytouch_jax.live.page.tables import Table
 
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.linear_head import LinearHead
+
+_BATCH = 4  # frames embedded at once: live touch waits for them
 
 
 class Teacher:
@@ -160,7 +165,7 @@ class Teacher:
             table,
             self._recorder.sensor,
             self._pooling,
-            self._recorder.features,
+            partial(self._embed, table),
             self._log,
         )
         ids = fitted.ids
@@ -185,6 +190,28 @@ class Teacher:
             about |= {name: str(value) for name, value in result.items()}
             save_npz(self._features, features, about)
             self._use(fitted.head)
+
+    def _embed(self, table: Manifest, ids: Array) -> Array:
+        """Return features (n, E) of rows: of live touch, and of frames of an earlier start."""
+        known = self._recorder.features
+        paths = table.text_column("path")[ids].tolist()
+        unknown = [place for place, path in enumerate(paths) if path not in known]
+        if unknown:
+            found, values = embed_rows(
+                self._encoder,
+                table,
+                ids[unknown],
+                pooling=self._pooling,
+                batch=_BATCH,
+                log=self._log,
+            )
+            if len(found) < len(unknown):
+                raise UserError(
+                    f"{len(unknown) - len(found)} recorded frames have no picture of the untouched "
+                    "gel."
+                )
+            known |= {paths[place]: one for place, one in zip(unknown, values, strict=True)}
+        return np.stack([known[path] for path in paths])
 
     def _use(self, head: LinearHead) -> None:
         """Let live touch be named by a head that lies in the folder.

@@ -1,5 +1,6 @@
-"""A film in the place of LeRobot's OpenCV camera, which reads a film as fast as it can and ends
-with it.
+"""A film in the place of LeRobot's OpenCV camera.
+
+LeRobot's own reads a film as fast as it can, and ends with it.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from anytouch_jax.encoder import linear_head
+from anytouch_jax.encoder import calibration, linear_head
 from anytouch_jax.encoder import linear_head as novelty
 from anytouch_jax.encoder.linear_head import ContactGate
 from anytouch_jax.errors import UserError
@@ -155,3 +155,15 @@ def test_contact_is_a_difference_from_the_untouched_gel():
     assert (gate_of(gel), gate_of(pressed)) == (0.0, 1.0)
     with pytest.raises(UserError, match="--background"):
         gate(np.zeros((80, 60, 3), np.uint8))
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_confidence_is_not_above_what_the_groups_support(columns):
+    """However sure the logits are; a temperature that is modest already stays."""
+    rng = np.random.default_rng(2)
+    groups = np.repeat(np.arange(7), 10)
+    logits = 50 * rng.standard_normal((70, columns))
+    found = calibration.modest_temperature(logits, groups, 0.05)
+    confidence = linear_head.probabilities(logits, found).max(1).mean()
+    assert found > 0.05 and confidence == pytest.approx(8 / 9, abs=1e-6)
+    assert calibration.modest_temperature(logits, groups, 2 * found) == 2 * found

@@ -14,13 +14,14 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedFilm, open_source
+from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
 from anytouch_jax.live.page.frames import FrameReader
 from anytouch_jax.live.page.layers import LAYERS, MEASURED, field_numbers, touch_layer
 from anytouch_jax.live.page.naming import NearestTouches, name_touch
 from anytouch_jax.live.page.packet import Shown, packet
 from anytouch_jax.live.page.recorder import LiveRecorder
 from anytouch_jax.live.page.teach import Teacher
-from anytouch_jax.live.stream import Embedded, StreamSettings, stream_with
+from anytouch_jax.live.stream import Embedded, Source, StreamSettings, stream_with
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
@@ -95,10 +96,14 @@ class Live:
 
     def start(self) -> None:
         """Open the source and begin. Raises UserError if it cannot be opened."""
-        source, live = open_source(self.source, self._camera, self._log)
-        if not live and Path(self.source).is_file():
-            source.release()
-            source = LoopedFilm(Path(self.source))
+        source: Source
+        if self.source == EXAMPLE:
+            source = ExampleCamera()
+        else:
+            source, live = open_source(self.source, self._camera, self._log)
+            if not live and Path(self.source).is_file():
+                source.release()
+                source = LoopedFilm(Path(self.source))
         self._thread = threading.Thread(target=self._run, args=(source,), daemon=True)
         self._thread.start()
 

@@ -5,7 +5,8 @@ Pixels are uint8, channel last (RGB); normalisation happens on the device. B bat
 text slots, S text length.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 from anytouch_jax.shown import shown_short
 
@@ -14,7 +15,7 @@ Array = Any  # a numpy or a jax array
 
 @shown_short
 class FieldBatch(NamedTuple):
-    """Touches with exact fields of their last frame (h, w), free of scale as in `nn.fields`.
+    """Touches with exact fields of their last frame (h, w), free of scale as the head's outputs.
 
     `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,), `aspect` f32 (B,) logarithm of height over width.
     `depth` (B, h, w) and `shear` (B, h, w, 2) are shares of the picture's width, `pressure` (B, h,
@@ -32,6 +33,31 @@ class FieldBatch(NamedTuple):
     force: Array
     torque: Array
     slip: Array
+
+
+class FieldOutput(NamedTuple):
+    """What the head of fields predicts (B, h, w) at half the picture's resolution, free of scale.
+
+    `*_log` are logarithms of Laplace deviations.
+
+    `depth`, `shear` (..., 2) along x and y of the picture, `pressure` over the gel's modulus.
+    `contact` are logits. `force` (B, 3): tangential x and y and normal, over modulus times width
+    squared. `torque` (B,) over modulus times width cubed. `slip` (B,) logits of the fraction of the
+    contact that slides.
+    """
+
+    depth: Array
+    shear: Array
+    contact: Array
+    pressure: Array
+    depth_log: Array
+    shear_log: Array
+    force: Array
+    torque: Array
+    slip: Array
+    force_log: Array  # (B, 2): tangential, and of the logarithm of the normal force
+    torque_log: Array
+    slip_log: Array
 
 
 @shown_short
@@ -89,3 +115,33 @@ class Stage2Batch(NamedTuple):
     align: AlignBatch | None
     match: MatchBatch | None
     fields: FieldBatch | None = None
+
+
+class BatchSource(Protocol):
+    """Batches of a run: `data.loading.loader.Loader`, or a row of `doors.BATCHES`.
+
+    The batch of a step depends on the seed and the step alone, so that a run that continues gets
+    what it would have got. `notes` are sentences for the user.
+    """
+
+    notes: list[str]
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Steps until every sample was drawn once."""
+
+    @property
+    def trained_sensors(self) -> list[str]:
+        """Names of the sensors that batches are drawn from."""
+
+    @property
+    def examples(self) -> Sequence[tuple[Any, Callable[[], Any]]]:
+        """A batch of each structure, as shapes and a function that makes it.
+
+        Their steps are compiled side by side. Empty: each is compiled when it comes.
+        """
+
+    def stream(
+        self, start: int, stop: int
+    ) -> Iterator[tuple[int, TouchBatch | Stage2Batch, Mapping[str, Any]]]:
+        """Yield (step, batch, numbers for the log) for steps start .. stop - 1."""

@@ -24,7 +24,9 @@ class Door(NamedTuple):
 
 
 # Readers of weights that are not in AnyTouch's own layouts. `family` is asked about every file.
+# `start` makes the first parameters of a run from a file of any layout.
 WEIGHTS = {
+    "start": Door("zoo.families:load_start"),
     "family": Door("zoo.families:load_family"),
     "family encoder": Door("zoo.encoder:family_encoder"),
     "torch": Door("zoo.torch_file:read_torch"),
@@ -33,13 +35,13 @@ WEIGHTS = {
 BATCHES = {
     "simulated": Door("sim.batches:SimulatedLoader", "sim"),
 }
-# Heads beside the embedding: what builds their module, their loss and what they measure.
+# Heads beside the embedding. Each is a `nn.heads.Head`; its loss is a row of OBJECTIVES.
 HEADS = {
     "fields": Door("fields.head:HEAD"),
 }
-# Further terms of the training objectives, weighted by `objective.terms`.
+# Further terms of the loss, weighted by `objective.terms`. Each is an `objectives.Objective`.
 OBJECTIVES = {
-    "fields": Door("fields.loss:field_terms"),
+    "fields": Door("fields.loss:OBJECTIVE"),
 }
 # What computes the features of touch instead of XLA.
 ENGINES = {

@@ -5,7 +5,7 @@
 import contextlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,8 +31,9 @@ from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
-from anytouch_jax.progress import tracked
 from anytouch_jax.shown import shown_short
+from anytouch_jax.train.loop import Work
+from anytouch_jax.train.tuning import tune_for_steps
 from anytouch_jax.weights import checkpoint, convert, registry
 from anytouch_jax.weights.load import Loaded, load_model
 from anytouch_jax.zoo.families import load_family
@@ -134,7 +135,15 @@ def adapt(
         measure = partial(jax.jit(loss), clip=_read(manifest, config, rows), target=classes[rows])
         clip = _read(manifest, config, fitted)
         tokens, history = _fit(
-            loss, touch, row, clip, classes[fitted], steps=steps, rate=rate, seed=seed
+            loss,
+            touch,
+            row,
+            clip,
+            classes[fitted],
+            config=config,
+            steps=steps,
+            rate=rate,
+            seed=seed,
         )
         before = float(measure(touch))
         after = float(measure(put_tokens(touch, row, tokens)))
@@ -310,6 +319,13 @@ def _read(manifest: Manifest, config: Config, rows: np.ndarray) -> np.ndarray:
     )
 
 
+class Labelled(NamedTuple):
+    """Frames of a step: clip u8 (B, 1, H, W, 3), class i32 (B,)."""
+
+    clip: np.ndarray
+    target: np.ndarray
+
+
 def _fit(
     loss: Loss,
     params: Params,
@@ -317,35 +333,37 @@ def _fit(
     clip: np.ndarray,
     target: np.ndarray,
     *,
+    config: Config,
     steps: int,
     rate: float,
     seed: int,
 ) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Return the tokens (S, D) of the row after `steps` of Adam with a cosine schedule, and the
-    loss of each step.
-    """
-    tx = optax.adam(optax.cosine_decay_schedule(rate, steps))
-    arrays = jax.device_put((params, clip, target))
+    """Return the tokens (S, D) of the row after `steps` of Adam, and the loss of each step."""
+    root = jax.random.key(seed)
 
     @jax.jit
-    def step(
-        tokens: jax.Array, state: Any, key: jax.Array, arrays: Any
-    ) -> tuple[jax.Array, Any, jax.Array]:
-        params, clip, target = arrays
-        key_rows, _ = jax.random.split(key)
+    def drawn(number: Any) -> jax.Array:
+        key_rows, _ = jax.random.split(jax.random.fold_in(root, number))
         # Drawn with replacement: epochs would need another shape for every number of frames.
-        rows = jax.random.randint(key_rows, (BATCH,), 0, clip.shape[0])
-        value, grad = jax.value_and_grad(
-            lambda t: loss(put_tokens(params, row, t), clip[rows], target[rows])
-        )(tokens)
-        updates, state = tx.update(grad, state)
-        return optax.apply_updates(tokens, updates), state, value
+        return jax.random.randint(key_rows, (BATCH,), 0, clip.shape[0])
 
-    tokens = jnp.asarray(params["touch"]["sensor_tokens"][row])
-    state = tx.init(tokens)
-    root = jax.random.key(seed)
-    history = []
-    for number in tracked(range(steps), "steps"):
-        tokens, state, value = step(tokens, state, jax.random.fold_in(root, number), arrays)
-        history.append(value)
-    return np.asarray(tokens), tuple(float(value) for value in history)
+    def batches(start: int, stop: int) -> Iterator[tuple[int, Labelled, dict[str, Any]]]:
+        for number in range(start, stop):
+            rows = np.asarray(drawn(number))
+            yield number, Labelled(clip[rows], target[rows]), {}
+
+    def loss_of(
+        params: Params, batch: Labelled, key: jax.Array, progress: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        merged = put_tokens(params["frozen"], row, params["tokens"])
+        return loss(merged, jnp.asarray(batch.clip), jnp.asarray(batch.target)), {}
+
+    tokens = params["touch"]["sensor_tokens"][row]
+    work = Work(
+        {"tokens": tokens, "frozen": params},
+        loss_of,
+        batches,
+        frozen=(("^frozen/", True), ("", False)),
+    )
+    result = tune_for_steps(config, work, rate=rate, steps=steps)
+    return np.asarray(result.state.trainable["tokens"]), result.losses

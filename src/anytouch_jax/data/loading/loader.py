@@ -119,6 +119,11 @@ class Loader:
         return _KINDS[match if align == _NONE else align]
 
     @property
+    def examples(self) -> tuple[()]:
+        """Nothing: a batch of each structure is compiled when it comes."""
+        return ()
+
+    @property
     def steps_per_epoch(self) -> int:
         """Batches that hold every still and every clip once (and every anchor, if matching has
         separate steps).

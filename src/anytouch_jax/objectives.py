@@ -278,14 +278,17 @@ def trained_by(batch: AnyBatch, *, config: Config) -> Rules:
 
 def _trained_by_stage(batch: AnyBatch, config: Config) -> Rules:
     """Return the rules of `trained_by` without further terms."""
+    align: AlignBatch | None = None
+    match: MatchBatch | None = None
+    frames = 0  # of the touches whose pixels are reconstructed
     if isinstance(batch, TouchBatch):
-        align = match = None
-        pixels = batch
+        frames = batch.clip.shape[1]
     else:
-        align, match = batch.align, batch.match
+        align = batch.align
+        match = batch.match
         # The release keeps the loss of stage 1 on the align batch.
-        pixels = align if config.recipe == "release" else None
-    frames = 0 if pixels is None else pixels.clip.shape[1]
+        if align is not None and config.recipe == "release":
+            frames = align.clip.shape[1]
     has_image = align is not None and align.image.shape[0] > 0
     has_text = align is not None and align.text.shape[0] > 0
     has_match = match is not None
@@ -517,7 +520,8 @@ def stage2_loss(
     """
     key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
     batch = _arrays(batch)
-    align, match = batch.align, batch.match
+    align = batch.align
+    match = batch.match
     patches = net.model.patches
     metrics = Metrics()
     noise = None

@@ -138,8 +138,7 @@ def adapt(
             loss,
             touch,
             row,
-            clip,
-            classes[fitted],
+            Labelled(clip, classes[fitted]),
             config=config,
             steps=steps,
             rate=rate,
@@ -330,8 +329,7 @@ def _fit(
     loss: Loss,
     params: Params,
     row: int,
-    clip: np.ndarray,
-    target: np.ndarray,
+    frames: Labelled,
     *,
     config: Config,
     steps: int,
@@ -345,12 +343,12 @@ def _fit(
     def drawn(number: Any) -> jax.Array:
         key_rows, _ = jax.random.split(jax.random.fold_in(root, number))
         # Drawn with replacement: epochs would need another shape for every number of frames.
-        return jax.random.randint(key_rows, (BATCH,), 0, clip.shape[0])
+        return jax.random.randint(key_rows, (BATCH,), 0, len(frames.clip))
 
     def batches(start: int, stop: int) -> Iterator[tuple[int, Labelled, dict[str, Any]]]:
         for number in range(start, stop):
             rows = np.asarray(drawn(number))
-            yield number, Labelled(clip[rows], target[rows]), {}
+            yield number, Labelled(frames.clip[rows], frames.target[rows]), {}
 
     def loss_of(
         params: Params, batch: Labelled, key: jax.Array, progress: jax.Array

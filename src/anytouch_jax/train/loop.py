@@ -182,17 +182,23 @@ def fit_work(
             return FitResult(state, start, resumed=start, losses=tuple(record.losses))
         if checkpoints is not None:
             checkpoints.check_space(state)
-        if options.display is None:
-            shown = progress.progress(start, stop, log, curve=options.curve)
-        else:
-            shown = options.display(start, stop)
-        advance = stack.enter_context(shown)
+        display = options.display
+        if display is None:
+            display = functools.partial(progress.progress, log=log, curve=options.curve)
+        advance = stack.enter_context(display(start, stop))
         loop = _Loop(config, work, mesh, checkpoints, record, log, advance, options.on_report, pace)
         interrupt: list[signal.Signals] = []
         if checkpoints is not None:
             # Where nothing is kept, a signal ends the work at once.
             interrupt = stack.enter_context(progress.signals())
-        return loop.run(state, start, stop, interrupt)
+        result = loop.run(state, start, stop, interrupt)
+    if result.interrupted and run_dir is not None:
+        # After the bar has gone, which would draw over the line.
+        log(
+            f"stopped by {result.interrupted.name} after step {result.step} and saved in "
+            f"{run_dir}, the same command continues from here"
+        )
+    return result
 
 
 def _open(
@@ -289,11 +295,6 @@ class _Loop:
         signalled = self.signalled(interrupt)
         if figures > 0 and reported < done and not signalled:
             self.report(done, state, placed)
-        if signalled and self.checkpoints is not None:
-            self.log(
-                f"stopped by {signalled.name} after step {done} and saved, the same command "
-                "continues from here"
-            )
         losses = tuple(self.record.losses)
         return FitResult(state, done, self.row, self.traces, start, signalled, losses)
 

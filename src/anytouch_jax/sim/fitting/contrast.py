@@ -46,8 +46,8 @@ class Felt(NamedTuple):
     other_row: Array
     by_known: Array
     target: Array
-    queue: Array
-    filled: Array
+    queue: Array | np.ndarray
+    filled: Array | np.ndarray
 
 
 class Contrast:

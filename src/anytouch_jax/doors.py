@@ -34,14 +34,14 @@ WEIGHTS = {
 BATCHES = {
     "simulated": Door("sim.batches:SimulatedLoader", "sim"),
 }
-# Heads beside the embedding: what builds their module, their loss and what they measure.
+# Heads beside the embedding. Each is a `nn.heads.Head`; its loss is a row of OBJECTIVES.
 HEADS = {
     "fields": Door("fields.head:HEAD"),
     "fields measure": Door("fields.measure:measure_of"),
 }
-# Further terms of the training objectives, weighted by `objective.terms`.
+# Further terms of the loss, weighted by `objective.terms`. Each is an `objectives.Objective`.
 OBJECTIVES = {
-    "fields": Door("fields.loss:field_terms"),
+    "fields": Door("fields.loss:OBJECTIVE"),
 }
 # What computes the features of touch instead of XLA.
 ENGINES = {

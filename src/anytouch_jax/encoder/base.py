@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation
@@ -29,7 +30,6 @@ from anytouch_jax.encoder.features import features_and_fields, network
 from anytouch_jax.encoder.features import precision as precision
 from anytouch_jax.encoder.features import touch_features as touch_features
 from anytouch_jax.encoder.features import touch_only as touch_only
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.encoder.interface import Preprocess as Preprocess
 from anytouch_jax.encoder.measured import Fields, Measure, missing, open_measure
 from anytouch_jax.encoder.towers import PART_NAMES, Towers

@@ -14,9 +14,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.doors import HEADS, enter
 from anytouch_jax.encoder.arrays import Array
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.errors import UserError
 from anytouch_jax.shown import shown_short
 

@@ -20,11 +20,11 @@ import jax
 import numpy as np
 from jax import export as jax_export
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import UNIVERSAL, parse_json
 from anytouch_jax.data.images import decode_bytes
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import Engine
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.export import engines
 from anytouch_jax.shown import described

@@ -18,11 +18,11 @@ import jax
 import numpy as np
 from jax import export as jax_export
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import to_json
 from anytouch_jax.data.images import encode
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import METADATA, Array, Join, Params, Pooling
-from anytouch_jax.encoder.field_outputs import LENGTH, FieldOutput
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.export import engines
 from anytouch_jax.export.artefact import FORMAT, describes, platform_here
@@ -30,6 +30,7 @@ from anytouch_jax.export.artefact import Exported as Exported
 from anytouch_jax.export.artefact import load as load
 from anytouch_jax.export.artefact import read_checked as read_checked
 from anytouch_jax.export.engines import Engine
+from anytouch_jax.fields.outputs import LENGTH
 from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:

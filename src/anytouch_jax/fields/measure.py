@@ -14,15 +14,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.data.background.dots import DotFlow
 from anytouch_jax.data.background.layout import known_gels as known_gels
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import METADATA, Array, Log
-from anytouch_jax.encoder.field_outputs import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.encoder.measured import Fields as Fields
 from anytouch_jax.encoder.measured import missing as missing
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields.faults import faults_of as faults_of
+from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
 from anytouch_jax.fields.pictures import depth_levels as depth_levels
 from anytouch_jax.fields.pictures import overlay as overlay
 from anytouch_jax.fields.pictures import write_surface as write_surface
@@ -158,7 +159,7 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
     """Return the output of the network in mm and N.
 
     Args:
-        out: arrays (B, ...), see `encoder.field_outputs.FieldOutput`.
+        out: arrays (B, ...), see `batch.FieldOutput`.
         scale: that of the sensor.
         shape: the picture's height over its width.
         faults: sentences. With some, no deviation is below the value itself.

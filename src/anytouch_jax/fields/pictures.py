@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from anytouch_jax.encoder.arrays import Array
-from anytouch_jax.encoder.field_outputs import LENGTH
 from anytouch_jax.encoder.measured import Fields
+from anytouch_jax.fields.outputs import LENGTH
 from anytouch_jax.files import atomic_write
 
 _EDGE = 4  # pixels, along each side, of one vertex of a surface

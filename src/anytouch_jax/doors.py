@@ -29,6 +29,10 @@ WEIGHTS = {
     "family encoder": Door("zoo.encoder:family_encoder"),
     "torch": Door("zoo.torch_file:read_torch"),
 }
+# What reads sensor.json of a fitted sensor, a folder NAME.sensor.
+SENSORS = {
+    "fitted": Door("sim.sensing.own:read_numbers", "sim"),
+}
 # Sources of training batches, by the word of --data. Each has the interface of `batch.BatchSource`.
 BATCHES = {
     "simulated": Door("sim.batches:SimulatedLoader", "sim"),

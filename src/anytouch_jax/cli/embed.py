@@ -223,7 +223,8 @@ def save_features(
     if head is not None and len(features.values):
         predictions = features.predictions | _predictions(head, features.values)
         features = replace(features, predictions=predictions)
-        _log_other_sensors(head, features, options.sensor)
+        named = None if options.sensor is None else options.sensor_name
+        _log_other_sensors(head, features, named)
     about |= {
         "encoder": encoder.source,
         "weights": encoder.fingerprint,

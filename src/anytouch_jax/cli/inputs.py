@@ -32,8 +32,10 @@ class SensorOptions:
 
     # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
     model: Path = Path(DEFAULT)
-    # Sensor of the frames. Without it, or if it is unknown, the universal tokens are used.
     sensor: str | None = None
+    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit`. Without it,
+    or if it is unknown, the universal tokens are used.
+    """
     # Picture of the untouched gel: it is subtracted, and decides contact.
     background: Path | None = None
     # Turn the frames clockwise by so many degrees, before anything else.
@@ -42,6 +44,13 @@ class SensorOptions:
     """Mirror the frames after that: across exchanges left and right, down exchanges top and
     bottom.
     """
+
+    @property
+    def sensor_name(self) -> str:
+        """The name that the word of --sensor stands for. Raises UserError for a damaged folder."""
+        from anytouch_jax.encoder.sensor_words import resolve_sensor
+
+        return resolve_sensor(self.sensor or UNIVERSAL).name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,16 +125,18 @@ def load_inputs(options: FrameOptions) -> Inputs:
     """
     from anytouch_jax.encoder.encoder import check_frames, load_encoder
     from anytouch_jax.encoder.linear_head import load_head
+    from anytouch_jax.encoder.sensor_words import resolve_sensor
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    word = resolve_sensor(options.sensor or UNIVERSAL)
     head = None if options.head is None else load_head(options.head)
     pooling = options.pooling
     if pooling is None:
         pooling = "class" if head is None else head.pooling
     enable_compilation_cache()
     encoder = load_encoder(options.model, engine=options.engine).computed_in(options.dtype)
-    if options.sensor is not None:
-        check_spelling(options.sensor, encoder.config.model.sensors)
+    if not word.is_fitted:
+        check_spelling(word.name, encoder.config.model.sensors)
     if str(options.model) == DEFAULT:
         log(f"encoder: {DEFAULT} (name another with --model)")
     check_frames(encoder.config.model, options.frames)
@@ -155,8 +166,8 @@ def frames_input(
     from anytouch_jax.encoder.contact_gate import ContactGate
     from anytouch_jax.encoder.interface import Preprocess
 
-    sensor = options.sensor or UNIVERSAL
-    row = encoder.sensor_row(sensor, log)
+    row = encoder.sensor_row(options.sensor or UNIVERSAL, log)
+    sensor = options.sensor_name
     if options.background is not None and not encoder.subtracts:
         log(
             "--background only decides contact: this encoder was trained on frames without "
@@ -286,7 +297,7 @@ def gels_of(preprocess: Preprocess, options: SensorOptions) -> dict[str, np.ndar
     gel = preprocess.background
     if gel is None:
         return {}
-    return {options.sensor or UNIVERSAL: reduced(orient_frame(gel, options.rotate, options.flip))}
+    return {options.sensor_name: reduced(orient_frame(gel, options.rotate, options.flip))}
 
 
 def log_universal(encoder: Encoder, options: SensorOptions) -> None:

@@ -21,6 +21,7 @@ from anytouch_jax.encoder.arrays import METADATA, Array, Log
 from anytouch_jax.encoder.field_outputs import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.encoder.measured import Fields as Fields
 from anytouch_jax.encoder.measured import missing as missing
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields.faults import faults_of as faults_of
 from anytouch_jax.fields.pictures import depth_levels as depth_levels
@@ -81,7 +82,7 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
 
     Args:
         metadata: of the weights, which may hold factors on deviations and moduli of sensors.
-        sensor: its name. GELS knows the width of some.
+        sensor: its name, or the folder of a fitted one. GELS knows the width of some.
         width_mm: the mm that the picture's width shows, if it is another one.
 
     Raises:
@@ -100,15 +101,19 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
         raise UserError(
             "the calibration of fields in the weights is damaged; load the weights again"
         ) from None
-    gel = GELS.get(sensor)
+    word = resolve_sensor(sensor)
+    gel = GELS.get(word.name)
+    # Nobody has measured the stiffness of an own gel: sensor.json holds a usual one.
+    spread = OTHER_SPREAD if gel is None and word.name not in moduli else 0.0
+    if word.width_mm is not None and word.shape is not None:
+        gel = KnownGel(word.width_mm, word.shape, word.modulus_kpa or OTHER_MODULUS)
     if gel is None:
-        spread = 0.0 if sensor in moduli else OTHER_SPREAD
-        modulus = moduli.get(sensor, OTHER_MODULUS)
+        modulus = moduli.get(word.name, OTHER_MODULUS)
         return Scale(width_mm, modulus, spread, shape=None, factors=factors)
     # Another width is that of a cropped picture, whose shape nobody knows.
     shape = gel.shape if width_mm is None else None
-    modulus = moduli.get(sensor, gel.modulus)
-    return Scale(width_mm or gel.width, modulus, spread=0.0, shape=shape, factors=factors)
+    modulus = moduli.get(word.name, gel.modulus)
+    return Scale(width_mm or gel.width, modulus, spread, shape=shape, factors=factors)
 
 
 _ARRAYS = tuple(
@@ -353,11 +358,12 @@ def measure_of(
 
     Args:
         metadata: those of the weights, see `scale_of`.
-        sensor: its name.
+        sensor: its name, or the folder of a fitted one.
         background: the untouched gel RGB u8 (h, w, 3), as the camera takes it.
         width_mm: the mm that the picture's width shows, see `scale_of`.
         log: takes a sentence on each fault of the first frame.
         rotate: degrees by which frames are turned.
         flip: how they are mirrored after that.
     """
-    return Measure(scale_of(metadata, sensor, width_mm), sensor, background, log, rotate, flip)
+    scale = scale_of(metadata, sensor, width_mm)
+    return Measure(scale, resolve_sensor(sensor).name, background, log, rotate, flip)

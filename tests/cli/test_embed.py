@@ -91,6 +91,25 @@ def test_clips_of_a_manifest_and_of_a_video(embed, tmp_path, world):
     ]
 
 
+def test_a_stack_is_embedded_frame_by_frame(embed, tmp_path, mistake, tiny_run):
+    frames = np.random.default_rng(0).integers(0, 256, (5, 32, 32, 3), np.uint8)
+    (tmp_path / "folder").mkdir()
+    for number, frame in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "folder" / f"{number}.png"), frame[..., ::-1])
+    np.save(tmp_path / "stack.npy", frames)
+    np.savez(tmp_path / "stack.npz", rgb=frames)
+    for length in (1, 3):
+        words = ("--sensor", "digit", "--frames", length)
+        wanted = embed(tmp_path / "folder", *words)
+        for name in ("stack.npy", "stack.npz"):
+            found = embed(tmp_path / name, *words)
+            np.testing.assert_allclose(found["features"], wanted["features"], atol=1e-6)
+            assert found["key/frame_index"].tolist() == list(range(length - 1, 5))
+    np.savez(tmp_path / "two.npz", left=frames, right=frames)
+    out = ("--out", tmp_path / "f.npz")
+    assert "left" in mistake("embed", "--model", tiny_run, "--data", tmp_path / "two.npz", *out)
+
+
 def test_a_bad_picture_of_a_folder_is_named_or_left_out(embed, mistake, tmp_path, world, tiny_run):
     folder = tmp_path / "frames"
     folder.mkdir()

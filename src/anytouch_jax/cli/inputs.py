@@ -277,9 +277,13 @@ def _some_frames(data: Path) -> Iterator[np.ndarray]:
 
     Broken ones are left out.
     """
-    from anytouch_jax.data import images
+    from anytouch_jax.data import images, stacks
     from anytouch_jax.data.background.rule import FRAMES
 
+    stack = stacks.read_stack(data)
+    if stack is not None:
+        yield from stacks.stacked_frames(stack[:: -(-len(stack) // FRAMES)], data)
+        return
     files = images.picture_files(data)
     if files is None:
         yield from images.frames_from_video(data)
@@ -359,20 +363,32 @@ def contact_of_rows(
     return np.where(np.isnan(known), by_score, known)
 
 
-def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[NumberedFrame]:
-    """Yield number, name and RGB u8 pixels of each frame; the frames of a video have no names.
+def count_frames(data: Path) -> int:
+    """Return the number of frames of a folder, a stack, a picture or a video's header."""
+    from anytouch_jax.data import images, stacks
 
-    A folder's pictures come in natural order.
+    stack = stacks.read_stack(data)
+    return images.count_frames(data) if stack is None else len(stack)
+
+
+def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[NumberedFrame]:
+    """Yield number, name and RGB u8 pixels of each frame.
+
+    A folder's pictures come in natural order. The frames of a video or a stack have no names.
 
     Args:
-        data: a folder, a picture or a video.
+        data: a folder, a picture, a stack of frames (.npy, .npz) or a video.
         on_bad_sample: with "skip", a picture that cannot be read is None, and the first are logged.
         times: the time stamps of a video's frames are appended to it, s.
     """
-    from anytouch_jax.data import images
+    from anytouch_jax.data import images, stacks
 
+    stack = stacks.read_stack(data)
     if data.is_dir():
         yield from _frames_of_folder(data, on_bad_sample)
+    elif stack is not None:
+        for number, frame in enumerate(stacks.stacked_frames(stack, data)):
+            yield number, "", frame
     elif images.picture_files(data):
         yield 0, data.name, images.decode(data)
     else:

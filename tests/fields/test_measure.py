@@ -100,6 +100,19 @@ def test_without_contact_and_without_a_width_nothing_is_invented():
         output(contact=np.full((1, SIDE, SIDE), -9.0)), fields.scale_of({}, "digit"), shape=4 / 3
     )
     assert free.area[0] == 0 and np.isnan(free.centre).all() and free.summary()["centre_x"] is None
+    # nothing slips where nothing touches
+    assert np.isnan(free.slip).all() and np.isnan(free.slip_std).all()
+    assert free.summary()["slip"] is None and free.summary()["slip_std"] is None
+    assert np.isnan(fields.stacked([free])["slip"]).all()
+    faulty = fields.fields_of(
+        output(contact=np.full((1, SIDE, SIDE), -9.0)),
+        fields.scale_of({}, "digit"),
+        shape=4 / 3,
+        faults=("grey",),
+    )
+    assert faulty.summary()["slip"] is None
+    touched = fields.fields_of(output(), fields.scale_of({}, "digit"), shape=4 / 3)
+    assert touched.slip[0] == 0.5 and touched.summary()["slip_std"] is not None
     unknown = fields.fields_of(output(), fields.scale_of({}, "mine"), shape=0.75)
     assert unknown.force is None and unknown.torque is None and unknown.summary()["force_z"] is None
     assert unknown.depth.max() == pytest.approx(0.05) and unknown.area[0] == pytest.approx(

@@ -37,7 +37,7 @@ class Fields:
         contact: probability.
         force: (B, 3), N along x, along y and into the gel.
         torque: (B,), N mm about the centre of pressure.
-        slip: (B,), fraction of the contact that slides.
+        slip: (B,), fraction of the contact that slides, NaN without contact.
         area: (B,), mm2.
         centre: (B, 2), mm of the pressure from the middle of the picture, x to the right and y
             down, NaN without contact.

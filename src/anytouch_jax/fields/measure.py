@@ -178,15 +178,17 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
     area = cell * inside.sum((1, 2))
     # A pixel that is in contact with probability p adds its area times the smaller of p and 1 - p.
     area_std = cell * np.minimum(contact, 1 - contact).sum((1, 2))
-    # The length of the rim of a round contact of this area, NaN without contact.
-    rim = np.sqrt(4 * np.pi * np.where(area > 0, area, np.nan))
+    # 1 with contact, and NaN without: where nothing touches, nothing slips and has a centre.
+    touched = np.where(area > 0, 1, np.nan)
+    # The length of the rim of a round contact of this area.
+    rim = np.sqrt(4 * np.pi * area * touched)
     values: dict[str, Any] = {
         "depth": mm * out.depth,
         "depth_std": mm * LENGTH * factors["depth"] * _deviation(out.depth_log),
         "shear": mm * out.shear,
         "shear_std": mm * LENGTH * factors["shear"] * _deviation(out.shear_log),
-        "slip": _logistic(out.slip),
-        "slip_std": np.minimum(factors["slip"] * _deviation(out.slip_log), 1),
+        "slip": touched * _logistic(out.slip),
+        "slip_std": touched * np.minimum(factors["slip"] * _deviation(out.slip_log), 1),
         "area": area,
         "area_std": area_std,
         "centre": mm * _centre(inside, out.pressure, area, shape),

@@ -267,11 +267,18 @@ def test_the_surface_is_a_mesh_in_mm(tmp_path):
     # 16 x 12 points
     assert b"element vertex 192" in head and b"element face 330" in head
     points = np.frombuffer(body[: 192 * 15], [("at", "<f4", 3), ("colour", "u1", 3)])
-    assert np.ptp(points["at"][:, 0]) == pytest.approx(14.25 * 11 / 12) and points["at"][0, 1] > 0
-    assert (
-        points["at"][:, 2].min() == pytest.approx(-0.05 * 14.25)
-        and len(body) == 192 * 15 + 330 * 13
-    )
+    at = points["at"].astype(float)
+    assert len(body) == 192 * 15 + 330 * 13
+    # x right, y down, z away from the camera: where the gel is pressed it is nearer
+    np.testing.assert_allclose(at, one.at(16, 12).points()[0].reshape(-1, 3), atol=1e-6)
+    assert np.ptp(at[:, 0]) == pytest.approx(14.25 * 11 / 12) and at[0, 0] < 0 and at[0, 1] < 0
+    assert at[:, 2].min() == pytest.approx(-0.05 * 14.25) and at[:, 2].max() == 0
+    assert at[at[:, 2] < -0.6][:, :2].max() < 0, "the upper left quarter is pressed"
+    assert b"comment frame: right-handed, x right, y down, z away from the camera" in head
+    # the front of every face is turned to the object
+    faces = np.frombuffer(body[192 * 15 :], [("count", "u1"), ("corners", "<i4", 3)])
+    corner, second, third = np.moveaxis(at[faces["corners"]], 1, 0)
+    assert (np.cross(second - corner, third - corner)[:, 2] > 0).all()
     picture = fields.overlay(gel(64, 48), one)
     assert (
         picture.shape == (64, 48, 3)

@@ -41,6 +41,7 @@ BATCHES = {
 HEADS = {
     "fields": Door("fields.head:HEAD"),
     "fields measure": Door("fields.measure:measure_of"),
+    "fields units": Door("fields.units:describe_units"),
 }
 # Further terms of the training objectives, weighted by `objective.terms`.
 OBJECTIVES = {

@@ -54,7 +54,7 @@ def units_of(scale: Scale) -> dict[str, Unit]:
             "N mm", f"{newton_mm} * {TORQUE} * {factors['torque']} * deviation(torque_log)"
         ),
         "slip": Unit("fraction of the contact that slides", "1 / (1 + exp(-slip))"),
-        "slip_std": Unit("", f"minimum({factors['slip']} * deviation(slip_log), 1)"),
+        "slip_std": Unit("fraction", f"minimum({factors['slip']} * deviation(slip_log), 1)"),
     }
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from measuring import gel, measuring_weights
 
+import anytouch_jax as at
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields import measure as fields
@@ -203,6 +204,18 @@ def faulty(kind: str) -> tuple[np.ndarray, np.ndarray | None]:
         "cut to a square": (real[:, :120], None),
         "turned": (np.rot90(real), None),
     }[kind]
+
+
+def test_a_device_that_is_built_another_way_round_is_no_fault(encoder):
+    """The simulated DIGIT of an example has its lights the other way round than three real ones."""
+    for touch in at.example_touches():
+        lines: list[str] = []
+        seen = encoder.measure(touch.frame, touch.background, touch.sensor, log=lines.append)
+        assert not seen.faults and not lines, (touch.press, touch.sensor)
+    real, _ = faulty("none")
+    for turned in (real[:, ::-1], real[::-1], real[::-1, ::-1]):
+        both = np.ascontiguousarray(turned)
+        assert not fields.faults_of(both, both, "gelsight_mini", 0.75)
 
 
 @pytest.mark.parametrize(

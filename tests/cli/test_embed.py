@@ -11,7 +11,7 @@ from runs import run_config, train
 import anytouch_jax as at
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.encoder.linear_head import load_head
-from anytouch_jax.weights import registry
+from anytouch_jax.weights import load, registry
 
 
 @pytest.fixture
@@ -220,6 +220,22 @@ def test_mistakes_are_named_before_the_encoder_is_loaded(
     out = [] if "--out" in words else ["--out", "f.npz"]
     sentence = mistake("embed", "--model", "nowhere", "--data", *words, *out)
     assert all(name in sentence for name in named), sentence
+
+
+@pytest.mark.parametrize("command", ["embed", "measure", "stream"])
+@pytest.mark.parametrize("stored", ["run", "package"])
+def test_a_misspelt_sensor_is_named_before_the_encoder_is_loaded(
+    mistake, tmp_path, tiny_run, monkeypatch, command, stored
+):
+    def loaded(*_, **__):
+        raise AssertionError("loading takes seconds")
+
+    monkeypatch.setattr(load, "load_model", loaded)
+    film = write_film(tmp_path / "film.avi", [np.zeros((32, 32, 3), np.uint8)])
+    model = ["--model", tiny_run] if stored == "run" else []
+    words = (command, *model, "--data", film, "--out", tmp_path / "f.npz", "--sensor")
+    assert "did you mean digit" in mistake(*words, "DIGIT")
+    assert "sensor.json" in mistake(*words, "gone.sensor")
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import log, refuse_join, refuse_unused
@@ -105,6 +105,40 @@ def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequen
     return False
 
 
+def check_sensor(options: SensorOptions) -> None:
+    """Raise UserError for a sensor that is misspelt or damaged, before the encoder is loaded.
+
+    Loading takes seconds. Where only the weights name their sensors, `load_inputs` checks again.
+    """
+    from anytouch_jax.encoder.sensor_words import resolve_sensor
+
+    if options.sensor is None:
+        return
+    word = resolve_sensor(options.sensor)
+    stored = _stored_sensors(options.model)
+    if not word.is_fitted and stored is not None:
+        check_spelling(word.name, stored)
+
+
+def _stored_sensors(model: Path) -> tuple[str, ...] | None:
+    """Return the sensors of an encoder as its files state them, None if they do not."""
+    from anytouch_jax.config import parse_json
+    from anytouch_jax.weights import registry, safetensors
+
+    if str(model).startswith("hf:"):  # it would be downloaded
+        return None
+    path = registry.locate(model)
+    stated: Any = None
+    # What is damaged is reported by the reader of weights.
+    with suppress(UserError, OSError, ValueError, KeyError, TypeError):
+        if path.is_dir():
+            stated = parse_json((path / "config.json").read_bytes())["model"]["sensors"]
+        elif path.suffix == ".safetensors" and path.is_file():
+            metadata = safetensors.read_file_metadata(path)
+            stated = parse_json(metadata[safetensors.MODEL_KEY])["sensors"]
+    return tuple(map(str, stated)) if isinstance(stated, list) else None
+
+
 class Inputs(NamedTuple):
     """The encoder, the pooling and the head that options name."""
 
@@ -128,6 +162,7 @@ def load_inputs(options: FrameOptions) -> Inputs:
     from anytouch_jax.encoder.sensor_words import resolve_sensor
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    check_sensor(options)
     word = resolve_sensor(options.sensor or UNIVERSAL)
     head = None if options.head is None else load_head(options.head)
     pooling = options.pooling

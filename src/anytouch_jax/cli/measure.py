@@ -133,8 +133,7 @@ def _resolve(options: MeasureOptions) -> _Work:
         suffix = ".avi" if options.film.suffix == ".avi" else ".mp4"
         check_folder(options.film, "--film", read=read, suffix=suffix)
     check_apart(out=options.out, film=options.film, ply=options.ply)
-    if options.sensor is not None:
-        _ = options.sensor_name  # a damaged folder of a fitted sensor is named here
+    inputs.check_sensor(options)
     encoder = load_encoder(options.model)
     if not encoder.measures:
         raise missing(encoder.source)

@@ -30,6 +30,10 @@ WEIGHTS = {
     "image encoder": Door("zoo.start:touch_of_photographs"),
     "torch": Door("zoo.torch_file:read_torch"),
 }
+# What reads sensor.json of a fitted sensor, a folder NAME.sensor.
+SENSORS = {
+    "fitted": Door("sim.sensing.own:read_numbers", "sim"),
+}
 # Sources of training batches, by the word of --data. Each has the interface of `batch.BatchSource`.
 BATCHES = {
     "simulated": Door("sim.batches:SimulatedLoader", "sim"),
@@ -38,6 +42,7 @@ BATCHES = {
 HEADS = {
     "fields": Door("fields.head:HEAD"),
     "fields measure": Door("fields.measure:measure_of"),
+    "fields units": Door("fields.units:describe_units"),
 }
 # Further terms of the loss, weighted by `objective.terms`. Each is an `objectives.Objective`.
 OBJECTIVES = {

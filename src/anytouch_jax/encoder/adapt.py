@@ -29,6 +29,7 @@ from anytouch_jax.encoder.new_sensor import put_tokens as put_tokens
 from anytouch_jax.encoder.new_sensor import read_model as read_model
 from anytouch_jax.encoder.new_sensor import save as save
 from anytouch_jax.encoder.new_sensor import with_row as with_row
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
@@ -114,6 +115,7 @@ def adapt_with(
         raise UserError(
             "the tokens are fitted to classes; name a column with --labels, or copy with --frames 0"
         )
+    sensor = resolve_sensor(sensor).name
     loaded, params = read_model(run)
     config, params, row = with_row(loaded, params, sensor, str(run), log)
     source = {

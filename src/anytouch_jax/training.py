@@ -33,7 +33,7 @@ from anytouch_jax.train.loop import FitResult, fit
 from anytouch_jax.train.mesh import make_mesh
 from anytouch_jax.train.progress import alone_in, begun_with, silent
 from anytouch_jax.weights.checkpoint import CheckpointError, read_metadata, steps
-from anytouch_jax.zoo.families import load_start
+from anytouch_jax.weights.start import load_start
 
 Params = dict[str, Any]
 Log = Callable[[str], None]

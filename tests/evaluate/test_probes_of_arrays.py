@@ -6,7 +6,7 @@ import pytest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import ProbeHead, linear_path
 from anytouch_jax.evaluate.probing import ProbeResult, leave_groups_out, probe_features
-from anytouch_jax.evaluate.statistics import verdict
+from anytouch_jax.evaluate.verdicts import verdict
 
 Array = np.ndarray[Any, Any]
 

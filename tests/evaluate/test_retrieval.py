@@ -21,7 +21,8 @@ from anytouch_jax.evaluate.retrieval import (
     score_galleries,
     score_matching,
 )
-from anytouch_jax.evaluate.statistics import mean_interval, plain
+from anytouch_jax.evaluate.statistics import mean_interval
+from anytouch_jax.evaluate.tables import plain
 
 Array = np.ndarray[Any, Any]
 COUNT = 240

@@ -9,9 +9,10 @@ from measuring import measuring_weights
 from tiny_models import touch_model
 
 from anytouch_jax.config import Config
-from anytouch_jax.encoder.encoder import EngineEncoder, load_encoder, random_encoder
+from anytouch_jax.encoder.encoder import load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.export import engines
+from anytouch_jax.export.encoder import EngineEncoder
 from anytouch_jax.export.export import describes, export, load, read_checked
 
 pytest.importorskip("onnxruntime")

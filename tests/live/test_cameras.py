@@ -187,7 +187,8 @@ def test_an_address_is_a_camera_and_a_film_at_an_address_is_a_film(tmp_path):
                 "Content-Type", "video/avi" if is_film else "multipart/x-mixed-replace; boundary=b"
             )
             self.end_headers()
-            part = f"--b\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n".encode()
+            part = b"--b\r\nContent-Type: image/jpeg\r\n"
+            part += f"Content-Length: {len(picture)}\r\n\r\n".encode()
             self.wfile.write(film.read_bytes() if is_film else (part + picture + b"\r\n") * 200)
 
         def log_message(self, *_):

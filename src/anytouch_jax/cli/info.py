@@ -59,7 +59,7 @@ def _health(options: InfoOptions) -> int:
     Exit status 1 reports a fault.
     """
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.evaluate.statistics import markdown_table
+    from anytouch_jax.evaluate.tables import markdown_table
     from anytouch_jax.live import health
 
     check_folder(options.picture, "--picture", read=options.paths, suffix=".png")

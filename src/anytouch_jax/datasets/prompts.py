@@ -61,8 +61,9 @@ _SYSTEM = (
     "colours, cameras, sensors, images or who is touching."
 )
 _FORM = (
-    'Answer with one JSON object and nothing else: {"object": "<what is touched, at most six words>", "caption": '
-    '"<one or two sentences, at most 40 words, that say how the touched place feels>"}.'
+    'Answer with one JSON object and nothing else: {"object": "<what is touched, at most six '
+    'words>", "caption": "<one or two sentences, at most 40 words, that say how the touched place '
+    'feels>"}.'
 )
 _TEXTS: dict[Family, str] = {
     "photograph": (
@@ -90,7 +91,8 @@ _TEXTS: dict[Family, str] = {
     ),
 }
 _REFUSAL = re.compile(
-    r"\b(i'?m sorry|i am sorry|as an ai|i can(not|'?t) (see|assist|help|determine|identify|describe|provide|view)|"
+    r"\b(i'?m sorry|i am sorry|as an ai|"
+    r"i can(not|'?t) (see|assist|help|determine|identify|describe|provide|view)|"
     r"unable to (see|assist|help|determine|identify|describe|provide|view))\b",
     re.IGNORECASE,
 )

@@ -180,7 +180,8 @@ class Checkpoints:
         with self._one_sentence(target):
             try:
                 future.result()
-            finally:  # also after a failure: the other processes are waiting for process 0 to rename
+            # Also after a failure: the other processes are waiting for process 0 to rename.
+            finally:
                 if jax.process_count() > 1:
                     from jax.experimental import multihost_utils
 

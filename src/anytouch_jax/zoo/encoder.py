@@ -76,8 +76,10 @@ class FamilyEncoder(Encoder):
         """
         shape = ", ".join(map(str, self.image_size))
         return {
-            "input": f"frames: float32 (B, {frames}, {shape}, 3), oldest first, each from encoder.preprocess of "
-            f"{self.family.title}; sensor: int32 (B,)",
+            "input": (
+                f"frames: float32 (B, {frames}, {shape}, 3), oldest first, each from "
+                f"encoder.preprocess of {self.family.title}; sensor: int32 (B,)"
+            ),
             "preparation": asdict(self.preparation),
             "frame_shape": [*self.image_size, 3],
             "frame_dtype": "float32",

@@ -201,13 +201,8 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
 
 
 def test_sensor_rows(tmp_path):
-    rows = (
-        "a,digit,s,0,train",
-        "b,tac3d,s,1,train",
-        "c,newfinger,s,2,test",
-        "d,allsight,s,3,train",
-    )
-    text = "\n".join((HEAD, *rows, ""))
+    rows = "a,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
+    text = f"{HEAD}\n{rows}"
     got = m.read(_file(tmp_path, text))
     model = preset("tiny").model
     refused(r"line 4 of .*manifest\.csv.*unknown sensor 'newfinger'", m.sensor_rows, got, model)
@@ -326,8 +321,7 @@ def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
 
 
 def test_labels_of_a_csv_keep_what_they_say(tmp_path):
-    labels = "label.object,label.force,label.stable,label.word,label.serial"
-    head = f"path,sensor,sequence,frame_index,split,{labels}"
+    head = f"{HEAD},label.object,label.force,label.stable,label.word,label.serial"
     rows = [
         "a.png,digit,s,0,train,001, 1.5 ,True,True,0x1A",
         "b.png,digit,s,1,train,007, ,false,maybe,0x10",

@@ -1,0 +1,169 @@
+"""Probes of arrays: a head fitted on features and labels that are given.
+
+They take `features` (n, d); `labels` (n,), where None, "" or NaN is no label; `groups` (n,), which
+no fold or bootstrap cuts; and `split` (n,), "train", "val" or "test" for the rows that take part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from anytouch_jax.evaluate import heads, splits
+from anytouch_jax.evaluate.heads import LinearModel, ProbeHead, Scaling
+from anytouch_jax.evaluate.results import ProbeResult
+from anytouch_jax.evaluate.scoring import (
+    Prediction,
+    Scored,
+    Subsets,
+    constant_prediction,
+    predict,
+    result_of,
+)
+from anytouch_jax.evaluate.splits import LabelledFeatures, Selection, Split
+from anytouch_jax.evaluate.statistics import Array, Protocol
+from anytouch_jax.progress import tracked
+
+
+def probe_features(  # noqa: PLR0913 - four arrays, and settings that are each used alone
+    features: Array,
+    labels: npt.ArrayLike,
+    groups: npt.ArrayLike,
+    split: npt.ArrayLike,
+    head: ProbeHead | None = None,
+    *,
+    measured: bool = False,
+    protocol: Protocol = "honest",
+    seeds: int = 5,
+    subsets: Subsets | None = None,
+    name: str = "linear",
+) -> ProbeResult:
+    """Probe with a head that is selected and fitted on train, and tested on test.
+
+    Args:
+        features: f32 (n, d), frozen.
+        labels: (n,) classes or numbers; None, "" and NaN are no label.
+        groups: (n,) names of what was sampled independently, such as recordings or objects.
+        split: (n,) "train", "val" or "test"; rows of other splits take no part.
+        head: linear by default.
+        measured: the labels are continuous, so the head is a regression.
+        protocol: "honest" selects on val or by cross-validation, "published" on test.
+        seeds: how many heads of classes are fitted on bootstraps of the train groups too.
+        subsets: parts of test that are scored too, name -> mask over all rows.
+        name: of the probe in tables.
+
+    Raises:
+        UserError: as `splits.check_rows` does.
+    """
+    data, rows, notes = splits.check_rows(features, labels, groups, split, measured=measured)
+    head = head or ProbeHead()
+    found = predict(data, rows, head, protocol, refit=True)
+    notes += _fit_notes(found, head)
+    scored = Scored(rows, found.predicted, constant_prediction(data, rows), found.selected)
+    result = result_of(name, protocol, data, scored, notes, subsets)
+    if not measured:
+        chosen = replace(head, options=(found.selected.option,))
+        result = replace(result, **_refits(data, rows, chosen, found.model, seeds))
+    if result.outcome is not None:
+        outcome = replace(result.outcome, fitted=(found.model, data.names))
+        result = replace(result, outcome=outcome)
+    return result
+
+
+def _fit_notes(found: Prediction, head: ProbeHead) -> tuple[str, ...]:
+    """Return what a reader should know of a selection and its fit."""
+    notes = []
+    selected = found.selected
+    if selected.chosen_on == "test":
+        notes.append("chosen on test, as the authors' code does: an upper estimate")
+    scores = np.asarray(selected.scores)
+    if len(scores) and head.name == "linear":
+        is_end = selected.place in (0, len(scores) - 1)
+        # A plateau that reaches the end hides nothing: only a single best one may go on beyond it.
+        is_alone = np.sum(scores == scores.max()) == 1
+        if is_end and is_alone:
+            notes.append(f"the chosen penalty {selected.option:g} lies at the edge of those tried")
+    if found.model is not None and not found.model.fit.finished:
+        notes.append("the fit stopped at its limit of iterations")
+    return tuple(notes)
+
+
+def _refits(
+    data: LabelledFeatures, rows: Split, head: ProbeHead, start: LinearModel | None, seeds: int
+) -> dict[str, Any]:
+    """Return how heads score that are fitted on bootstraps of the train groups.
+
+    Their spread shows how much a score depends on which objects were recorded for training. The
+    interval of a result, by contrast, is of the test groups with this one fit.
+    """
+    accuracies = []
+    bootstraps = list(splits.group_bootstraps(rows.fit, data.groups, seeds))
+    for ids, weights in tracked(bootstraps, "refits"):
+        (again,) = data.fit(head, ids, weights=weights, start=start).predict(data.x[rows.test])
+        accuracies.append(float(np.mean(again == data.y[rows.test])))
+    if not accuracies:
+        return {}
+    deviation = None
+    if len(accuracies) > 1:
+        deviation = float(np.std(accuracies, ddof=1))
+    mean = float(np.mean(accuracies))
+    return {"refit_mean": mean, "refit_std": deviation, "seeds": len(accuracies)}
+
+
+def leave_groups_out(
+    features: Array,
+    labels: npt.ArrayLike,
+    groups: npt.ArrayLike,
+    *,
+    folds: int | None = 10,
+    penalties: Sequence[float] = (10.0, *heads.PENALTIES),
+    scaling: Scaling = "column",
+    subsets: Subsets | None = None,
+    name: str = "linear, groups left out",
+) -> ProbeResult:
+    """Probe each row with a linear fit on no row of its group, for instance on held-out objects.
+
+    The choice of the penalty is nested: in each fold the groups that are left select it, by
+    cross-validation among themselves, so no row has a part in the choice by which it is scored.
+    Their commonest class is the baseline.
+
+    Args:
+        features: f32 (n, d), frozen.
+        labels: (n,) classes.
+        groups: (n,) names of what is left out together.
+        folds: into so many the groups are dealt; None leaves each group out alone.
+        penalties: of logistic regression.
+        scaling: of the features; see `ProbeHead`.
+        subsets: parts that are scored too, name -> mask over all rows.
+        name: of the probe in tables.
+
+    Raises:
+        UserError: as `splits.check_rows` does.
+    """
+    everywhere = np.full(len(np.asarray(labels, object)), "train")
+    data, rows, notes = splits.check_rows(features, labels, groups, everywhere, tested=False)
+    used = rows.fit
+    chosen = []
+    predicted = np.full(len(data.y), -1)
+    baseline = np.full(len(data.y), -1)
+    head = ProbeHead("linear", scaling, tuple(penalties))
+    count = folds
+    if count is None:
+        count = len(np.unique(data.groups[used]))
+    parts = list(splits.group_folds(used, data.groups, data.y, count))
+    for fit, out in tracked(parts, "folds"):
+        cut = Split(fit, fit[:0], out)
+        found = predict(data, cut, head, "honest", refit=True)
+        chosen.append(found.selected.option)
+        predicted[out] = found.predicted
+        baseline[out] = constant_prediction(data, cut)
+    values, times = np.unique(chosen, return_counts=True)
+    listed = ", ".join(f"{value:g} ({n} x)" for value, n in zip(values, times, strict=True))
+    notes += (f"penalties of the folds: {listed}",)
+    median = Selection(0, float(np.median(chosen)), "cross-validation, median of the folds")
+    scored = Scored(Split(used, used[:0], used), predicted[used], baseline[used], median)
+    return result_of(name, "honest", data, scored, notes, subsets)

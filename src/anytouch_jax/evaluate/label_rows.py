@@ -1,0 +1,84 @@
+"""Rows of a label probe: which take part, with which label, group and split."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from anytouch_jax.data.manifest.manifest import Manifest
+from anytouch_jax.encoder.arrays import Array
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate import scoring, splits, tasks
+from anytouch_jax.evaluate.options import LabelProbeOptions
+from anytouch_jax.evaluate.results import ProbeResult
+from anytouch_jax.evaluate.tasks import TaskRows
+
+
+def label_rows(
+    table: Manifest,
+    label: str,
+    *,
+    group: str = "",
+    leave_out: str | None = None,
+    where: tuple[str, float] | None = None,
+    sensor: str | None = None,
+    frames: int = 1,
+    among: Callable[[TaskRows], TaskRows] = lambda rows: rows,
+) -> tuple[TaskRows, scoring.Subsets]:
+    """Return the rows of `probe_label`, and masks as of `tasks.described_subsets`.
+
+    `among` chooses some of the rows; the other arguments are fields of `LabelProbeOptions`.
+    """
+    options = LabelProbeOptions(
+        label=label, group=group, leave_out=leave_out, where=where, sensor=sensor, frames=frames
+    )
+    task = task_of(table, options)
+    rows = among(tasks.select(table, task, frames))
+    return rows, subsets_of(table, task, rows, leave_out)
+
+
+def task_of(table: Manifest, options: LabelProbeOptions) -> tasks.Task:
+    """Return the task of a label column. Raises UserError for an unknown column or sensor."""
+    return tasks.label_task(
+        table,
+        options.label,
+        group=options.leave_out or options.group,
+        where=options.where,
+        sensor=options.sensor,
+    )
+
+
+def select_rows(table: Manifest, task: tasks.Task, options: LabelProbeOptions) -> TaskRows:
+    """Return the rows with a label. Raises UserError if there are none."""
+    return tasks.select(table, task, options.frames)
+
+
+def subsets_of(
+    table: Manifest, task: tasks.Task, rows: TaskRows, leave_out: str | None
+) -> dict[str, Array]:
+    """Return masks of classes, or of held-out values, that alignment may have named, and others."""
+    if leave_out is None:
+        return tasks.described_subsets(table, task.label, rows.rows[:, 0], "classes")
+    return tasks.described_subsets(table, task.groups[0], rows.rows[:, 0], f"{leave_out}s")
+
+
+def commonest_class(rows: TaskRows, options: LabelProbeOptions) -> ProbeResult | None:
+    """Check the rows before the work, and return the result of the most frequent class of train.
+
+    There is none where groups are left out, since each fold has another commonest class.
+    """
+    if options.leave_out is not None and len(np.unique(rows.groups)) == 1:
+        raise UserError(
+            f"All rows are of one {options.leave_out} ({rows.groups[0]}). Nothing is left to fit "
+            "on."
+        )
+    nothing = np.zeros((len(rows.split), 1))
+    if options.leave_out is not None:
+        everywhere = np.full(len(rows.split), "train")
+        splits.check_rows(nothing, rows.labels, rows.groups, everywhere, tested=False)
+        return None
+    given, cut, _ = splits.check_rows(nothing, rows.labels, rows.groups, rows.split)
+    constant = scoring.constant_prediction(given, cut)
+    scored = scoring.Scored(cut, constant, constant)
+    return scoring.result_of("commonest class", "honest", given, scored)

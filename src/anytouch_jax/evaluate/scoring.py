@@ -154,7 +154,7 @@ def _parts(
     parts = []
     for part, mask in subsets.items():
         kept = np.asarray(mask, bool)[tested]
-        low, high = statistics.mean_interval(correct[kept], groups[kept])
+        low, high = statistics.fraction_interval(correct[kept], groups[kept])
         accuracy = float(correct[kept].mean()) if kept.any() else NAN
         parts.append(SubsetResult(part, accuracy, low, high, int(kept.sum())))
     return tuple(parts)

@@ -390,7 +390,7 @@ def test_a_label_probe_of_models_files_and_controls(touches, tiny_run, tmp_path)
     ("label", "options", "word"),
     [
         ("object", {}, "train"),
-        ("force", {}, "label.force"),
+        ("force", {"regression": "no"}, "label.force"),
         ("split", {}, "train"),
         ("hardness", {"controls": False}, "nothing"),
         ("hardness", {"leave_out": "sensor", "sensor": "digit"}, "digit"),

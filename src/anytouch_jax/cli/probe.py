@@ -77,6 +77,10 @@ class LabelOptions(ProbeOptions):
     """published chooses the penalty on the test split, as the authors' code does. The report says
     so.
     """
+    regression: Literal["auto", "yes", "no"] = "auto"
+    """Whether the label is a number: R2, mean absolute error and Spearman's correlation. By auto it
+    is if the column has numbers with a fraction.
+    """
     # Also print parts of the test rows: classes that alignment may have named, and others.
     details: bool = False
     # Write the linear head of one --model as .npz, for embed --head and stream --head.
@@ -114,12 +118,16 @@ class TasksOptions(BatteryOptions):
 
     tasks: tuple[str, ...] = ("all",)
     """Tasks: material, roughness, hardness, grasp, grasp_after, object, slip, force, twist, slide,
-    indenter, or all.
+    indenter, any other label column of the manifest, or all.
     """
     heads: tuple[Literal["linear", "knn", "gradient"], ...] = ("linear",)
     """Heads. gradient is the authors': one layer trained by AdamW."""
     protocol: Literal["honest", "published"] = "honest"
     """published also reports the choice on the test split, as in the authors' code."""
+    regression: Literal["auto", "yes", "no"] = "auto"
+    """Whether labels are numbers, for tasks that do not say so. By auto they are if the column has
+    numbers with a fraction.
+    """
     frames: Count[int | None] = None  # Frames of a touch (default: those of each task).
     # Features: class token, mean of the patch tokens, or both.
     pooling: Literal["class", "mean", "both"] = "class"

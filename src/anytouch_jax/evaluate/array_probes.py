@@ -114,13 +114,14 @@ def _refits(
     return {"refit_mean": mean, "refit_std": deviation, "seeds": len(accuracies)}
 
 
-def leave_groups_out(
+def leave_groups_out(  # noqa: PLR0913 - three arrays, and settings that are each used alone
     features: Array,
     labels: npt.ArrayLike,
     groups: npt.ArrayLike,
     *,
+    measured: bool = False,
     folds: int | None = 10,
-    penalties: Sequence[float] = (10.0, *heads.PENALTIES),
+    penalties: Sequence[float] | None = None,
     scaling: Scaling = "column",
     subsets: Subsets | None = None,
     name: str = "linear, groups left out",
@@ -133,10 +134,11 @@ def leave_groups_out(
 
     Args:
         features: f32 (n, d), frozen.
-        labels: (n,) classes.
+        labels: (n,) classes or numbers.
         groups: (n,) names of what is left out together.
+        measured: the labels are continuous, so the head is a regression.
         folds: into so many the groups are dealt; None leaves each group out alone.
-        penalties: of logistic regression.
+        penalties: of the head; by default from 10 down for classes, from 100 for numbers.
         scaling: of the features; see `ProbeHead`.
         subsets: parts that are scored too, name -> mask over all rows.
         name: of the probe in tables.
@@ -145,16 +147,21 @@ def leave_groups_out(
         UserError: as `splits.check_rows` does.
     """
     everywhere = np.full(len(np.asarray(labels, object)), "train")
-    data, rows, notes = splits.check_rows(features, labels, groups, everywhere, tested=False)
+    data, rows, notes = splits.check_rows(
+        features, labels, groups, everywhere, measured=measured, tested=False
+    )
     used = rows.fit
     chosen = []
-    predicted = np.full(len(data.y), -1)
-    baseline = np.full(len(data.y), -1)
+    predicted = np.full(len(data.y), -1, data.y.dtype)
+    baseline = np.full(len(data.y), -1, data.y.dtype)
+    if penalties is None:
+        penalties = heads.RIDGE if measured else (10.0, *heads.PENALTIES)
     head = ProbeHead("linear", scaling, tuple(penalties))
     count = folds
     if count is None:
         count = len(np.unique(data.groups[used]))
-    parts = list(splits.group_folds(used, data.groups, data.y, count))
+    y = None if measured else data.y
+    parts = list(splits.group_folds(used, data.groups, y, count))
     for fit, out in tracked(parts, "folds"):
         cut = Split(fit, fit[:0], out)
         found = predict(data, cut, head, "honest", refit=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pyarrow as pa
 
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array
@@ -13,6 +14,9 @@ from anytouch_jax.evaluate import scoring, splits, tasks
 from anytouch_jax.evaluate.options import LabelProbeOptions
 from anytouch_jax.evaluate.results import ProbeResult
 from anytouch_jax.evaluate.tasks import TaskRows
+
+# A column of more whole numbers than these is rather a measurement than names of classes.
+MANY_NUMBERS = 20
 
 
 def label_rows(
@@ -39,14 +43,38 @@ def label_rows(
 
 
 def task_of(table: Manifest, options: LabelProbeOptions) -> tasks.Task:
-    """Return the task of a label column. Raises UserError for an unknown column or sensor."""
-    return tasks.label_task(
+    """Return the task of a label column: of classes, or a regression.
+
+    Raises UserError for an unknown column or sensor.
+    """
+    task = tasks.label_task(
         table,
         options.label,
         group=options.leave_out or options.group,
         where=options.where,
         sensor=options.sensor,
     )
+    return tasks.with_kind(table, task, options.regression)
+
+
+def kind_sentence(table: Manifest, task: tasks.Task, options: LabelProbeOptions) -> str:
+    """Return how a column of numbers is probed and how to change that, "" if nobody could ask."""
+    if options.regression != "auto":
+        return ""
+    if task.kind == "regression":
+        return (
+            f"{task.label} holds measurements: it is probed by regression (R2, mean absolute "
+            "error, Spearman's correlation)"
+        )
+    column = table.column(task.label)
+    is_number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type)
+    count = len(column.unique().drop_null())
+    if is_number and count > MANY_NUMBERS:
+        return (
+            f"{task.label} holds {count} whole numbers, which are probed as classes. Give "
+            "--regression yes if they are measurements"
+        )
+    return ""
 
 
 def select_rows(table: Manifest, task: tasks.Task, options: LabelProbeOptions) -> TaskRows:
@@ -58,15 +86,20 @@ def subsets_of(
     table: Manifest, task: tasks.Task, rows: TaskRows, leave_out: str | None
 ) -> dict[str, Array]:
     """Return masks of classes, or of held-out values, that alignment may have named, and others."""
+    if task.kind == "regression":
+        return {}
     if leave_out is None:
         return tasks.described_subsets(table, task.label, rows.rows[:, 0], "classes")
     return tasks.described_subsets(table, task.groups[0], rows.rows[:, 0], f"{leave_out}s")
 
 
-def commonest_class(rows: TaskRows, options: LabelProbeOptions) -> ProbeResult | None:
-    """Check the rows before the work, and return the result of the most frequent class of train.
+def constant_result(
+    rows: TaskRows, options: LabelProbeOptions, measured: bool
+) -> ProbeResult | None:
+    """Check the rows before the work, and return the result of a constant prediction.
 
-    There is none where groups are left out, since each fold has another commonest class.
+    It is the most frequent class of train, or its mean. There is none where groups are left out,
+    since each fold has another constant.
     """
     if options.leave_out is not None and len(np.unique(rows.groups)) == 1:
         raise UserError(
@@ -76,9 +109,14 @@ def commonest_class(rows: TaskRows, options: LabelProbeOptions) -> ProbeResult |
     nothing = np.zeros((len(rows.split), 1))
     if options.leave_out is not None:
         everywhere = np.full(len(rows.split), "train")
-        splits.check_rows(nothing, rows.labels, rows.groups, everywhere, tested=False)
+        splits.check_rows(
+            nothing, rows.labels, rows.groups, everywhere, measured=measured, tested=False
+        )
         return None
-    given, cut, _ = splits.check_rows(nothing, rows.labels, rows.groups, rows.split)
+    given, cut, _ = splits.check_rows(
+        nothing, rows.labels, rows.groups, rows.split, measured=measured
+    )
     constant = scoring.constant_prediction(given, cut)
     scored = scoring.Scored(cut, constant, constant)
-    return scoring.result_of("commonest class", "honest", given, scored)
+    name = "mean of train" if measured else "commonest class"
+    return scoring.result_of(name, "honest", given, scored)

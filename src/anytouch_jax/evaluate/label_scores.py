@@ -27,13 +27,19 @@ def probe_source(
     rows: TaskRows,
     options: LabelProbeOptions,
     subsets: Subsets,
+    measured: bool,
 ) -> list[ProbeResult]:
     """Return the results of one source of features: of each head, the linear one first."""
     if options.leave_out is not None:
-        name = f"{source.name}: linear, {options.leave_out} left out"
         return [
             leave_groups_out(
-                x, rows.labels, rows.groups, name=name, scaling=source.scaling, subsets=subsets
+                x,
+                rows.labels,
+                rows.groups,
+                measured=measured,
+                scaling=source.scaling,
+                subsets=subsets,
+                name=f"{source.name}: linear, {options.leave_out} left out",
             )
         ]
     results = []
@@ -46,6 +52,7 @@ def probe_source(
                 rows.groups,
                 rows.split,
                 heads.ProbeHead(name, scaling),
+                measured=measured,
                 protocol=options.protocol,
                 seeds=options.seeds,
                 subsets=subsets,

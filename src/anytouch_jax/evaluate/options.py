@@ -12,7 +12,7 @@ from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS
 from anytouch_jax.evaluate.feature_cache import FeatureSource, Order
 from anytouch_jax.evaluate.heads import GradientRecipe, HeadName
 from anytouch_jax.evaluate.statistics import Protocol
-from anytouch_jax.evaluate.tasks import Task
+from anytouch_jax.evaluate.tasks import Regression, Task
 
 Paths = Sequence[str | Path]
 Tasks = Sequence[str | Task] | Literal["all"]
@@ -34,6 +34,9 @@ class ProbeOptions:
             as the authors' released code does.
         pooling: class token, mean of the patch tokens, or both.
         join: how the segments of a clip longer than the model's are joined.
+        regression: whether the label is continuous. "auto" goes by its column: numbers with a
+            fraction are. Then a score is R2, with the mean absolute error and Spearman's
+            correlation beside it.
     """
 
     features: Paths = ()
@@ -44,6 +47,7 @@ class ProbeOptions:
     protocol: Protocol = "honest"
     pooling: Pooling = "class"
     join: Join = "mean"
+    regression: Regression = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)

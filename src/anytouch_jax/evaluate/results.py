@@ -28,7 +28,16 @@ _OF_CLASSES = (
     "classes",
     "parts",
 )
-_OF_NUMBERS = ("r2", "mae", "mae_low", "mae_high", "baseline_mae")
+_OF_NUMBERS = (
+    "r2",
+    "mae",
+    "mae_low",
+    "mae_high",
+    "baseline_mae",
+    "spearman",
+    "spearman_low",
+    "spearman_high",
+)
 
 
 @dataclass(frozen=True)
@@ -86,6 +95,9 @@ class ProbeResult:
         mae_low: lower end of its 95 % interval.
         mae_high: upper end.
         baseline_mae: mean absolute error of train's mean.
+        spearman: rank correlation of predictions and labels, None where one of them is constant.
+        spearman_low: lower end of its 95 % interval.
+        spearman_high: upper end.
         notes: what a reader of the score should know.
         outcome: the test rows one by one; not in JSON.
     """
@@ -112,6 +124,9 @@ class ProbeResult:
     mae_low: float | None = None
     mae_high: float | None = None
     baseline_mae: float = NAN
+    spearman: float | None = None
+    spearman_low: float | None = None
+    spearman_high: float | None = None
     notes: tuple[str, ...] = ()
     outcome: Outcome | None = field(default=None, repr=False, compare=False)
 
@@ -186,6 +201,9 @@ def _result_cells(result: ProbeResult) -> dict[str, str]:
             "mae": result.mae,
             "unit": "",
             "chance_mae": result.baseline_mae,
+            "spearman": result.spearman,
+            "spearman_low": result.spearman_low,
+            "spearman_high": result.spearman_high,
             "train": result.n_train,
             "test": result.n_test,
             "groups": result.test_groups,
@@ -224,11 +242,13 @@ def _part_cells(result: ProbeResult) -> list[dict[str, str]]:
 
 def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
     """Return the cells of a result of `probe_tasks` that every table has."""
+    more = {}
     if row["metric"] == "r2":
         mae = f"{row['mae']:.3g} {row['unit']}".strip()
         score = f"R2 {row['mean']:.3f}, {mae}"
         interval = interval_text(row["low"], row["high"], 1.0, 3)
         chance = f"{row['chance_mae']:.3g} {row['unit']}".strip()
+        more["Spearman"] = _rank_text(row)
     else:
         score = share_text(row["mean"])
         interval = interval_text(row["low"], row["high"])
@@ -239,4 +259,15 @@ def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
         "chance": chance,
         "train": str(row["train"]),
         "test (groups)": f"{row['test']} ({row['groups']})",
+        **more,
     }
+
+
+def _rank_text(row: Mapping[str, Any]) -> str:
+    """Return Spearman's correlation with its interval, "-" for constant predictions."""
+    if row.get("spearman") is None:
+        return "-"
+    text = f"{row['spearman']:.3f}"
+    if row["spearman_low"] is None:
+        return text
+    return f"{text} ({interval_text(row['spearman_low'], row['spearman_high'], 1.0, 3)})"

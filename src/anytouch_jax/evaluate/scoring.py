@@ -67,7 +67,8 @@ def score_sums(data: LabelledFeatures, predicted: Array, tested: Array) -> Group
     groups = data.groups[tested]
     if len(data.names):
         return statistics.classification_sums(predicted == truth, groups)
-    return statistics.regression_sums(predicted - truth, truth - truth.mean(), groups)
+    centred = truth - truth.mean()
+    return statistics.regression_sums(predicted - truth, centred, groups, predicted)
 
 
 class Scored(NamedTuple):
@@ -116,7 +117,8 @@ def result_of(
         chosen_on = scored.selected.chosen_on
     more: dict[str, Any] = {}
     if measured:
-        more = {key: scores[key] for key in ("mae", "mae_low", "mae_high")}
+        names = ("mae", "mae_low", "mae_high", "spearman", "spearman_low", "spearman_high")
+        more = {key: scores[key] for key in names}
         more |= {"r2": scores["mean"], "baseline_mae": scores["chance_mae"]}
     else:
         correct = scored.predicted == truth

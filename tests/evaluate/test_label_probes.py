@@ -1,0 +1,140 @@
+"""Probes of a label column of a manifest, by features of a file: no picture is read."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+from task_world import row, table
+
+from anytouch_jax.cli.app import main
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.options import LabelProbeOptions
+from anytouch_jax.evaluate.probing import leave_groups_out, probe_label, probe_table, probe_tasks
+from anytouch_jax.evaluate.statistics import regression_sums, scores
+
+
+def written(folder: Path, rows: list[dict[str, Any]], features: Any) -> tuple[Path, Path]:
+    """A manifest and a file of features for its rows."""
+    columns = table(rows).table.to_pydict()
+    manifests.write(manifests.from_columns(columns, folder / "m.csv"), folder / "m.csv")
+    values = np.asarray(features, np.float32)
+    np.savez(folder / "f.npz", features=values, rows=np.arange(len(rows)))
+    return folder / "m.csv", folder / "f.npz"
+
+
+def springs(folder: Path, *, noise: float = 0.1, objects: int = 24) -> tuple[Path, Path]:
+    """Objects of a measured stiffness, a quarter of them in test; features that hold it."""
+    rng = np.random.default_rng(0)
+    rows = []
+    features = []
+    for thing in range(objects):
+        for number in range(4):
+            rows.append(
+                row(
+                    path=f"{thing}_{number}.png",
+                    sequence=f"s{thing}",
+                    frame_index=number,
+                    object=f"o{thing}",
+                    split="test" if thing % 4 == 0 else "train",
+                    label__stiffness=10.25 + 2.5 * thing,
+                    label__count=thing,
+                )
+            )
+            features.append([thing / 4 + rng.normal(0, noise), *rng.normal(size=9)])
+    return written(folder, rows, features)
+
+
+def probe(data: Path, features: Path, label: str, **options: Any) -> tuple[list[Any], list[str]]:
+    said: list[str] = []
+    plain: dict[str, Any] = {"features": [features], "controls": False, "seeds": 0}
+    return probe_label([], [data], label, log=said.append, **plain | options), said
+
+
+def test_a_measured_column_is_probed_by_regression(tmp_path):
+    data, features = springs(tmp_path)
+    results, said = probe(data, features, "stiffness", out=tmp_path / "o.json")
+    linear, knn, constant = results
+    assert linear.measured and linear.r2 > 0.95 and linear.mae < 2 < linear.baseline_mae
+    assert (
+        linear.low <= linear.r2 <= linear.high and linear.mae_low <= linear.mae <= linear.mae_high
+    )
+    assert linear.spearman_low <= linear.spearman <= linear.spearman_high <= 1
+    assert linear.test_groups == 6 and knn.r2 < linear.r2
+    assert constant.probe == "mean of train" and constant.r2 < 0.1 and constant.spearman is None
+    assert any("stiffness holds measurements" in line for line in said)
+    printed = probe_table(results)
+    assert "Spearman" in printed and "R2 0." in printed and "None" not in printed
+    record = json.loads((tmp_path / "o.json").read_text())[0]
+    assert record["spearman"] == linear.spearman and "accuracy" not in record
+
+
+def test_whole_numbers_are_classes_until_the_user_says_otherwise(tmp_path):
+    data, features = springs(tmp_path)
+    # classes of test that train lacks
+    with pytest.raises(UserError, match="No class of test"):
+        probe(data, features, "count")
+    (linear, *_), said = probe(data, features, "count", regression="yes")
+    assert linear.r2 > 0.95 and not any("whole numbers" in line for line in said)
+    _, said = probe(data, features, "count", leave_out="sequence")
+    assert any("24 whole numbers" in line and "--regression yes" in line for line in said)
+    with pytest.raises(UserError, match="--regression yes"):
+        probe(data, features, "stiffness", regression="no")
+    with pytest.raises(UserError, match="text"):
+        probe(data, features, "object", regression="yes")
+    with pytest.raises(UserError, match="--save"):
+        probe_label(["x"], [data], "stiffness", save=tmp_path / "h.npz")
+
+
+def test_tasks_take_any_label_column(tmp_path):
+    data, features = springs(tmp_path)
+    plain: dict[str, Any] = {"features": [features], "controls": False, "seeds": 2, "log": str}
+    (one,) = probe_tasks([], [data], ["stiffness"], **plain)["results"]
+    assert one["metric"] == "r2" and one["mean"] > 0.95 and one["spearman"] > 0.95
+    assert one["spearman_low"] <= one["spearman"] <= one["spearman_high"]
+    with pytest.raises(UserError, match=r"no task 'tast'.*label column"):
+        probe_tasks([], [data], ["tast"], **plain)
+
+
+def test_a_number_is_predicted_for_groups_that_are_left_out(tmp_path):
+    data, features = springs(tmp_path)
+    (one,), _ = probe(data, features, "stiffness", leave_out="object")
+    assert one.r2 > 0.95 and one.n_test == 96 and one.test_groups == 24
+    # features that know the object alone say nothing of another one's stiffness
+    thing = np.repeat(np.arange(24), 4)
+    known = leave_groups_out(np.eye(24)[thing], 10.25 + thing, thing, measured=True)
+    assert known.r2 < 0.1
+
+
+def test_the_commands_print_it(tmp_path, monkeypatch, capsys):
+    springs(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    words = ["--features", "f.npz", "--data", "m.csv", "--no-controls"]
+    for command in (["label", "--label"], ["tasks", "--tasks"]):
+        assert main(["probe", *command, "stiffness", *words]) == 0
+        assert "R2 0.9" in capsys.readouterr().out
+
+
+def test_rank_correlation_is_scipys_and_its_interval_holds_it():
+    rng = np.random.default_rng(1)
+    truth = rng.normal(size=80).round(1)
+    predicted = truth + rng.normal(size=80)
+    groups = np.arange(80) // 2
+    run = regression_sums(predicted - truth, truth - truth.mean(), groups, predicted)
+    scored = scores([run], [run], True)
+    assert scored["spearman"] == pytest.approx(spearmanr(predicted, truth).statistic, abs=1e-9)
+    assert scored["spearman_low"] < scored["spearman"] < scored["spearman_high"]
+    assert scored["spearman_high"] - scored["spearman_low"] < 0.5
+
+
+def test_a_record_of_options_and_their_names_are_one_call(tmp_path):
+    data, features = springs(tmp_path)
+    record = LabelProbeOptions(label="stiffness", features=[features], controls=False, seeds=0)
+    by_record = probe_label([], [data], options=record, log=str)
+    assert by_record == probe(data, features, "stiffness")[0]
+    assert probe_label([], [data], options=record, log=str, frames=1) == by_record
+    with pytest.raises(TypeError, match="colour"):
+        probe_label([], [data], options=record, colour=3)

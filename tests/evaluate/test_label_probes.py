@@ -138,3 +138,57 @@ def test_a_record_of_options_and_their_names_are_one_call(tmp_path):
     assert probe_label([], [data], options=record, log=str, frames=1) == by_record
     with pytest.raises(TypeError, match="colour"):
         probe_label([], [data], options=record, colour=3)
+
+
+def recordings(
+    folder: Path, *, names: int = 3, each: int = 4, frames: int = 6
+) -> tuple[Path, Path]:
+    """Recordings as the page makes them: all of split train, some of each name."""
+    rng = np.random.default_rng(0)
+    rows = []
+    features = []
+    for name in range(names):
+        for number in range(each):
+            for frame in range(6):
+                rows.append(
+                    row(
+                        path=f"{name}_{number}/{frame}.png",
+                        sequence=f"2026_{name}_{number}",
+                        frame_index=frame,
+                        object=f"thing {name}",
+                    )
+                )
+                features.append([*np.eye(3)[name] * 4 + rng.normal(size=3), *rng.normal(size=5)])
+    return written(folder, rows, features)
+
+
+def test_recordings_without_a_split_are_left_out_in_turn(tmp_path):
+    data, features = recordings(tmp_path)
+    (one,), said = probe(data, features, "object")
+    assert one.n_test == one.n_train == 72 and one.test_groups == 12 and one.accuracy > 0.9
+    assert "sequence left out" in one.probe
+    assert sum("no split into train and test" in line for line in said) == 1
+    (by_name,), said = probe(data, features, "object", leave_out="sequence")
+    assert by_name == one and not any("no split" in line for line in said)
+    with pytest.raises(UserError, match="published"):
+        probe(data, features, "object", protocol="published")
+
+
+def test_frames_of_one_recording_do_not_teach_each_other(tmp_path):
+    """Features that know the recording alone: chance, where a split by frames gives 100 %."""
+    data, _ = recordings(tmp_path)
+    np.savez(tmp_path / "f.npz", features=np.eye(12)[np.arange(72) // 6] * 5, rows=np.arange(72))
+    (one,), _ = probe(data, tmp_path / "f.npz", "object")
+    assert one.accuracy < 0.5
+
+
+def test_a_class_of_one_recording_is_named(tmp_path):
+    data, features = recordings(tmp_path)
+    columns = manifests.read(data).table.to_pydict()
+    columns["object"] = [
+        "alone" if one == "2026_0_0" else name
+        for one, name in zip(columns["sequence"], columns["object"], strict=True)
+    ]
+    manifests.write(manifests.from_columns(columns, data), data)
+    (one,), _ = probe(data, features, "object")
+    assert any("alone" in note for note in one.notes)

@@ -54,7 +54,8 @@ class LabelOptions(ProbeOptions):
 
     Use --where label.contact_score 7 for firm touches only, after `anytouch data contact`. The
     penalty is chosen on split val, or by grouped cross-validation inside train. The report is on
-    split test.
+    split test. A manifest without a split, as one of your recordings, has each recording left out
+    in turn.
     """
 
     label: str = "object"  # Label column. The prefix "label." may be left out.
@@ -162,7 +163,7 @@ def run_label(options: LabelOptions) -> int:
     if options.leave_out is not None:
         refuse_unused(
             options,
-            ("group", "seeds", "protocol", "save"),
+            ("group", "seeds", "protocol"),
             "with --leave-out, which makes its own folds",
         )
     models = _models(options)

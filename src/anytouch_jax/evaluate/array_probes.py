@@ -114,6 +114,23 @@ def _refits(
     return {"refit_mean": mean, "refit_std": deviation, "seeds": len(accuracies)}
 
 
+def _single_group_note(data: LabelledFeatures, used: Array) -> tuple[str, ...]:
+    """Return a note on classes of one group, which no head knows when that group is left out."""
+    pairs = np.unique(np.stack([data.y[used], _codes(data.groups[used])]), axis=1)
+    classes, groups = np.unique(pairs[0], return_counts=True)
+    single = data.names[classes[groups == 1]]
+    if not len(single):
+        return ()
+    listed = ", ".join(map(str, single[:10]))
+    if len(single) > 10:
+        listed += f" and {len(single) - 10} more"
+    return (f"classes of one group alone count as errors when it is left out: {listed}",)
+
+
+def _codes(names: Array) -> Array:
+    return np.unique(names, return_inverse=True)[1]
+
+
 def leave_groups_out(  # noqa: PLR0913 - three arrays, and settings that are each used alone
     features: Array,
     labels: npt.ArrayLike,
@@ -171,6 +188,8 @@ def leave_groups_out(  # noqa: PLR0913 - three arrays, and settings that are eac
     values, times = np.unique(chosen, return_counts=True)
     listed = ", ".join(f"{value:g} ({n} x)" for value, n in zip(values, times, strict=True))
     notes += (f"penalties of the folds: {listed}",)
+    if not measured:
+        notes += _single_group_note(data, used)
     median = Selection(0, float(np.median(chosen)), "cross-validation, median of the folds")
     scored = Scored(Split(used, used[:0], used), predicted[used], baseline[used], median)
     return result_of(name, "honest", data, scored, notes, subsets)

@@ -12,6 +12,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, sources
 from anytouch_jax.evaluate.label_rows import (
     constant_result,
+    hold_out,
     kind_sentence,
     select_rows,
     subsets_of,
@@ -72,7 +73,13 @@ def probe_label(
     for note in rows.notes:
         log(note)
     measured = task.kind == "regression"
-    chance = constant_result(rows, options, measured)
+    rows, left_out = hold_out(rows, options)
+    if left_out and options.leave_out is None:
+        log(
+            f"The manifest has no split into train and test: every {left_out} is left out in turn, "
+            "and named by a head fitted on the others"
+        )
+    chance = constant_result(rows, left_out, measured)
     encoding = feature_cache.Encoding(
         pooling=options.pooling, join=options.join, folder=options.cache, gels=gels
     )
@@ -88,7 +95,7 @@ def probe_label(
     results = list[ProbeResult]()
     for source in probed:
         x = features_of(source, rows, options.frames)
-        found = probe_source(source, x, rows, options, subsets, measured)
+        found = probe_source(source, x, rows, options, subsets, left_out, measured)
         results += found
         log(f"probed {source.name}")
         if options.save is not None and source.encoder is not None and not source.is_control:

@@ -93,24 +93,42 @@ def subsets_of(
     return tasks.described_subsets(table, task.groups[0], rows.rows[:, 0], f"{leave_out}s")
 
 
-def constant_result(
-    rows: TaskRows, options: LabelProbeOptions, measured: bool
-) -> ProbeResult | None:
+def hold_out(rows: TaskRows, options: LabelProbeOptions) -> tuple[TaskRows, str]:
+    """Return the rows, and what is left out in turn; "" if the split of the manifest is used.
+
+    Where whole groups are left out in turn all rows are of train. That is so by `leave_out`, and
+    where the manifest has no rows of train or of test, as recordings of a camera have none.
+    """
+    if options.leave_out is not None:
+        return _all_of_train(rows), options.leave_out
+    if np.any(rows.split == "train") and np.any(rows.split == "test"):
+        return rows, ""
+    if options.protocol == "published":
+        raise UserError(
+            "The manifest has no split into train and test, which --protocol published needs."
+        )
+    # keys of groups begin with their column
+    return _all_of_train(rows), str(rows.groups[0]).partition(" ")[0]
+
+
+def _all_of_train(rows: TaskRows) -> TaskRows:
+    return rows._replace(split=np.full(len(rows.split), "train"))
+
+
+def constant_result(rows: TaskRows, left_out: str, measured: bool) -> ProbeResult | None:
     """Check the rows before the work, and return the result of a constant prediction.
 
     It is the most frequent class of train, or its mean. There is none where groups are left out,
     since each fold has another constant.
     """
-    if options.leave_out is not None and len(np.unique(rows.groups)) == 1:
+    if left_out and len(np.unique(rows.groups)) == 1:
         raise UserError(
-            f"All rows are of one {options.leave_out} ({rows.groups[0]}). Nothing is left to fit "
-            "on."
+            f"All rows are of one {left_out} ({rows.groups[0]}). Nothing is left to fit on."
         )
     nothing = np.zeros((len(rows.split), 1))
-    if options.leave_out is not None:
-        everywhere = np.full(len(rows.split), "train")
+    if left_out:
         splits.check_rows(
-            nothing, rows.labels, rows.groups, everywhere, measured=measured, tested=False
+            nothing, rows.labels, rows.groups, rows.split, measured=measured, tested=False
         )
         return None
     given, cut, _ = splits.check_rows(

@@ -27,10 +27,21 @@ def probe_source(
     rows: TaskRows,
     options: LabelProbeOptions,
     subsets: Subsets,
+    left_out: str,
     measured: bool,
 ) -> list[ProbeResult]:
-    """Return the results of one source of features: of each head, the linear one first."""
-    if options.leave_out is not None:
+    """Return the results of one source of features: of each head, the linear one first.
+
+    Args:
+        source: of the features.
+        x: f32 (n, d).
+        rows: their labels, groups and splits.
+        options: of the probe.
+        subsets: parts of the rows that are scored too.
+        left_out: what is left out in turn, instead of the split.
+        measured: the label is continuous.
+    """
+    if left_out:
         return [
             leave_groups_out(
                 x,
@@ -39,7 +50,7 @@ def probe_source(
                 measured=measured,
                 scaling=source.scaling,
                 subsets=subsets,
-                name=f"{source.name}: linear, {options.leave_out} left out",
+                name=f"{source.name}: linear, {left_out} left out",
             )
         ]
     results = []

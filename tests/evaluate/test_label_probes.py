@@ -192,3 +192,97 @@ def test_a_class_of_one_recording_is_named(tmp_path):
     manifests.write(manifests.from_columns(columns, data), data)
     (one,), _ = probe(data, features, "object")
     assert any("alone" in note for note in one.notes)
+
+
+def two_sensors(folder: Path, code: Any, *, splits: bool = False) -> tuple[Path, Path]:
+    """Five objects with six places each, felt by two sensors; `code(thing, place, sensor)`.
+
+    The second sensor has felt one object more. With `splits` places are of train or test.
+    """
+    rng = np.random.default_rng(0)
+    rows = []
+    features = []
+    for sensor, things in (("digit", 5), ("gelsight_mini", 6)):
+        for thing in range(things):
+            for place in range(6):
+                for frame in range(3):
+                    rows.append(
+                        row(
+                            path=f"{sensor}/{thing}_{place}_{frame}.png",
+                            sensor=sensor,
+                            sequence=f"{sensor}_{thing}_{place}",
+                            frame_index=frame,
+                            touch=f"{thing}_{place}",
+                            object=f"thing {thing}",
+                            split="test" if splits and place > 3 else "train",
+                        )
+                    )
+                    own = np.asarray(code(thing, place, sensor), float)
+                    features.append(own + 0.1 * rng.normal(size=len(own)))
+    return written(folder, rows, features)
+
+
+ACROSS = {"train_sensor": "digit", "test_sensor": "gelsight_mini"}
+
+
+@pytest.mark.parametrize("splits", [False, True])
+def test_a_head_of_one_sensor_is_tested_on_another(tmp_path, splits):
+    def code(thing, place, sensor):
+        return [*np.eye(6)[thing], 0.3 * (sensor == "digit")]
+
+    data, features = two_sensors(tmp_path, code, splits=splits)
+    results, said = probe(data, features, "object", **ACROSS)
+    linear, knn = results
+    tested = 5 * (2 if splits else 6)
+    for one in (linear, knn):
+        assert one.accuracy > 0.95 and one.low > 0.65 and one.n_test == 3 * tested
+        assert one.test_groups == tested and one.baseline == pytest.approx(0.2, abs=0.05)
+    assert any("18 rows of classes that digit has not touched" in line for line in said)
+    assert any("tested on gelsight_mini" in note for note in linear.notes)
+
+
+def test_what_only_one_sensor_shows_does_not_carry_over(tmp_path):
+    """Each sensor shows the object by a code of its own: perfect within it, chance across."""
+
+    def code(thing, place, sensor):
+        return np.eye(12)[thing + 6 * (sensor == "digit")]
+
+    data, features = two_sensors(tmp_path, code)
+    within, _ = probe(data, features, "object", sensor="digit", group="touch")
+    across, _ = probe(data, features, "object", **ACROSS)
+    assert within[0].accuracy > 0.95 and across[0].accuracy < 0.5
+
+
+def test_a_place_that_both_sensors_felt_is_not_fitted_on(tmp_path):
+    """Features know the place, not the object: only a head that has seen it would name it."""
+
+    def code(thing, place, sensor):
+        return np.eye(36)[6 * thing + place] * 3
+
+    data, features = two_sensors(tmp_path, code)
+    across, _ = probe(data, features, "object", **ACROSS)
+    assert across[0].accuracy < 0.5 and across[1].accuracy < 0.5
+
+
+def test_options_between_sensors_are_checked_before_an_encoder_is_loaded(tmp_path):
+    data, _ = two_sensors(tmp_path, lambda *_: [0.0])
+    for change, words in (
+        ({"train_sensor": "digit"}, "go together"),
+        ({"train_sensor": "DIGIT", "test_sensor": "digit"}, "'DIGIT'.*digit, gelsight_mini"),
+        ({"train_sensor": "digit", "test_sensor": "digit"}, "the same"),
+        ({**ACROSS, "sensor": "digit"}, "--sensor"),
+        ({**ACROSS, "save": tmp_path / "h.npz"}, "--save"),
+        ({"sensor": "DIGIT"}, "'DIGIT'"),
+        ({"label": "colour"}, "'colour'"),
+    ):
+        with pytest.raises(UserError, match=words):
+            probe_label(["no such encoder"], [data], **{"label": "object", "log": str} | change)
+
+
+def test_a_number_across_sensors(tmp_path):
+    data, features = two_sensors(tmp_path, lambda thing, *_: [thing, thing**2 / 5])
+    columns = manifests.read(data).table.to_pydict()
+    columns["label.size"] = [float(name.split()[1]) + 0.5 for name in columns["object"]]
+    manifests.write(manifests.from_columns(columns, data), data)
+    (linear, _), _ = probe(data, features, "size", group="touch", **ACROSS)
+    assert linear.r2 > 0.9 and linear.n_test == 18 * 6

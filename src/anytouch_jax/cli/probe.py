@@ -69,6 +69,8 @@ class LabelOptions(ProbeOptions):
     """
     where: Finite[tuple[str, float] | None] = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
+    train_sensor: str | None = None  # Fit the heads on recordings of this sensor.
+    test_sensor: str | None = None  # Test them on the same classes by this sensor.
     # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
     frames: Count[int] = 1
     # Features: class token, mean of the patch tokens, or both.

@@ -10,14 +10,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, sources
-from anytouch_jax.evaluate.label_rows import (
-    constant_result,
-    hold_out,
-    kind_sentence,
-    select_rows,
-    subsets_of,
-    task_of,
-)
+from anytouch_jax.evaluate.label_rows import constant_result, plan_rows, select_rows, task_of
 from anytouch_jax.evaluate.label_scores import features_of, probe_source
 from anytouch_jax.evaluate.options import LabelProbeOptions, Models, Paths
 from anytouch_jax.evaluate.results import ProbeResult, probe_json
@@ -56,30 +49,16 @@ def probe_label(
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
     table = manifests.read([str(path) for path in data])
     task = task_of(table, options)
-    if options.save is not None and task.kind == "regression":
-        raise UserError(
-            f"{task.label} is continuous, and a saved head names classes. Leave out --save."
-        )
     rows = select_rows(table, task, options)
     encoders = sources.opened(models)
     gels = UnitGels(table)
-    rows = sources.with_gel(rows, gels, encoders)
-    subsets = subsets_of(table, task, rows, options.leave_out)
+    plan = plan_rows(table, task, sources.with_gel(rows, gels, encoders), options)
+    rows = plan.rows
     log(f"{len(rows.rows)} of {len(table)} rows take part")
-    sentence = kind_sentence(table, task, options)
-    if sentence:
-        log(sentence)
     log(gels.report(rows.rows[:, 0]))
-    for note in rows.notes:
+    for note in plan.notes:
         log(note)
-    measured = task.kind == "regression"
-    rows, left_out = hold_out(rows, options)
-    if left_out and options.leave_out is None:
-        log(
-            f"The manifest has no split into train and test: every {left_out} is left out in turn, "
-            "and named by a head fitted on the others"
-        )
-    chance = constant_result(rows, left_out, measured)
+    chance = constant_result(plan)
     encoding = feature_cache.Encoding(
         pooling=options.pooling, join=options.join, folder=options.cache, gels=gels
     )
@@ -95,7 +74,7 @@ def probe_label(
     results = list[ProbeResult]()
     for source in probed:
         x = features_of(source, rows, options.frames)
-        found = probe_source(source, x, rows, options, subsets, left_out, measured)
+        found = probe_source(source, x, plan, options)
         results += found
         log(f"probed {source.name}")
         if options.save is not None and source.encoder is not None and not source.is_control:

@@ -61,6 +61,8 @@ class LabelProbeOptions(ProbeOptions):
         leave_out: column of which every value is held out in turn, instead of the splits.
         where: keep rows whose column is above a number.
         sensor: keep rows of this sensor.
+        train_sensor: fit on rows of this sensor, and test on rows of `test_sensor`.
+        test_sensor: of the same classes.
         frames: of a touch: 1 for stills, 3 or more for the clip that ends at each row.
         save: file for the linear head of the only model, with its calibration.
         coverage: fraction of touches whose set of classes holds the true one, of a saved head.
@@ -72,6 +74,8 @@ class LabelProbeOptions(ProbeOptions):
     leave_out: str | None = None
     where: tuple[str, float] | None = None
     sensor: str | None = None
+    train_sensor: str | None = None
+    test_sensor: str | None = None
     frames: int = 1
     save: Path | None = None
     coverage: float = COVERAGE

@@ -6,7 +6,6 @@ import pytest
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import ProbeHead, linear_path
 from anytouch_jax.evaluate.probing import ProbeResult, leave_groups_out, probe_features
-from anytouch_jax.evaluate.verdicts import verdict
 
 Array = np.ndarray[Any, Any]
 
@@ -207,15 +206,3 @@ def test_rows_that_cannot_be_probed_are_refused(probe: Any) -> None:
         groups=lambda g, split: np.where(split == "test", 1, 0),
         split=lambda parts, _: np.where(parts == "val", "unused", parts),
     )
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "words"),
-    [
-        (0.03, 0.21, "ours is 12 points above raw pixels (3 to 21)."),
-        (-0.02, 0.26, "no better than raw pixels: +12 points"),
-        (None, None, "ours is +12 points from raw pixels, by too few test recordings to be sure."),
-    ],
-)
-def test_a_verdict_is_a_paired_interval(low: float | None, high: float | None, words: str) -> None:
-    assert words in verdict("ours", {"difference": 0.12, "low": low, "high": high})

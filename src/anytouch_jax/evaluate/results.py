@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import Array, Protocol
+from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
 from anytouch_jax.evaluate.tables import interval_text, markdown_table, plain, share_text
 from anytouch_jax.shown import shown_short
 
@@ -54,14 +54,20 @@ class SubsetResult:
 @shown_short
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The test rows, whether each was right, and its group.
+    """The test rows of a result, one by one.
 
-    `fitted`: the linear model and the names of its classes.
+    Attributes:
+        rows: places (n,) of the rows.
+        correct: whether each was right, bool (n,); empty for a continuous label.
+        groups: names (n,).
+        sums: by which they are scored.
+        fitted: the linear model and the names of its classes.
     """
 
     rows: Array
     correct: Array
     groups: Array
+    sums: GroupSums
     fitted: tuple[LinearModel | None, Array] | None = None
 
 

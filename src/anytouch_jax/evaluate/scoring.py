@@ -105,17 +105,16 @@ def result_of(
     truth = data.y[tested]
     groups = data.groups[tested]
     measured = not len(data.names)
-    scores = statistics.scores(
-        [score_sums(data, scored.predicted, tested)],
-        [score_sums(data, scored.constant, tested)],
-        measured,
-    )
+    sums = score_sums(data, scored.predicted, tested)
+    constant = score_sums(data, scored.constant, tested)
+    scores = statistics.scores([sums], [constant], measured)
     option = None
     chosen_on = ""
     if scored.selected is not None:
         option = scored.selected.option
         chosen_on = scored.selected.chosen_on
     more: dict[str, Any] = {}
+    correct = np.zeros(0, bool)
     if measured:
         names = ("mae", "mae_low", "mae_high", "spearman", "spearman_low", "spearman_high")
         more = {key: scores[key] for key in names}
@@ -130,7 +129,6 @@ def result_of(
             "parts": _parts(subsets or {}, tested, correct, groups),
             "balanced_accuracy": float(np.mean(by_class)),
             "classes": tuple(map(str, data.names[learned])),
-            "outcome": Outcome(tested, correct, groups),
         }
         if scores["low"] is None:
             notes = (*notes, "test has one group only: no interval")
@@ -145,6 +143,7 @@ def result_of(
         n_test=len(tested),
         test_groups=len(np.unique(groups)),
         notes=notes,
+        outcome=Outcome(tested, correct, groups, sums),
         **more,
     )
 

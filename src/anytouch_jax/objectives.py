@@ -467,7 +467,7 @@ def _draw_match(
     _, positive = _draw_tokens(batch.positive_sensor, keys[1], progress, net, config)
     batch = batch._replace(clip=normalise_touch(batch.clip), sensor=sensor)
     batch = batch._replace(positive=normalise_touch(batch.positive), positive_sensor=positive)
-    if batch.negative is not None:
+    if batch.negative is not None and batch.negative_sensor is not None:
         _, negative = _draw_tokens(batch.negative_sensor, keys[2], progress, net, config)
         batch = batch._replace(negative=normalise_touch(batch.negative), negative_sensor=negative)
     return p_u, batch

@@ -1,5 +1,6 @@
-"""Small worlds on disk: every touch image is of one colour that tells its row, so that a batch can
-be read back.
+"""Small worlds on disk.
+
+Every touch image is of one colour that tells its row, so that a batch can be read back.
 """
 
 from collections.abc import Callable
@@ -33,9 +34,7 @@ def save(path: Path, rgb: tuple[int, int, int], shape: tuple[int, int] = (12, 16
 
 @pytest.fixture
 def make(tmp_path: Path) -> Callable[..., manifests.Manifest]:
-    """make(rows, folder="."): a manifest of rows given as dicts; images are written for rows and
-    their photographs.
-    """
+    """make(rows, folder="."): a manifest of rows given as dicts, with the images that they name."""
 
     def build(rows: list[dict[str, Any]], folder: str = ".") -> manifests.Manifest:
         root = tmp_path / folder
@@ -65,9 +64,7 @@ def make(tmp_path: Path) -> Callable[..., manifests.Manifest]:
 
 @pytest.fixture
 def rich() -> list[dict[str, Any]]:
-    """Rows for `make`: clips of two sensors that touch the same places, some with pictures and
-    captions.
-    """
+    """Rows for `make`: clips of two sensors at the same places, some with images and captions."""
     rows = []
     for i in range(8):
         for k in range(6):
@@ -86,9 +83,7 @@ def rich() -> list[dict[str, Any]]:
 
 @pytest.fixture
 def settings() -> Callable[..., configuration.Config]:
-    """settings(stage, recipe, plain=True, **data): preset tiny at 28 pixels; `plain` leaves the
-    colours alone.
-    """
+    """settings(stage, recipe, plain=True, **data): preset tiny at 28 pixels, plain: as stored."""
 
     def build(
         stage: Any = 1, recipe: Any = "paper", plain: bool = True, **data: Any

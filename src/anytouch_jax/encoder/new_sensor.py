@@ -14,12 +14,12 @@ import numpy as np
 
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, Config, check_spelling, to_json
 from anytouch_jax.encoder.arrays import Log, Params
-from anytouch_jax.encoder.encoder import find_tokenizer, open_family
+from anytouch_jax.encoder.encoder import find_tokenizer
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_folder, atomic_write
 from anytouch_jax.shown import shown_short
 from anytouch_jax.weights import checkpoint, convert, registry
-from anytouch_jax.weights.load import Loaded, load_model
+from anytouch_jax.weights.load import Loaded, load_model, open_family
 
 
 @shown_short

@@ -8,9 +8,8 @@ on the long side.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from itertools import pairwise, product
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -20,24 +19,29 @@ from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS, 
 from anytouch_jax.data.background.estimate import (
     DOT_DEPTH,
     UntouchedGel,
-    close_dots,
     has_dots,
     scale_picture,
+)
+
+# Some of these names were defined here, and are asked for here.
+from anytouch_jax.data.background.layout import (  # noqa: F401
+    ORIENTATION,
+    Check,
+    UnitFrames,
+    check_layout,
+    known_gels,
+    small_look,
 )
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import read_arrays
 
-# real untouched gels, in the package
-_LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "looks.npz"
 # that are read of a unit, and of a recording
 RECORDINGS = 24
 FRAMES = 6
-SIDE = 16  # of the layout of a picture
 LIMITS = {
-    "orientation": 0.10,
+    "orientation": ORIENTATION,
     "exposure": 0.25,
     "focus": 0.5,
     "detail": 0.7,
@@ -53,92 +57,7 @@ LIMITS = {
 _SHARE = 0.25  # of recordings that look like another unit
 _ALIKE = 0.6  # distance within another unit, as a share of that between the two
 _DOTS = 21  # pixels of the widest marker dots, at 160 pixels
-# correlation of a unit with its family, and recordings from which a fixed pattern is judged
-_LIKE = 0.6
-_FEWEST = 4
-_TURNS = (
-    (0, False),
-    (1, False),
-    (2, False),
-    (3, False),
-    (0, True),
-    (1, True),
-    (2, True),
-    (3, True),
-)
-_NAMES = {
-    (1, False): "turned by 90 degrees",
-    (2, False): "upside down",
-    (3, False): "turned by 270 degrees",
-    (0, True): "mirrored left to right",
-    (2, True): "mirrored top to bottom",
-    (1, True): "mirrored and turned",
-    (3, True): "mirrored and turned",
-}
-_OPTIONS = {
-    (1, False): "--rotate 90",
-    (2, False): "--rotate 180",
-    (3, False): "--rotate 270",
-    (0, True): "--flip across",
-    (2, True): "--flip down",
-}
-
-
-@dataclass(frozen=True)
-class Check:
-    """The result of a check: `ok` is None if it cannot be decided; `advice` is what to do if it
-    failed.
-    """
-
-    name: str
-    ok: bool | None
-    value: str
-    advice: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class UnitFrames:
-    """Frames of one sensor unit: `recordings` are lists of pictures RGB u8 (h, w, 3), in order, all
-    of one size.
-
-    `background` is its untouched gel. `steps` (n,): distances of neighbouring frame numbers. `rows`
-    counts all.
-    """
-
-    sensor: str
-    unit: str
-    recordings: Sequence[Sequence[Array]]
-    background: Array | None = None
-    steps: Array = field(default_factory=lambda: np.ones(0))
-    rows: int = 0
-
-    @property
-    def frames(self) -> list[Array]:
-        """All pictures that were read."""
-        return [frame for recording in self.recordings for frame in recording]
-
-    @cached_property
-    def small(self) -> list[Array]:
-        """The pictures of each recording at 160 pixels, u8 (n, h, w, 3)."""
-        return [
-            np.stack([scale_picture(frame) for frame in recording]) for recording in self.recordings
-        ]
-
-    @cached_property
-    def middles(self) -> list[Array]:
-        """The median picture of each recording at 160 pixels."""
-        return [np.median(small, axis=0).astype(np.uint8) for small in self.small]
-
-    @cached_property
-    def usual(self) -> Array:
-        """The median of all recordings at 160 pixels: what never moves."""
-        return np.median(np.stack(self.middles), axis=0).astype(np.uint8)
-
-    def untouched(self) -> Array:
-        """Return the background, or the usual picture without one."""
-        if self.background is None:
-            return self.usual
-        return self.background
+_FEWEST = 4  # recordings from which a fixed pattern is judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,72 +181,6 @@ def check_units(
         known = [*references.get(unit.sensor, ()), *(other.untouched() for other in others)]
         results.append(examine(unit, known, others))
     return results
-
-
-@lru_cache
-def known_gels(sensor: str) -> list[Array]:
-    """Return small untouched gels RGB u8 (30, 40, 3) of real units of a sensor family, none of an
-    unknown one.
-    """
-    name = f"{sensor}.bases"
-    gels = read_arrays(_LOOKS, only=name.__eq__).get(name, np.zeros(0))
-    # the simulator invents the look of the others
-    if gels.dtype == np.uint8:
-        return list(gels)
-    return []
-
-
-def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
-    """Compare with the references: which turn and order of colours fits them best? A near symmetry
-    is no fault.
-    """
-    name = "orientation and colours"
-    if not references:
-        return Check(name, None, "no reference of this sensor")
-    picture = unit.untouched()
-    known = np.stack([_layout(reference) for reference in references])
-    own = _layout(picture)
-    scores = dict[tuple[tuple[int, bool], bool], float]()
-    shapes = np.log([reference.shape[1] / reference.shape[0] for reference in references])
-    shape = np.log(picture.shape[1] / picture.shape[0])
-    for turn, swap in product(_TURNS, (False, True)):
-        if abs((-shape if turn[0] % 2 else shape) - np.median(shapes)) > 0.2:
-            continue
-        scores[turn, swap] = float(
-            np.median(np.sort((known * _turned(own, turn, swap)).sum((1, 2, 3)))[-3:])
-        )
-    if not scores or max(scores.values()) < _LIKE:
-        return Check(name, None, f"unlike its family ({max(scores.values(), default=0):.2f})")
-    upright = scores.pop((_TURNS[0], False), -1.0)
-    best = max(scores, key=lambda key: scores[key])
-    margin = scores[best] - upright
-    if margin <= LIMITS["orientation"]:
-        return Check(name, True, f"fits ({upright:.2f})")
-    # The picture was turned by the inverse of what makes it fit.
-    (turns, mirrored), swap = best
-    done = (turns, True) if mirrored else (-turns % 4, False)
-    what = " and ".join(
-        filter(None, (_NAMES.get(done, ""), "red and blue exchanged" if swap else ""))
-    )
-    cure = _OPTIONS.get(done, "a turn and a mirror") if done != _TURNS[0] else ""
-    advice = " and ".join(filter(None, (cure, "red and blue exchanged" if swap else "")))
-    return Check(name, False, f"{what} ({margin:+.2f})", f"Read it with {advice}.")
-
-
-def _layout(picture: Array) -> Array:
-    """Return where a picture has which colour, f32 (SIDE, SIDE, 3) of norm 1, without brightness
-    and contrast.
-    """
-    small = _look(np.ascontiguousarray(picture)).reshape(SIDE, SIDE, 3)
-    small = small - small.mean()
-    return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6))
-
-
-def _turned(layout: Array, turn: tuple[int, bool], swap: bool) -> Array:
-    layout = np.rot90(layout[:, ::-1] if turn[1] else layout, turn[0])
-    if swap:
-        return layout[..., ::-1]
-    return layout
 
 
 def _exposure(unit: UnitFrames) -> Check:
@@ -499,12 +352,12 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
     name = "one unit"
     if len(unit.recordings) < _FEWEST:
         return Check(name, None, "too few recordings")
-    looks = np.stack([_look(middle) for middle in unit.middles])
+    looks = np.stack([small_look(middle) for middle in unit.middles])
     middle = np.median(looks, axis=0)
     own = np.sqrt(np.mean((looks - middle) ** 2, axis=1))
     for other in others:
         if other.frames[0].shape == unit.frames[0].shape and len(other.recordings) >= _FEWEST:
-            away = np.sqrt(np.mean((looks - _look(other.usual)) ** 2, axis=1))
+            away = np.sqrt(np.mean((looks - small_look(other.usual)) ** 2, axis=1))
             share = float(((own > LIMITS["two units"] / 2) & (away < 0.4 * own)).mean())
             if share >= _SHARE:
                 advice = "Sort them by unit. Left and right may be exchanged."
@@ -530,12 +383,6 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
         f"looks differ by {value:.0f}",
         "The folder seems to have two units. Sort them.",
     )
-
-
-def _look(picture: Array) -> Array:
-    small = scale_picture(picture)
-    small = close_dots(small) if has_dots(small) else small
-    return cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
 
 
 def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:

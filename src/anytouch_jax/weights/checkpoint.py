@@ -74,9 +74,19 @@ def quiet_hook(hook: Callable[..., Any]) -> Callable[..., Any]:
     return quiet
 
 
-# Orbax logs the traceback of every error in its threads, which it raises too.
-logging.getLogger("absl").addFilter(lambda record: "_SignalingThread" not in record.getMessage())
-sys.excepthook = quiet_hook(sys.excepthook)
+_is_quiet = False
+
+
+def _quieten() -> None:
+    """Let errors of Orbax be told once, by us. It is done when Orbax is first used."""
+    global _is_quiet
+    if _is_quiet:
+        return
+    _is_quiet = True
+    # Orbax logs the traceback of every error in its threads, which it raises too.
+    absl = logging.getLogger("absl")
+    absl.addFilter(lambda record: "_SignalingThread" not in record.getMessage())
+    sys.excepthook = quiet_hook(sys.excepthook)
 
 
 class Checkpoints:
@@ -343,6 +353,7 @@ def _acquire_orbax() -> Callable[[], None]:
     """Wait until no other operation of Orbax runs; return its release, which any thread may call,
     also twice.
     """
+    _quieten()
     stack = ExitStack()
     stack.callback(_ORBAX.release)
     _ORBAX.acquire()
@@ -368,6 +379,7 @@ def _load(folder: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises CheckpointError for other shapes.
     """
+    _quieten()
     # a wrong JAX_PLATFORMS is no fault of the checkpoint
     jax.local_devices()
     context = ocp.Context()

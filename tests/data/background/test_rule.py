@@ -40,9 +40,7 @@ def test_the_median_of_pressed_frames_is_the_untouched_gel(look):
 
 @pytest.fixture
 def world(tmp_path):
-    """world([(frames, cells)]): a manifest of frames with equal cells; "gel.png" is a stored
-    picture, all grey.
-    """
+    """world([(frames, cells)]): frames with equal cells; "gel.png" is a stored picture, grey."""
 
     def build(*groups):
         cv2.imwrite(str(tmp_path / "gel.png"), np.full((120, 160, 3), 90, np.uint8))

@@ -2,12 +2,13 @@
 
 A new sensor is a new entry of `SENSORS`, see also `own`.
 
-`looks.npz` has the untouched gels of camera sensors and the colours of their dents
-(`experiments/results/tried.md`). GelSight, GelSight Mini, DIGIT and 9DTact look like real units.
-The colours of the Mini are fitted to 17 presses of a ball of 6.31 mm (GelSLAM) by `fitting.fit`.
-Its `contrast` makes simulated balls as strong as real ones. GelSlim and DuraGel are a few lights
-each, set by eye. Sizes, gels and moduli are round numbers near published ones. Tac3D measures a
-field and has no image.
+`looks.npz` has the colours of the dents of camera sensors (`experiments/results/tried.md`), and the
+untouched gels of the two whose looks are set by eye. Those of real units are in
+`data.background.layout`. GelSight, GelSight Mini, DIGIT and 9DTact look like real units. The
+colours of the Mini are fitted to 17 presses of a ball of 6.31 mm (GelSLAM) by `fitting.fit`. Its
+`contrast` makes simulated balls as strong as real ones. GelSlim and DuraGel are a few lights each,
+set by eye. Sizes, gels and moduli are round numbers near published ones. Tac3D measures a field and
+has no image.
 """
 
 import math
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.data.background.layout import known_gels
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 from anytouch_jax.sim.contact.mechanics import Gel
@@ -189,10 +191,15 @@ def bases(sensor: Sensor) -> Array:
     """
     if sensor.kind == "field":
         return np.zeros((1, 30, 30, 3), np.float32)
-    stored = _stored(sensor)["bases"]
-    if stored.dtype == np.uint8:
-        return stored.astype(np.float32) / 255
-    return stored
+    stored = _stored(sensor)
+    if "bases" in stored:
+        bases_of = stored["bases"]
+    else:
+        # of real units; the core knows these, because it checks cameras by them
+        bases_of = np.stack(known_gels(sensor.name))
+    if bases_of.dtype == np.uint8:
+        return bases_of.astype(np.float32) / 255
+    return bases_of
 
 
 def look(sensor: Sensor) -> Photometry:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import UNIVERSAL, Config, check_spelling
-from anytouch_jax.data.background.rule import RunningGel, other_unit, same_unit, untouched_gel
+from anytouch_jax.data.background.rule import RunningGel, estimate_background, other_unit, same_unit
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder import arrays
@@ -172,13 +172,13 @@ class TouchEncoder(ABC):
         """Return a frame (h, w, 3) as RGB u8 (size, size, 3).
 
         It is background-subtracted if the encoder does so. Raises UserError if the encoder needs a
-        `background`, and there is none. `untouched_gel(frames)` makes one.
+        `background`, and there is none. `estimate_background(frames)` makes one.
         """
         if self.needs_background and background is None:
             raise UserError(
                 f"{self.source} subtracts the untouched gel. Give its picture, or that of some "
                 "frames: "
-                "encoder.preprocess(frame, at.untouched_gel(frames)). Or prepare all frames with "
+                "encoder.preprocess(frame, at.estimate_background(frames)). Or prepare all frames with "
                 "at.Preprocess(encoder, frames=frames)."
             )
         return Preprocess(self, background)(frame)
@@ -189,7 +189,7 @@ class Preprocess:
 
     They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and
     resized. For an encoder that `subtracts`, the `background` (a picture of the untouched gel) is
-    subtracted first, or the `untouched_gel` of `frames`. Without either, the first frame chooses
+    subtracted first, or the `estimate_background` of `frames`. Without either, the first frame chooses
     among the `known` pictures of a head. If none is of its unit, `log` gets a warning, and the
     frames so far give a running estimate, as for an encoder that needs a background.
 
@@ -216,7 +216,7 @@ class Preprocess:
         self._known = dict(known or {})
         self._log = log
         self._running = RunningGel() if encoder.needs_background or self._known else None
-        self._background = None if frames is None else untouched_gel(frames)
+        self._background = None if frames is None else estimate_background(frames)
         if background is not None:
             self._background = to_rgb(
                 arrays.as_array(background, "the background"), "the background"

@@ -76,7 +76,7 @@ class Spread(Generic[Item]):
         self.count += 1
 
 
-def untouched_gel(frames: Iterable[npt.ArrayLike]) -> Array:
+def estimate_background(frames: Iterable[npt.ArrayLike]) -> Array:
     """Return the background u8 (h, w, 3) of a camera: the median of its frames (h, w, 3).
 
     The frames may be pressed, at changing places. At most FRAMES of them are used, evenly spread.

@@ -47,9 +47,9 @@ __version__ = "0.3.0"
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
-        # Imported here, because only an old name or a mistake needs it.
-        from anytouch_jax import renamed
-
+        # Imported here, because only an old name or a mistake needs it. `from anytouch_jax import
+        # renamed` would ask this function for it.
+        renamed = import_module("anytouch_jax.renamed")
         if name in renamed.NAMES:
             new = renamed.NAMES[name]
             renamed.warn(f"anytouch_jax.{name}", f"anytouch_jax.{new}")

@@ -12,6 +12,7 @@ from films import write_film
 from anytouch_jax.data.images import frames_from_video
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.errors import UserError
+from anytouch_jax.live import reader
 from anytouch_jax.live import stream as streams
 
 DIGIT = 1
@@ -19,8 +20,8 @@ DIGIT = 1
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
-    monkeypatch.setattr(streams, "RETRY", 0.05)
-    monkeypatch.setattr(streams, "STUCK", 0.004)
+    monkeypatch.setattr(reader, "RETRY", 0.05)
+    monkeypatch.setattr(reader, "STUCK", 0.004)
 
 
 @pytest.fixture(scope="module")
@@ -185,13 +186,13 @@ def test_no_clip_spans_a_missed_read(encoder):
     mailbox = streams.Mailbox(replace=False)
     clips = []
     frames = [
-        streams.Frame(i, np.full((32, 40, 3), i, np.uint8), 0.0, 0.0, missed=int(i > 3))
+        reader.Frame(i, np.full((32, 40, 3), i, np.uint8), 0.0, 0.0, missed=int(i > 3))
         for i in range(8)
     ]
-    reader = threading.Thread(
-        target=streams._read, args=(iter(frames), lambda pixels: pixels, 3, 1, mailbox)
+    reading = threading.Thread(
+        target=reader.read_clips, args=(iter(frames), lambda pixels: pixels, 3, 1, mailbox)
     )
-    reader.start()
+    reading.start()
     while (clip := mailbox.take()) is not None:
         clips.append([int(frame.max()) for frame in clip.frames])
     assert clips == [[0, 1, 2], [1, 2, 3], [4, 5, 6], [5, 6, 7]]

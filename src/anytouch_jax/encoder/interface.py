@@ -177,9 +177,8 @@ class TouchEncoder(ABC):
         if self.needs_background and background is None:
             raise UserError(
                 f"{self.source} subtracts the untouched gel. Give its picture, or that of some "
-                "frames: "
-                "encoder.preprocess(frame, at.estimate_background(frames)). Or prepare all frames with "
-                "at.Preprocess(encoder, frames=frames)."
+                "frames: encoder.preprocess(frame, at.estimate_background(frames)). Or prepare all "
+                "frames with at.Preprocess(encoder, frames=frames)."
             )
         return Preprocess(self, background)(frame)
 
@@ -189,9 +188,9 @@ class Preprocess:
 
     They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and
     resized. For an encoder that `subtracts`, the `background` (a picture of the untouched gel) is
-    subtracted first, or the `estimate_background` of `frames`. Without either, the first frame chooses
-    among the `known` pictures of a head. If none is of its unit, `log` gets a warning, and the
-    frames so far give a running estimate, as for an encoder that needs a background.
+    subtracted first, or the `estimate_background` of `frames`. Without either, the first frame
+    chooses among the `known` pictures of a head. If none is of its unit, `log` gets a warning, and
+    the frames so far give a running estimate, as for an encoder that needs a background.
 
     >>> features = encoder.encode_touch(Preprocess(encoder, frames=frames)(camera.read()), "digit")
     """

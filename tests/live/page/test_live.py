@@ -29,9 +29,9 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.page import live as live_module
 from anytouch_jax.live.page import server
+from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.live import Live
-from anytouch_jax.live.page.tables import FeatureMap
-from anytouch_jax.live.page.teach import SCORE, LiveRecorder
+from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
 
 PAGE = {"X-Anytouch": "1"}
 # picture, contact score and features
@@ -144,7 +144,7 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
 
     try:
         free, _ = until("depth", lambda about: about["frame"] > 3)
-        live.capture_background()
+        live.frames.capture_background()
         camera.shape = "ball"
         for layer, shape in (("depth", (360, 480, 3)), ("surface", (54, 72, 3))):
             pressed, picture = until(layer, lambda about: about["fields"]["area"] > 0)
@@ -155,10 +155,10 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
             assert {"contact", "force, N", "depth, mm", "slip"} == set(pressed["curves"])
         # no frame is read in one way and measured in another
         for rotate in (90, 0) * 40:
-            live.orient(rotate, "none")
-            live.capture_background()
+            live.frames.orient(rotate, "none")
+            live.frames.capture_background()
             time.sleep(0.003)
-        live.orient(90, "none")  # another shape than the sensor's: it is said
+        live.frames.orient(90, "none")  # another shape than the sensor's: it is said
         until("depth", lambda about: any("height" in fault for fault in about["fields"]["faults"]))
     finally:
         live.stop()

@@ -21,7 +21,8 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import Camera
 from anytouch_jax.live.page import server
-from anytouch_jax.live.page.tables import Run, Table
+from anytouch_jax.live.page.runs import Run
+from anytouch_jax.live.page.tables import Table
 
 KINDS = (".html", ".js", ".css")
 

@@ -467,6 +467,7 @@ def _stage2_embeddings(
         matched.append((match.positive, match.positive_sensor))
         # By cosine the other pairs of the batch are the negatives.
         if net.model.match_head != "cosine":
+            assert match.negative is not None and match.negative_sensor is not None
             matched.append((match.negative, match.negative_sensor))
     if match_noise is None:
         z = touch_embeddings(params, aligned + matched, net=net)

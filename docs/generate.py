@@ -31,7 +31,7 @@ _ROOMS = {
     "objectives": "Losses of the two stages",
     "nn": "Networks",
     "train": "Training",
-    "pretrain": "Training",
+    "training": "Training",
     "batch": "Batches",
     "config": "Settings",
     "data": "Data",

@@ -63,7 +63,14 @@ def faults_of(
             faults.append(
                 f"it looks {turned} when compared with its background. Read both in the same way."
             )
-    check = check_layout(UnitFrames(sensor, "", [[frame]], background), known_gels(sensor))
+    # With its own background a mirrored picture is measured as well as another one: the network
+    # has learned from simulated instances of which half are mirrored. On 20 presses each of a real
+    # DIGIT and a GelSight, mirrored, the deepest point changes by 4 % in the median.
+    check = check_layout(
+        UnitFrames(sensor, "", [[frame]], background),
+        known_gels(sensor),
+        may_be_mirrored=background is not None,
+    )
     if check.ok is False:
         faults.append(f"unlike other units of {sensor} it looks {check.value}. {check.advice}")
     return tuple(faults)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -160,7 +161,7 @@ def _simulated(options: AdaptOptions) -> int:
     from anytouch_jax.encoder.adapt import save
     from anytouch_jax.sim.fitting.tokens import adapt_by_simulation
 
-    state = options.out.with_name(f"{options.out.name}.part.npz")
+    state = options.out.with_name(f"{options.out.name}.part")
     log("compiling the simulator: about two minutes at first")
     adapted = adapt_by_simulation(
         options.model,
@@ -175,7 +176,7 @@ def _simulated(options: AdaptOptions) -> int:
         log(f"interrupted: {state} keeps the state. Run the same command again to continue.")
         return 130
     save(adapted, options.model, options.out)
-    state.unlink(missing_ok=True)
+    shutil.rmtree(state, ignore_errors=True)
     name = adapted.metadata["source"]["sensor"]
     print(
         f"{options.out}: tokens of {name}, {len(adapted.losses)} steps. Of held-out simulated "

@@ -64,7 +64,12 @@ def faults_of(
                 f"it looks {turned} when compared with its background. Read both in the same way."
             )
     check = check_layout(UnitFrames(sensor, "", [[frame]], background), known_gels(sensor))
-    if check.ok is False:
+    # A device may be built another way round than the few known ones, and simulated devices are.
+    # The network was trained on mirrored devices: with the background of the same device it reads
+    # an example and its three mirror images alike (depth within 0.05 mm RMS, force within 17 %).
+    # So a turn counts only without a background. Exchanged colours always do.
+    is_fault = background is None or "exchanged" in check.value
+    if check.ok is False and is_fault:
         faults.append(f"unlike other units of {sensor} it looks {check.value}. {check.advice}")
     return tuple(faults)
 

@@ -33,7 +33,9 @@ def test_the_median_of_pressed_frames_is_the_untouched_gel(look):
     frames = presses(30, look)
     free = UntouchedGel(gel_frame(look, 0))
     assert free.score(gels.estimate_background(frames)) < 3 < 6 < min(map(free.score, frames[5:25]))
-    assert np.array_equal(gels.estimate_background(iter(frames)), gels.estimate_background(np.stack(frames)))
+    assert np.array_equal(
+        gels.estimate_background(iter(frames)), gels.estimate_background(np.stack(frames))
+    )
     refused("too few", gels.estimate_background, frames[:2])
     refused("2 sizes", gels.estimate_background, [*frames, frames[0][:50]])
 

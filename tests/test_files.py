@@ -4,12 +4,17 @@ import stat
 import zipfile
 from pathlib import Path
 
+import fsspec
 import numpy as np
 import pytest
+from refused import refused
 
 from anytouch_jax import files
-from anytouch_jax.data.manifest.files import unpack_npy
+from anytouch_jax.data.manifest.files import local_copy, unpack_npy
 from anytouch_jax.files import atomic_path, atomic_write, lock
+from anytouch_jax.train.mesh import enable_compilation_cache
+
+REMOTE = "memory://a.png"
 
 
 def test_a_file_is_replaced_in_one_move(tmp_path: Path) -> None:
@@ -59,6 +64,25 @@ def test_a_lock_is_exclusive_and_ends_with_its_block(tmp_path):
         assert first and not second
     with lock(path) as again:
         assert again and path.read_text() == "kept"
+
+
+def test_without_a_home_there_is_no_cache_and_no_fault(monkeypatch):
+    """A container with a user number that it does not know, and no HOME."""
+
+    def unknown(number: int) -> None:
+        raise KeyError(f"getpwuid(): uid not found: {number}")
+
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    for name in ("HOME", "XDG_CACHE_HOME", "ANYTOUCH_CACHE"):
+        monkeypatch.delenv(name, raising=False)
+    folder = files.cache_folder()
+    assert not folder.exists() and list(folder.glob("*")) == []
+    with pytest.raises(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    files.remove_old(folder, "*")
+    assert enable_compilation_cache() is None
+    fsspec.filesystem("memory").pipe("/a.png", b"x")
+    refused("cannot be copied to .* or name another folder in ANYTOUCH_CACHE", local_copy, REMOTE)
 
 
 def npz_of(header: dict, data: bytes = b"") -> io.BytesIO:

@@ -3,8 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from anytouch_jax.encoder import calibration, linear_head
 from anytouch_jax.encoder import calibration as novelty
-from anytouch_jax.encoder import linear_head
 from anytouch_jax.encoder.linear_head import ContactGate
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits
@@ -223,3 +223,15 @@ def test_sets_of_a_head_hold_the_class_of_new_recordings_of_any_length():
         alarms.append(np.average(seen.novel, weights=weights))
     assert 0.86 < np.mean(covered) < 0.96, covered
     assert 0.01 < np.mean(alarms) < 0.09, alarms
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_confidence_is_not_above_what_the_groups_support(columns):
+    """However sure the logits are; a temperature that is modest already stays."""
+    rng = np.random.default_rng(2)
+    groups = np.repeat(np.arange(7), 10)
+    logits = 50 * rng.standard_normal((70, columns))
+    found = calibration.modest_temperature(logits, groups, 0.05)
+    confidence = linear_head.probabilities(logits, found).max(1).mean()
+    assert found > 0.05 and confidence == pytest.approx(8 / 9, abs=1e-6)
+    assert calibration.modest_temperature(logits, groups, 2 * found) == 2 * found

@@ -129,11 +129,9 @@ def _lines(path: Path) -> list[str]:
     if str(path) in registry.list_encoders():
         return [_named(str(path)), *_weights(registry.locate(path))]
     if str(path) == "cameras":
-        from anytouch_jax.live.cameras import list_cameras
+        from anytouch_jax.live.cameras import describe_cameras
 
-        return [line for camera in list_cameras() for line in camera.lines()] or [
-            "no camera is connected"
-        ]
+        return describe_cameras() or ["no camera is connected"]
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix = path.suffix.lower()

@@ -16,7 +16,7 @@ from anytouch_jax.data.opencv import QUIET
 from anytouch_jax.data.picture_headers import JPEG, PNG, check_header, decoded_chunks
 from anytouch_jax.data.pixels import MAX_ASPECT, MAX_PIXELS, ImageError, to_rgb
 from anytouch_jax.data.videos import (
-    PyAvFilm,
+    VideoFile,
     count_frames,
     frame_time,
     frames_from_video,
@@ -32,7 +32,7 @@ __all__ = [
     "QUIET",
     "SUFFIXES",
     "ImageError",
-    "PyAvFilm",
+    "VideoFile",
     "count_frames",
     "decode",
     "decode_bytes",

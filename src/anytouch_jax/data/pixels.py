@@ -32,7 +32,7 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
     """
     if pixels.ndim == 2:
         pixels = pixels[..., None]
-    _check_shape(pixels.shape, path)
+    check_shape(pixels.shape, path)
     # the byte order of the machine, for a .npy of another
     pixels = pixels[..., :3].astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.uint16:
@@ -51,7 +51,8 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
     return np.ascontiguousarray(pixels)
 
 
-def _check_shape(shape: tuple[int, ...], path: str | Path) -> None:
+def check_shape(shape: tuple[int, ...], path: str | Path) -> None:
+    """Raise ImageError unless a shape is that of an image (h, w, c) of a usable size."""
     if len(shape) != 3 or shape[2] not in (1, 3, 4) or 0 in shape:
         raise ImageError(
             f"{path} has shape {shape}; an image is (height, width) with 1, 3 or 4 channels"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -14,40 +15,12 @@ import numpy as np
 
 from anytouch_jax.data.folders import picture_files
 from anytouch_jax.data.opencv import QUIET
-from anytouch_jax.data.pixels import ImageError, to_rgb
+from anytouch_jax.data.pixels import ImageError, check_shape, to_rgb
 from anytouch_jax.files import placeholder
 
 if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.frame import VideoFrame
-
-
-class Video(Protocol):
-    """What a video gives, in the names of cv2.VideoCapture."""
-
-    def open(self, path: str, /) -> bool:
-        """Start again at the first frame."""
-
-    def isOpened(self) -> bool:
-        """Return whether frames can be read."""
-
-    def grab(self) -> bool:
-        """Go to the next frame."""
-
-    def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        """Return whether there is one, and the frame of the last grab, BGR u8 (h, w, 3)."""
-
-    def read(self) -> tuple[bool, np.ndarray | None]:
-        """Go to the next frame, and return it as `retrieve` does."""
-
-    def get(self, name: int, /) -> float:
-        """Return a property by OpenCV's number."""
-
-    def set(self, name: int, value: float, /) -> bool:
-        """Set a property by OpenCV's number, and return whether that worked."""
-
-    def release(self) -> None:
-        """Close the video."""
 
 
 def frames_from_video(path: str | Path) -> Iterator[np.ndarray]:
@@ -88,7 +61,7 @@ def timed_frames(path: str | Path) -> Iterator[tuple[float, np.ndarray]]:
         raise ImageError(f"{path} is not a video that can be read, or has no frame")
 
 
-def frame_time(video: Video, number: int, last: float) -> float:
+def frame_time(video: _Decoder | VideoFile, number: int, last: float) -> float:
     """Return the seconds of a frame, by its stamp or the frame rate.
 
     Args:
@@ -118,7 +91,7 @@ def count_frames(path: str | Path) -> int:
         video.release()
 
 
-def open_video(path: str | Path) -> Video:
+def open_video(path: str | Path) -> VideoFile:
     """Open a video, by PyAV if OpenCV cannot decode it.
 
     A file that neither can read is returned as one that gives no frame.
@@ -130,65 +103,218 @@ def open_video(path: str | Path) -> Video:
         kind = placeholder(path)
         if kind:
             raise ImageError(f"{path} is {kind}")
-    # FFmpeg takes the part of a relative name before a colon for a protocol
-    place = os.path.abspath(path)
-    with QUIET:
-        video: Video = cv2.VideoCapture(place)
-        if not video.isOpened():
-            return video
-        if video.grab():
-            return cv2.VideoCapture(place)  # some formats cannot go back
+    return VideoFile(path)
+
+
+class VideoFile:
+    """A video file, with the methods of cv2.VideoCapture. Frames are BGR u8 (h, w, 3).
+
+    All decoders follow one rule, because a data set may have videos of several codecs:
+
+    * Frames are upright. A phone stores how it was held, as a multiple of 90 degrees.
+    * Pixels are square. A video of 240 x 240 pixels may be meant to be shown as 320 x 240.
+    * Time counts from the start of the video, whatever its first stamp is.
+    * Colours have the range and the matrix that the video names, which both decoders see to.
+
+    Rotation and shape of pixels are read by OpenCV in any case. It knows what a file says of a
+    video that it cannot decode.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._decoder: _Decoder = cv2.VideoCapture()
+        self._quarters = 0  # of a turn, clockwise, that make frames upright
+        self._stretch = 1.0  # width of a pixel over its height
+        self._name: str | Path = path
+        self.open(path)
+
+    def open(self, path: str | Path) -> bool:
+        """Start at the first frame of a file. Raises ImageError for a codec without decoder."""
+        self.release()
+        self._name = path
+        with QUIET, _name_for_opencv(path) as name:
+            told = cv2.VideoCapture(name)
+            self._decoder = told
+            if not told.isOpened():
+                return False
+            self._quarters = round(told.get(cv2.CAP_PROP_ORIENTATION_META) / 90) % 4
+            wide = told.get(cv2.CAP_PROP_SAR_NUM)
+            high = told.get(cv2.CAP_PROP_SAR_DEN)
+            # 0 is unknown, and means square
+            self._stretch = wide / high if wide > 0 and high > 0 else 1.0
+            if told.grab():
+                self._decoder = cv2.VideoCapture(name)  # some formats cannot go back
+                self._decoder.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+                return True
+        other = _by_pyav(path, _codec(told))
+        if other is not None:
+            self._decoder = other
+        return True
+
+    def isOpened(self) -> bool:
+        """Return whether frames can be read."""
+        return self._decoder.isOpened()
+
+    def grab(self) -> bool:
+        """Go to the next frame."""
+        return self._decoder.grab()
+
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        """Return whether there is one, and the frame of the last grab."""
+        whole, frame = self._decoder.retrieve()
+        if not whole or frame is None:
+            return False, None
+        return True, self._shown(frame)
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        """Go to the next frame, and return it as `retrieve` does."""
+        if not self.grab():
+            return False, None
+        return self.retrieve()
+
+    def get(self, name: int, /) -> float:
+        """Return a property by OpenCV's number. Width and height are those of the frames."""
+        if name not in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT):
+            return self._decoder.get(name)
+        width = self._shown_width(round(self._decoder.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        height = round(self._decoder.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        is_width = name == cv2.CAP_PROP_FRAME_WIDTH
+        is_turned = self._quarters % 2 == 1
+        return float(width if is_width != is_turned else height)
+
+    def set(self, name: int, value: float, /) -> bool:
+        """Set a property by OpenCV's number, and return whether that worked."""
+        return self._decoder.set(name, value)
+
+    def release(self) -> None:
+        """Close the video."""
+        self._decoder.release()
+
+    def _shown_width(self, width: int) -> int:
+        return max(1, round(width * self._stretch))
+
+    def _shown(self, frame: np.ndarray) -> np.ndarray:
+        """Return a stored frame with square pixels, upright."""
+        height, width = frame.shape[:2]
+        shown_width = self._shown_width(width)
+        if shown_width != width:
+            # A damaged header can ask for any shape.
+            check_shape((height, shown_width, 3), self._name)
+            area = cv2.INTER_AREA if shown_width < width else cv2.INTER_LINEAR
+            frame = cv2.resize(frame, (shown_width, height), interpolation=area)
+        if self._quarters:
+            frame = cv2.rotate(frame, _ROTATIONS[self._quarters])
+        return frame
+
+
+# By quarters of a turn, clockwise.
+_ROTATIONS = {
+    1: cv2.ROTATE_90_CLOCKWISE,
+    2: cv2.ROTATE_180,
+    3: cv2.ROTATE_90_COUNTERCLOCKWISE,
+}
+
+
+class _Decoder(Protocol):
+    """What decodes a video: cv2.VideoCapture, or what has its methods. Frames are as stored."""
+
+    def isOpened(self) -> bool: ...
+
+    def grab(self) -> bool: ...
+
+    def retrieve(self) -> tuple[bool, np.ndarray | None]: ...
+
+    def get(self, name: int, /) -> float: ...
+
+    def set(self, name: int, value: float, /) -> bool: ...
+
+    def release(self) -> None: ...
+
+
+def _by_pyav(path: str | Path, codec: str) -> _PyAv | None:
+    """Return a decoder before its first frame, None if PyAV finds none in the file either.
+
+    Raises ImageError without PyAV.
+    """
     try:
-        film = PyAvFilm(place)
-        if film.grab() and film.open(place):
-            return film
+        decoder = _PyAv(path)
+        if not decoder.grab():
+            return None
+        decoder.open()
     except ImportError:
         raise ImageError(
-            f"OpenCV cannot decode {path}, a video of the codec {_codec(video)}: pip install "
+            f"OpenCV cannot decode {path}, a video of the codec {codec}: pip install "
             "'anytouch_jax[lerobot]' to read it, or convert it with ffmpeg -i IN -c:v libx264 "
             "OUT.mp4"
         ) from None
     except OSError:
+        return None
+    return decoder
+
+
+@contextlib.contextmanager
+def _name_for_opencv(path: str | Path) -> Iterator[str]:
+    """Give the name of a file that OpenCV can open.
+
+    It takes UTF-8 only, and ends the process for other names, which ZIP files of Windows and old
+    recorders leave. Such a file gets a second name while it is opened.
+    """
+    # FFmpeg takes the part of a relative name before a colon for a protocol
+    name = os.path.abspath(path)
+    try:
+        name.encode()
+    except UnicodeEncodeError:
         pass
-    return video
+    else:
+        yield name
+        return
+    ending = Path(name).suffix
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="anytouch-")
+    except OSError as error:
+        raise ImageError(
+            f"the name of the video {path} is not UTF-8, and it cannot get another one "
+            f"({error.strerror}); rename it"
+        ) from None
+    with folder as place:
+        link = Path(place) / f"video{ending if ending.isascii() else ''}"
+        link.symlink_to(name)
+        yield str(link)
 
 
-def _codec(video: Video) -> str:
+def _codec(video: _Decoder) -> str:
     """Return the four letters of a video's codec, such as AV01."""
     number = int(video.get(cv2.CAP_PROP_FOURCC))
     return number.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ")
 
 
-class PyAvFilm:
-    """A video such as AV1, BGR u8 (h, w, 3), with the methods of cv2.VideoCapture.
+class _PyAv:
+    """A decoder of videos such as AV1. Raises ImportError and OSError."""
 
-    Raises ImportError and OSError.
-    """
-
-    def __init__(self, path: str) -> None:
-        self._path = path
+    def __init__(self, path: str | Path) -> None:
+        self._path = os.path.abspath(path)
         self._frame: VideoFrame | None = None
         self._container: InputContainer | None = None
         self._frames: Iterator[VideoFrame] = iter(())
-        self.open(path)
+        self.open()
 
-    def open(self, path: str, /) -> bool:
-        """Start again at the first frame."""
+    def open(self) -> None:
+        """Start at the first frame."""
         import av
 
         self.release()
         try:
-            self._container = av.open(path)
+            self._container = av.open(self._path)
             self._frames = self._container.decode(video=0)
         # IndexError: a file without a video
         except (av.FFmpegError, ValueError, IndexError) as error:
             raise OSError(str(error)) from None
+        stream = self._container.streams.video[0]
+        # Seconds of the first stamp, as cameras count from when they were switched on.
+        self._start = float((stream.start_time or 0) * (stream.time_base or 0))
         self._frame = None
         self._number = 0
-        return True
 
     def isOpened(self) -> bool:
-        """Return whether frames can be read."""
         return self._container is not None
 
     def grab(self) -> bool:
@@ -201,15 +327,9 @@ class PyAvFilm:
         return self._frame is not None
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        """Return the frame of the last grab."""
         if self._frame is None:
             return False, None
         return True, self._frame.to_ndarray(format="bgr24")
-
-    def read(self) -> tuple[bool, np.ndarray | None]:
-        """Return the next frame."""
-        self.grab()
-        return self.retrieve()
 
     def get(self, name: int, /) -> float:
         """Return a property by OpenCV's number, 0 for one that is not known."""
@@ -220,10 +340,12 @@ class PyAvFilm:
         if name == cv2.CAP_PROP_FRAME_COUNT:
             microseconds = self._container.duration or 0
             return float(stream.frames or round(microseconds / 1e6 * rate))
-        time = None if self._frame is None else self._frame.time
+        seconds = 0.0
+        if self._frame is not None and self._frame.time is not None:
+            seconds = self._frame.time - self._start
         known = {
             cv2.CAP_PROP_FPS: rate,
-            cv2.CAP_PROP_POS_MSEC: 1000 * (time or 0),
+            cv2.CAP_PROP_POS_MSEC: 1000 * seconds,
             cv2.CAP_PROP_POS_FRAMES: self._number,
             cv2.CAP_PROP_FRAME_WIDTH: stream.width,
             cv2.CAP_PROP_FRAME_HEIGHT: stream.height,
@@ -235,13 +357,12 @@ class PyAvFilm:
         if name != cv2.CAP_PROP_POS_FRAMES:
             return False
         if value < self._number:
-            self.open(self._path)
+            self.open()
         while self._number < value and self.grab():
             pass
         return self._number == value
 
     def release(self) -> None:
-        """Close the video."""
         if self._container is not None:
             self._container.close()
             self._container = None

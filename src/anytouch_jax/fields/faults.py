@@ -63,13 +63,15 @@ def faults_of(
             faults.append(
                 f"it looks {turned} when compared with its background. Read both in the same way."
             )
-    check = check_layout(UnitFrames(sensor, "", [[frame]], background), known_gels(sensor))
-    # A device may be built another way round than the few known ones, and simulated devices are.
-    # The network was trained on mirrored devices: with the background of the same device it reads
-    # an example and its three mirror images alike (depth within 0.05 mm RMS, force within 17 %).
-    # So a turn counts only without a background. Exchanged colours always do.
-    is_fault = background is None or "exchanged" in check.value
-    if check.ok is False and is_fault:
+    # With its own background a mirrored picture is measured as well as another one: the network
+    # has learned from simulated instances of which half are mirrored. On 20 presses each of a real
+    # DIGIT and a GelSight, mirrored, the deepest point changes by 4 % in the median.
+    check = check_layout(
+        UnitFrames(sensor, "", [[frame]], background),
+        known_gels(sensor),
+        may_be_mirrored=background is not None,
+    )
+    if check.ok is False:
         faults.append(f"unlike other units of {sensor} it looks {check.value}. {check.advice}")
     return tuple(faults)
 

@@ -9,8 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from anytouch_jax.encoder.field_outputs import FORCE, LENGTH, TORQUE
 from anytouch_jax.fields.measure import LEAST_FORCE, Scale, scale_of
+from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
 
 DEVIATION = "sqrt(2) * exp(5 * tanh(x / 5))"
 # of the example for a table without a sensor of known width

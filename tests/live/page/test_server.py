@@ -123,7 +123,7 @@ def test_depth_is_measured_where_the_untouched_gel_is_known(page, tmp_path):
     assert (
         nothing["area"] == 0 < values["area"]
         and values["depth_std"] > 0
-        and nothing["curves"]["slip"] == 0
+        and "slip" not in nothing["curves"]
     )
     surface = picture(page.get("/api/0/frame/2?layer=surface")).astype(int)
     # grey

@@ -38,12 +38,13 @@ class Turn(NamedTuple):
 
 
 _UPRIGHT = Turn(0, False)
+_ACROSS = Turn(0, True)
 _TURNS = (
     _UPRIGHT,
     Turn(1, False),
     Turn(2, False),
     Turn(3, False),
-    Turn(0, True),
+    _ACROSS,
     Turn(1, True),
     Turn(2, True),
     Turn(3, True),
@@ -144,7 +145,9 @@ def known_gels(sensor: str) -> list[Array]:
     return list(gels.get(sensor, ()))
 
 
-def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
+def check_layout(
+    unit: UnitFrames, references: Sequence[Array], *, may_be_mirrored: bool = False
+) -> Check:
     """Compare with the references: which turn and order of colours fits them best?
 
     A near symmetry is no fault: where a picture fits another way round by little more, nothing is
@@ -153,6 +156,8 @@ def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
     Args:
         unit: Its background, or else its usual picture, is compared.
         references: Backgrounds u8 (h, w, 3) of the same family.
+        may_be_mirrored: A mirror image left to right is no fault, as for the simulator's instances,
+            of which half are.
     """
     name = "orientation and colours"
     if not references:
@@ -162,6 +167,8 @@ def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
     if most < _LIKE:
         return Check(name, None, f"unlike its family ({most:.2f})")
     as_it_is = scores.pop((_UPRIGHT, False), -1.0)
+    if may_be_mirrored:
+        as_it_is = max(as_it_is, scores.pop((_ACROSS, False), -1.0))
     best = max(scores, key=lambda key: scores[key])
     margin = scores[best] - as_it_is
     if margin <= ORIENTATION:

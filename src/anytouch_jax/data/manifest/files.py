@@ -33,7 +33,7 @@ import pyarrow.parquet
 
 from anytouch_jax.data.manifest.schema import ManifestError, shown
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path
+from anytouch_jax.files import atomic_path, cache_folder
 
 MAX_BYTES = 1 << 29  # of one file: an image of images.MAX_PIXELS with four channels of 16 bits
 SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
@@ -391,8 +391,8 @@ def open_store(address: str) -> tuple[Any, str]:
 
 def _fetch(file: str, target: Path) -> None:
     system, path = open_store(file)
-    target.parent.mkdir(parents=True, exist_ok=True)
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
         size = int(system.size(path) or 0)
         _make_room(size, target)
         with (
@@ -408,7 +408,8 @@ def _fetch(file: str, target: Path) -> None:
     except Exception as error:  # each store has its own kinds, as of httpx and botocore
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(
-            f"{file} cannot be copied to {target.parent}: {reason}; check access and free space"
+            f"{file} cannot be copied to {target.parent}: {reason}; check access and free space, "
+            "or name another folder in ANYTOUCH_CACHE"
         ) from None
 
 
@@ -430,5 +431,7 @@ def _make_room(size: int, target: Path) -> None:
 
 
 def _folder() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(os.environ.get("ANYTOUCH_CACHE") or f"{home}/anytouch_jax/shards").expanduser()
+    given = os.environ.get("ANYTOUCH_CACHE")
+    if given:
+        return Path(given).expanduser()
+    return cache_folder() / "shards"

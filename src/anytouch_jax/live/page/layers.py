@@ -109,7 +109,9 @@ def field_numbers(measured: Fields) -> dict[str, Any]:
     about = measured.summary()
     unit = "widths" if measured.width_mm is None else "mm"
     curves = {"force, N": about["force_z"], f"depth, {unit}": about["depth"]}
-    curves["slip"] = about["slip"] if measured.area[0] > 0 else 0.0
+    if measured.area[0] > 0:
+        # Where nothing touches, nothing slips, and there is no number.
+        curves["slip"] = about["slip"]
     _, high = depth_levels(measured.depth[0], measured.width_mm)
     return {
         "curves": {name: round(value, 4) for name, value in curves.items() if value is not None},

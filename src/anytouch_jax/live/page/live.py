@@ -167,6 +167,7 @@ class Live:
         if measured is not None:
             curves |= measured["curves"]
         self.recorder.add(picture, score, frame.values)
+        self.teacher.look()
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
         about: dict[str, Any] = {

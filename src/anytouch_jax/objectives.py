@@ -209,7 +209,16 @@ def stage1_loss(
 ) -> tuple[Array, Metrics]:
     """Return `stage1_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`.
 
-    The clips are u8 (B, T, H, W, 3). `progress` f32 () in [0, 1] drives p_u (Eq. 7).
+    Args:
+        params: Parameters of `net`.
+        batch: Clips u8 (B, T, H, W, 3) with the loader's sensor rows.
+        key: Of the step. Masks and sensor tokens are drawn from it.
+        progress: The part of the run that is done, f32 () in [0, 1], which drives p_u (Eq. 7).
+        net: The network.
+        config: Its `objective` has weights and choices.
+
+    Returns:
+        The loss, and its terms unweighted, float32 scalars.
     """
     batch = _arrays(batch)
     key_noise, key_universal = jax.random.split(key)
@@ -467,6 +476,7 @@ def _stage2_embeddings(
         matched.append((match.positive, match.positive_sensor))
         # By cosine the other pairs of the batch are the negatives.
         if net.model.match_head != "cosine":
+            assert match.negative is not None and match.negative_sensor is not None
             matched.append((match.negative, match.negative_sensor))
     if match_noise is None:
         z = touch_embeddings(params, aligned + matched, net=net)
@@ -516,7 +526,16 @@ def stage2_loss(
 ) -> tuple[Array, Metrics]:
     """Return `stage2_terms` of a uint8 batch, with masks and sensor tokens drawn from `key`.
 
-    `progress` f32 () in [0, 1] drives p_u (Eq. 7).
+    Args:
+        params: Parameters of `net`.
+        batch: Pixels u8 with the loader's sensor rows.
+        key: Of the step. Masks and sensor tokens are drawn from it.
+        progress: The part of the run that is done, f32 () in [0, 1], which drives p_u (Eq. 7).
+        net: The network.
+        config: Its `objective` has weights and choices.
+
+    Returns:
+        The loss, and its terms unweighted, float32 scalars.
     """
     key_noise, key_align, key_match, key_keep = jax.random.split(key, 4)
     batch = _arrays(batch)
@@ -555,7 +574,15 @@ def stage2_loss(
 def draw_sensor_rows(
     sensor: Array, key: Array, progress: Array, *, net: Net, config: Config
 ) -> tuple[Array, Array]:
-    """Return p_u at `progress`, and the sensor rows i32 (B,) after one draw a sample (Eq. 7)."""
+    """Return p_u at `progress`, and the sensor rows i32 (B,) after one draw a sample (Eq. 7).
+
+    Args:
+        sensor: The loader's rows of the token table, i32 (B,).
+        key: Of this draw.
+        progress: The part of the run that is done, f32 () in [0, 1].
+        net: Its model names the universal row.
+        config: Its `objective` has p_u at the first and the last step.
+    """
     objective = config.objective
     p_u = tokens.universal_probability(progress, objective.universal_start, objective.universal_end)
     uniform = jax.random.uniform(key, sensor.shape)

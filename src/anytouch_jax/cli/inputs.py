@@ -224,7 +224,11 @@ def frames_input(
 
 
 def choose_gel(
-    encoder: Encoder, named: Path | None, data: Path, known: Mapping[str, np.ndarray]
+    encoder: Encoder,
+    named: Path | None,
+    data: Path,
+    known: Mapping[str, np.ndarray],
+    of: str = "the head was fitted with",
 ) -> tuple[np.ndarray | None, str]:
     """Return the untouched gel of a folder, a video, a picture or a camera, and what it is.
 
@@ -237,6 +241,7 @@ def choose_gel(
         named: the file that the user named.
         data: where the frames are.
         known: pictures of units that a head was fitted with.
+        of: what the known pictures belong to, in words.
 
     Raises:
         UserError: there are too few frames.
@@ -255,7 +260,7 @@ def choose_gel(
     elif not encoder.subtracts:
         return None, "not subtracted"
     elif data.exists():
-        picture, what = _recording_gel(encoder, data, stored, known)
+        picture, what = _recording_gel(encoder, data, stored, known, of)
     else:
         what = _live_gel(encoder, known)
     if not encoder.subtracts:  # the picture decides contact
@@ -274,7 +279,7 @@ def _live_gel(encoder: Encoder, known: Mapping[str, np.ndarray]) -> str:
 
 
 def _recording_gel(
-    encoder: Encoder, data: Path, stored: Path | None, known: Mapping[str, np.ndarray]
+    encoder: Encoder, data: Path, stored: Path | None, known: Mapping[str, np.ndarray], of: str
 ) -> tuple[np.ndarray | None, str]:
     """Return the untouched gel of a folder, a video or a picture, and what it is."""
     from anytouch_jax.data.background import rule
@@ -288,13 +293,11 @@ def _recording_gel(
         own, count = rule.recording_gel(_some_frames(data))
         what = f"estimated from {count} frames of {data}"
         is_sure = count >= rule.FEWEST
-    gel, why = rule.same_unit(known, own)
-    if why:
-        log(rule.other_unit(why))
-    # An estimate from few frames shows the press itself, so even a picture of another unit is
-    # better.
-    if gel is not None and not (why and is_sure):
-        return gel, "the picture that the head was fitted with"
+    counts = rule.known_gel(known, own, is_background=is_sure, untouched=stored is not None, of=of)
+    if counts.warning:
+        log(counts.warning)
+    if counts.picture is not None:
+        return counts.picture, counts.what
     if is_sure:
         return own, what
     if encoder.needs_background:

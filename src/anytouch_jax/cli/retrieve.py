@@ -263,7 +263,8 @@ def _query(
     if about.get("frames", "1").isdecimal():
         length = int(about.get("frames", "1"))
     frames = _last_frames(path, length)
-    preprocess = Preprocess(encoder, choose_gel(encoder, options.background, path, known)[0])
+    gel, _ = choose_gel(encoder, options.background, path, known, "the index was made with")
+    preprocess = Preprocess(encoder, gel)
     clip = np.stack([preprocess(frame) for frame in frames])[None]
     join: Any = about.get("join", "mean")
     return encoder.encode_touch(clip, options.sensor or UNIVERSAL, pooling=pooling, join=join)

@@ -8,28 +8,22 @@ from typing import Annotated, Literal
 
 from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check
 from anytouch_jax.errors import ConfigError, letters_apart
+from anytouch_jax.sensors import RECORDS
 from anytouch_jax.shown import shown_short
 
 UNIVERSAL = "universal"
-SENSORS = (
-    "gelsight",
-    "digit",
-    "gelslim",
-    "gelsight_mini",
-    "duragel",
-    "9dtact",
-    "allsight",
-    "tacto",
-    "taxim",
-    UNIVERSAL,
-)
+# Stored weights count on the order of the rows: gelsight to duragel are those of the release.
+SENSORS = (*(name for name, record in RECORDS.items() if record.has_tokens), UNIVERSAL)
 _MOST = 1 << 20  # of every size: a damaged configuration must not ask for the whole memory
 Size = Annotated[int, Range(1, _MOST, f"1 to {_MOST}")]
 Number = Annotated[int, Range(0, _MOST, f"0 to {_MOST}")]
-FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
+# force fields, not images: left out of training
+FIELD_SENSORS = tuple(name for name, record in RECORDS.items() if record.measures == "field")
 OWN_SENSOR = ".sensor"  # ending of a folder of `anytouch sensor fit`
 # sensors without tokens whose names are nearly those of others
-OTHER_SENSORS = ("dtact", "tactip")
+OTHER_SENSORS = tuple(
+    name for name, record in RECORDS.items() if record.measures == "image" and not record.has_tokens
+)
 _LETTERS = 2  # by which a misspelt name differs from the right one
 
 

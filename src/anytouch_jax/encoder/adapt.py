@@ -25,6 +25,7 @@ from anytouch_jax.encoder.features import network, precision
 from anytouch_jax.encoder.labelled import choose_frames as choose_frames
 from anytouch_jax.encoder.new_sensor import Adapted as Adapted
 from anytouch_jax.encoder.new_sensor import check_empty as check_empty
+from anytouch_jax.encoder.new_sensor import metadata_of
 from anytouch_jax.encoder.new_sensor import put_tokens as put_tokens
 from anytouch_jax.encoder.new_sensor import read_model as read_model
 from anytouch_jax.encoder.new_sensor import save as save
@@ -35,7 +36,6 @@ from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
 from anytouch_jax.train.loop import Work
 from anytouch_jax.train.tuning import tune_for_steps
-from anytouch_jax.weights.load import Loaded
 
 Loss = Callable[[Params, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32)
 BATCH = 16  # frames of a step
@@ -125,7 +125,7 @@ def adapt_with(
         "labels": settings.labels,
         "manifest": manifest.content_hash,
     }
-    metadata = _metadata(loaded, config, sensor, source)
+    metadata = metadata_of(loaded, config, sensor, source)
     if settings.labels is None or not settings.frames:
         nothing = float("nan")
         return Adapted(config, params, (), nothing, nothing, "fitted", metadata)
@@ -161,21 +161,6 @@ def adapt_with(
         return Adapted(
             config, put_tokens(params, row, tokens), history, before, after, measured, metadata
         )
-
-
-def _metadata(
-    loaded: Loaded, config: Config, sensor: str, source: dict[str, Any]
-) -> dict[str, Any]:
-    """Return what the checkpoint of an adapted model says about it."""
-    stored = loaded.metadata if loaded.from_run else {}
-    metadata: dict[str, Any] = {
-        name: stored[name] for name in ("preprocessing", "data") if name in stored
-    }
-    metadata["sensors"] = list(config.model.sensors)
-    metadata["source"] = source
-    if loaded.trained_sensors is not None:
-        metadata["seen"] = [*loaded.trained_sensors, sensor]
-    return metadata
 
 
 class Labelled(NamedTuple):

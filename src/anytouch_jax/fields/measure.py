@@ -28,6 +28,7 @@ from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
 from anytouch_jax.fields.pictures import depth_levels as depth_levels
 from anytouch_jax.fields.pictures import overlay as overlay
 from anytouch_jax.fields.pictures import write_surface as write_surface
+from anytouch_jax.sensors import RECORDS
 
 
 class KnownGel(NamedTuple):
@@ -39,12 +40,9 @@ class KnownGel(NamedTuple):
 
 
 GELS = {
-    "gelsight": KnownGel(18.88, 0.75, 150),
-    "gelsight_mini": KnownGel(18.88, 0.75, 180),
-    "gelslim": KnownGel(20.0, 0.75, 220),
-    "digit": KnownGel(14.25, 4 / 3, 120),
-    "9dtact": KnownGel(24.0, 0.75, 120),
-    "duragel": KnownGel(18.7, 0.75, 350),
+    name: KnownGel(record.size_mm[1], record.proportions, record.modulus_kpa)
+    for name, record in RECORDS.items()
+    if record.size_mm and record.proportions and record.modulus_kpa
 }
 # kPa of an unknown gel, and its standard deviation as a fraction of it.
 OTHER_MODULUS = 170.0

@@ -292,10 +292,17 @@ def run_blocks(
     mask: Array | None = None,
     turn: Turn | None = None,
 ) -> Array:
-    """Send `x` (B, S, D) through stacked blocks by lax.scan, so that compile time does not grow
-    with depth.
+    """Send `x` (B, S, D) through stacked blocks, (B, S, D).
 
-    `turn` changes queries and keys (B, S, H, D / H) in each block, by their places.
+    It is a lax.scan, so that compile time does not grow with depth.
+
+    Args:
+        blocks: What `stacked_blocks` returns.
+        x: The first block's input.
+        remat: Recompute activations in the backward pass.
+        causal: Whether a token reads those up to its own place only.
+        mask: Tokens to read, bool (B, S). None: all.
+        turn: Changes queries and keys (B, S, H, D / H) in each block, by their places.
     """
 
     def body(x: Array, block: Block) -> Array:

@@ -29,8 +29,8 @@ from anytouch_jax.ops import tokens
 class TouchPatch(nnx.Module):
     """Patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias.
 
-    It is shared by all sensors, or each row of the sensor table has its own, (rows, frames, P*P*3,
-    D).
+    It is shared by all sensors, or each row of the sensor table has its own: then the kernel is
+    (rows, frames, P*P*3, D).
     """
 
     def __init__(self, model: ModelConfig) -> None:
@@ -113,11 +113,11 @@ class TouchEncoder(nnx.Module):
         return run_blocks(self.blocks, x, remat=self.remat)
 
     def states(self, clip: Array, sensor: Array, count: int) -> Array:
-        """Return `count` hidden states, evenly spaced from the first block's input to the last
-        block's output.
+        """Return `count` hidden states, evenly spaced over the depth of the encoder.
 
-        They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT,
-        Ranftl et al. 2021).
+        The first is the first block's input, the last the last block's output. They are
+        concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT, Ranftl et
+        al. 2021).
         """
         x = self._first(clip, sensor)
         states = []

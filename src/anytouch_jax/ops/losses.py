@@ -308,10 +308,10 @@ def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array
 
 
 def laplace_loss(error: ArrayLike, log_scale: ArrayLike) -> Array:
-    """Return the negative log likelihood of errors under Laplace deviations exp(`log_scale`),
-    element-wise.
+    """Return the negative log likelihood of errors under Laplace distributions, element-wise.
 
-    The logarithm is bent smoothly into -5..5, so that no deviation vanishes or explodes.
+    Their scales are exp(`log_scale`). The logarithm is bent smoothly into -5..5, so that no
+    deviation vanishes or explodes.
     """
     error, log_scale = _wide(error, log_scale)
     log_scale = 5.0 * jnp.tanh(log_scale / 5.0)

@@ -118,10 +118,10 @@ def draw_tokens(
 
 
 def count_visible(positions: int, ratio: float) -> int:
-    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the
-    release.
+    """Return how many of `positions` stay visible: floor(N * ratio).
 
-    Raises ValueError for a negative number, and for a ratio outside 0 to 1.
+    It is computed in floating point, as in the release. Raises ValueError for a negative number,
+    and for a ratio outside 0 to 1.
     """
     if positions < 0 or not 0 <= ratio <= 1:
         raise ValueError(

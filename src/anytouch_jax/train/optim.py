@@ -136,10 +136,16 @@ def learning_rate(
 ) -> Array:
     """Return the learning rate at time `t`, f32 of its shape.
 
-    It rises linearly from 0 to `peak` at `warmup`, falls to `floor` at `total`, and stays there.
-    `t`, `warmup` and `total` share a unit (steps or epochs) and may be fractions. `decay` is
-    "linear" (the paper) or "cosine", half a period (the release). Raises ConfigError for another
-    decay.
+    Args:
+        t: Time in steps or epochs, which `warmup` and `total` share. It may be a fraction.
+        peak: The highest rate, reached linearly from 0 at `warmup`.
+        floor: The rate at `total` and after it.
+        warmup: Length of the warm-up.
+        total: Length of the whole schedule.
+        decay: "linear" (the paper) or "cosine", half a period (the release).
+
+    Raises:
+        ConfigError: For another decay.
     """
     if decay not in ("linear", "cosine"):
         raise ConfigError(f"unknown decay {decay!r}. Choose linear or cosine.")

@@ -26,8 +26,15 @@ def check_start(
 ) -> None:
     """Raise UserError for settings that this machine or this stage cannot follow.
 
-    So it does for missing weights, and for a run folder of another stage. `has_tokenizer` says that
-    the run folder has one.
+    So it does for missing weights, and for a run folder of another stage.
+
+    Args:
+        config: The settings.
+        run: The run folder, which need not exist.
+        init: A stage-1 run or weights, or None.
+        clip: CLIP weights, or None.
+        resumes: Whether the folder has a complete checkpoint.
+        has_tokenizer: Whether the folder has a tokenizer.
     """
     _check_arithmetic(config)
     _check_stage(config, init, clip)

@@ -62,10 +62,18 @@ def resolve(
     mesh: Mesh,
     log: Log,
 ) -> Start:
-    """Return the start of a run of `config` in the folder `run`. Writes nothing.
+    """Return the start of a run. Writes nothing.
 
-    `log` gets what the loader reports later, such as samples that were replaced. Raises UserError
-    for a mistake in the settings, the data or the folder.
+    Args:
+        config: The settings.
+        run: The run folder, which need not exist.
+        init: A stage-1 run or weights, see `pretrain`.
+        clip: CLIP weights, see `pretrain`.
+        mesh: The devices, whose number decides the slots of a batch.
+        log: Gets what the loader reports later, such as samples that were replaced.
+
+    Raises:
+        UserError: For a mistake in the settings, the data or the folder.
     """
     resumes = bool(checkpoint.steps(run / CHECKPOINTS))
     has_tokenizer = (run / TOKENIZER).exists()

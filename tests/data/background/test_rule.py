@@ -142,6 +142,55 @@ def test_the_same_unit_gets_the_picture_of_a_head_and_another_one_warning(world)
         assert gels.same_unit(known, frame)[1] == ""
 
 
+def other_pattern(gel: np.ndarray) -> np.ndarray:
+    """A gel of the same tint with a stain that covers a twentieth of it."""
+    stained = gel.copy()
+    stained[20:50, 30:60] = np.minimum(stained[20:50, 30:60].astype(int) + 45, 255)
+    return stained
+
+
+def test_the_untouched_gel_of_another_unit_of_one_tint_is_not_taken_for_a_press(world):
+    """Two GelSight Minis of two labs differ by a contact score of 8, and hardly in tint."""
+    known = {"digit a": gel_frame("coloured", 0)}
+    own = other_pattern(known["digit a"])
+    assert UntouchedGel(known["digit a"]).score(own) > 6.5
+    assert gels.same_unit(known, own)[1] == ""  # it may be a press
+    assert "by a contact score of" in gels.same_unit(known, own, untouched=True)[1]
+    assert gels.same_unit(known, gel_frame("coloured", 0, seed=3), untouched=True)[1] == ""
+    table = world(
+        ([own], {"unit": "b", "split": "background"}),
+        ([other_pattern(frame) for frame in presses(6)], {"unit": "b"}),
+        (presses(6), {"unit": "a"}),
+    )
+    said: list[str] = []
+    rule = gels.UnitGels(table, known, said.append)
+    assert (rule(1) == own).all()
+    assert len(said) == 1 and "from every unit that the head or index was fitted with" in said[0]
+    # the median of another one may hold a press, so its tint alone counts
+    assert rule(7) is known["digit a"] and len(said) == 1
+
+
+def test_few_frames_get_the_nearest_picture_and_one_true_line(world):
+    """A deep press alone changes the tint as much as another unit does."""
+    gel = gel_frame("coloured", 0)
+    known = {"digit a": gel, "digit b": np.full_like(gel, 30)}
+    pressed = np.clip(gel.astype(int) + 9, 0, 255).astype(np.uint8)
+    same = gels.known_gel(known, gel, is_background=False, of="the index was made with")
+    assert same == (gel, "the picture that the index was made with", "")
+    found = gels.known_gel(known, pressed, is_background=False, of="the index was made with")
+    assert found.picture is gel and not found.warning
+    assert found.what.startswith("the nearest picture that the index was made with. So few frames")
+    sure = gels.known_gel(known, pressed, is_background=True)
+    assert sure.picture is None and "in tint, by 9 grey levels" in sure.warning
+    small = np.zeros((160, 120, 3), np.uint8)
+    assert gels.known_gel(known, small, is_background=False) == (None, "", "")
+    # rows that had no untouched gel, and so were left out
+    said: list[str] = []
+    rule = gels.UnitGels(world(([pressed] * 2, {"unit": "a"})), {"digit a": gel}, said.append)
+    assert rule(0) is gel and said == []
+    assert "the nearest picture that the head was fitted with" in rule.report(np.arange(2))
+
+
 @pytest.mark.parametrize(("look", "share"), list(zip(LOOKS, (0.0, 0.4, 0.6), strict=True)))
 def test_a_live_source_that_begins_with_a_press_settles_on_the_free_gel(look, share):
     frames, contact = press_film(look, share, frames=60)

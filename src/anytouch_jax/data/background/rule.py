@@ -28,7 +28,13 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.config import FIELD_SENSORS
-from anytouch_jax.data.background.estimate import EDGE, free_frames, scale_picture
+from anytouch_jax.data.background.estimate import (
+    DIFFERENT,
+    EDGE,
+    UntouchedGel,
+    free_frames,
+    scale_picture,
+)
 from anytouch_jax.data.images import decode, to_rgb
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import Flip, orient_frame
@@ -50,6 +56,7 @@ ADVICE = (
     "background_path."
 )
 _ESTIMATED = 24  # frames of one recording among which the free ones are looked for
+_FREE_ROWS = "rows of split background"
 _SAME_SHAPE = 0.05  # relative difference of the proportions of one camera's pictures
 
 
@@ -206,12 +213,16 @@ def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
     return np.ascontiguousarray(orient_frame(orient_frame(picture, 0, flip), -rotate % 360))
 
 
-def same_unit(known: Mapping[str, Array], picture: Array) -> tuple[Array | None, str]:
+def same_unit(
+    known: Mapping[str, Array], picture: Array, *, untouched: bool = False
+) -> tuple[Array | None, str]:
     """Return the known picture that looks most like `picture`, and how it differs.
 
     Args:
         known: Backgrounds by the name of their sensor instance, u8 (h, w, 3).
         picture: The background of the camera at hand.
+        untouched: Nothing presses in `picture` for sure. Then it must not count as pressed when the
+            known picture is subtracted, which two instances of one tint can look like.
 
     Returns:
         The picture, None without any of these proportions, and why the camera is another instance:
@@ -232,13 +243,68 @@ def same_unit(known: Mapping[str, Array], picture: Array) -> tuple[Array | None,
         for name, gel in fitting.items()
     }
     name = min(tints, key=lambda one: tints[one])
-    if tints[name] <= TINT:
-        return fitting[name], ""
-    return fitting[name], f"in tint, by {tints[name]:.0f} grey levels"
+    gel = fitting[name]
+    if tints[name] > TINT:
+        return gel, f"in tint, by {tints[name]:.0f} grey levels"
+    if untouched:
+        # proportions that differ by a few pixels cannot be compared, and say nothing
+        with suppress(ValueError):
+            score = UntouchedGel(gel).score(picture)
+            if score >= DIFFERENT:
+                return gel, f"as much as a touch does, by a contact score of {score:.0f}"
+    return gel, ""
 
 
 def _thumbnail(picture: Array) -> Array:
     return cv2.resize(picture, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+class KnownGel(NamedTuple):
+    """What the known pictures of a head or an index say about a camera.
+
+    Attributes:
+        picture: The one that is subtracted, None if the camera's own counts.
+        what: What it is, in words for the report.
+        warning: A sentence, "" if all is well.
+    """
+
+    picture: Array | None
+    what: str
+    warning: str
+
+
+def known_gel(
+    known: Mapping[str, Array],
+    own: Array,
+    *,
+    is_background: bool,
+    untouched: bool = False,
+    of: str = "the head was fitted with",
+) -> KnownGel:
+    """Return which of the known pictures counts for a camera.
+
+    Args:
+        known: Backgrounds by the name of their sensor instance.
+        own: What the camera shows.
+        is_background: Whether `own` can be subtracted. A few frames show the press itself. That
+            changes the tint by up to 17 grey levels on real sensors, as much as another instance
+            does, so they cannot tell the two apart. Then the nearest picture is better than none.
+        untouched: Nothing presses in `own` for sure.
+        of: What the known pictures belong to, in words.
+    """
+    gel, why = same_unit(known, own, untouched=untouched)
+    if gel is not None and not why:
+        return KnownGel(gel, f"the picture that {of}", "")
+    if is_background:
+        return KnownGel(None, "", other_unit(why) if why else "")
+    if gel is None:
+        return KnownGel(None, "", "")
+    return KnownGel(
+        gel,
+        f"the nearest picture that {of}. So few frames do not tell whether it is the same sensor: "
+        "name its own picture with --background if it is another",
+        "",
+    )
 
 
 def other_unit(why: str) -> str:
@@ -419,26 +485,40 @@ class UnitGels:
         """Return the picture of the same instance among the known ones, or else the median."""
         rows = np.flatnonzero((self._unit == unit) & self._has_image)
         free = rows[self._split[rows] == "background"]
-        found = self._median(free, 1, "rows of split background")
+        found = self._median(free, 1, _FREE_ROWS)
         if found.picture is None:
             found = self._median_of(unit, self._fitted(rows))
         if not self._known:
             return found
-        # To recognise an instance one frame is enough, pressed or not.
-        look = found.picture
-        if look is None:
-            look = self._median(rows, 1, "").picture
-        if look is None:
+        own, untouched = self._own(rows, found)
+        if own is None:
             return found
         name = self._name(unit)
         known = {name: self._known[name]} if name in self._known else self._known
-        gel, why = same_unit(known, look)
-        if why and self._log is not None:
-            self._log(other_unit(why))
+        counts = known_gel(
+            known, own, is_background=untouched or found.picture is not None, untouched=untouched
+        )
+        if counts.warning and self._log is not None:
+            self._log(counts.warning)
             self._log = None  # once
-        if gel is None or why:
+        if counts.picture is None:
             return found
-        return _Unit(gel, "the picture that the head was fitted with", 0, True)
+        return _Unit(counts.picture, counts.what, 0, True)
+
+    def _own(self, rows: Array, found: _Unit) -> tuple[Array | None, bool]:
+        """Return what tells an instance, and whether nothing presses in it for sure.
+
+        That is a picture of its untouched gel, else its median, else its few frames.
+        """
+        if found.source == _FREE_ROWS:
+            return found.picture, True
+        for row in rows[self._stored[rows]][:1].tolist():
+            # a broken one is reported when the row itself is read
+            with suppress(UserError):
+                return reduced(decode(self._manifest.file(row, "background_path"))), True
+        if found.picture is not None:
+            return found.picture, False
+        return self._median(rows, 1, "").picture, False
 
     def _median_of(self, unit: int, rows: Array) -> _Unit:
         """Return the median of rows of an instance, or that of its sensor.

@@ -26,7 +26,7 @@ RATE = 1e-3
 DEEP_RATE = 1e-4
 FIRST = 2  # blocks that are trained with `deep`
 KEPT = 480  # features of touches before, that a touch must not be taken for
-HEAT = 0.07  # temperature of the contrast
+TEMPERATURE = 0.07  # of the contrast
 REUSE = 4  # steps with the same touches in other light
 Array = jax.Array
 State = dict[str, Any]
@@ -44,7 +44,7 @@ class Felt(NamedTuple):
     own_row: Array
     other: Array
     other_row: Array
-    by_known: Array
+    by_known: Array | np.ndarray
     target: Array
     queue: Array | np.ndarray
     filled: Array | np.ndarray
@@ -93,7 +93,7 @@ class Contrast:
         z = self.encode(merged, batch.own, batch.own_row)
         # A place of the queue that is not filled yet has the lowest cosine.
         among = jnp.where(batch.filled[None], z @ batch.queue.T, -1.0)
-        logits = jnp.concatenate([z @ batch.target.T, among], 1) / HEAT
+        logits = jnp.concatenate([z @ batch.target.T, among], 1) / TEMPERATURE
         cost = optax.softmax_cross_entropy_with_integer_labels(logits, jnp.arange(len(z)))
         value = jnp.sum(cost * batch.by_known) / jnp.maximum(batch.by_known.sum(), 1)
         if self.deep:

@@ -149,9 +149,7 @@ def _check_state(folder: Path, identity: str) -> None:
 
 
 def _found(held: list[SimulatedTouches], features: Callable[..., Any], train: State) -> float:
-    """Return the share of held-out touches by your sensor that are nearest to the same touch by a
-    known one.
-    """
+    """Return the ratio of held-out touches whose nearest one by a known sensor is the same."""
     parts = [features(train, touches) for touches in held]
     own, other = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
     by_known = np.concatenate([np.asarray(touches.sensor[:, 0]) > 0 for touches in held])

@@ -331,6 +331,7 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     """Return the live page of a camera, or of a film in its place."""
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.linear_head import load_head
+    from anytouch_jax.live.examples import EXAMPLE, SENSOR
     from anytouch_jax.live.page.live import Live
     from anytouch_jax.train.mesh import enable_compilation_cache
 
@@ -343,13 +344,19 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
     # Live touch is compared with the first features that are shown.
     spaces: list[Any] = [source for source in sources if source.kind == "space"]
+    sensor = options.sensor
+    out = options.out
+    if camera == EXAMPLE:
+        sensor = SENSOR
+        # What it teaches is not mixed with recordings of the user's own sensor.
+        out = out.with_name(f"{out.name}_examples")
     return Live(
         camera,
         encoder,
-        sensor=options.sensor,
+        sensor=sensor,
         head=head,
         space=spaces[0] if spaces else None,
-        out=options.out,
+        out=out,
         camera=options.settings(),
         log=log,
     )

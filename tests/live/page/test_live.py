@@ -153,7 +153,7 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
                 picture.shape == shape
                 and pressed["fields"]["force"][2] > 0.1 > free["fields"]["force"][2]
             )
-            assert {"contact", "force, N", "depth, mm", "slip"} == set(pressed["curves"])
+            assert {"contact", "force, N", "depth, mm", "slip, %"} == set(pressed["curves"])
         # no frame is read in one way and measured in another
         for rotate in (90, 0) * 40:
             live.frames.orient(rotate, "none")

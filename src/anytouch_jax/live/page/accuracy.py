@@ -57,20 +57,5 @@ def _accuracies(x: Array, pixels: Array, rows: TaskRows, tested: Array) -> dict[
         )
         result[name] = found.accuracy
         if found.low is not None and found.high is not None:
-            low, high = _opened(found.low, found.high, len(np.unique(arrays[2])))
-            result |= {f"{name}_low": low, f"{name}_high": high}
+            result |= {f"{name}_low": found.low, f"{name}_high": found.high}
     return result
-
-
-def _opened(low: float, high: float, recordings: int) -> tuple[float, float]:
-    """Return an interval that is no point where all recordings are right, or all are wrong.
-
-    Every draw of a bootstrap has the same value then. The exact interval of Clopper and Pearson
-    (1934) is that of the fractions of which so many recordings are no surprise.
-    """
-    least = 0.025 ** (1 / recordings)
-    if low == high == 1.0:
-        return least, 1.0
-    if low == high == 0.0:
-        return 0.0, 1.0 - least
-    return low, high

@@ -1,5 +1,6 @@
 import csv
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,6 +67,19 @@ def test_memory_does_not_grow_with_a_recording(tmp_path):
         results.close()
     assert peaks[1] < 1.2 * peaks[0] + 500_000
     assert (tmp_path / "m.npz").stat().st_size > 800 * 60 * 60 * 12
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_named_at_once(tmp_path):
+    results = Results(tmp_path / "m.npz")
+    results.add(measured(2), ["a", "b"], [0.0, 1.0])
+    results._arrays._files["depth"].close()
+    results._arrays._files["depth"] = open("/dev/full", "wb")  # noqa: SIM115
+    with pytest.raises(OSError, match="No space left") as told:
+        results.add(measured(2), ["c", "d"], [2.0, 3.0])
+    assert told.value.filename == str(tmp_path / "m.npz")
+    results.close()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_frames_of_another_form_are_not_mixed(tmp_path):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import os
 import shutil
 import zipfile
@@ -43,6 +44,7 @@ class GrowingArrays:
                 self._counts[name] = 0
             assert self._forms[name] == (array.dtype, array.shape[1:])
             self._files[name].write(np.ascontiguousarray(array).tobytes())
+            self._files[name].flush()  # a full disk is found now, and not at the end
             self._counts[name] += len(array)
 
     def save(self, path: Path, more: Mapping[str, Array]) -> None:
@@ -83,6 +85,7 @@ class Results:
     """
 
     def __init__(self, out: Path) -> None:
+        self._out = out
         hidden = part_path(out)
         self._folder = hidden.with_name(f"{hidden.name}.parts")
         self._folder.mkdir()
@@ -97,7 +100,17 @@ class Results:
         return len(self._names)
 
     def add(self, measured: Fields, names: Sequence[str], times: Sequence[float]) -> None:
-        """Append frames with their names and time stamps, NaN for none. Raises OSError."""
+        """Append frames with their names and time stamps, NaN for none.
+
+        Raises OSError with the name of the .npz, because nobody knows the hidden files.
+        """
+        try:
+            self._add(measured, names, times)
+        except OSError as error:
+            number = error.errno or errno.EIO
+            raise OSError(number, error.strerror or str(error), str(self._out)) from error
+
+    def _add(self, measured: Fields, names: Sequence[str], times: Sequence[float]) -> None:
         for row, (name, time) in enumerate(zip(names, times, strict=True)):
             line: dict[str, Any] = {"frame": name, "time": None if np.isnan(time) else time}
             line |= measured.summary(row)

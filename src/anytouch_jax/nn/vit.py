@@ -186,23 +186,17 @@ class Vit(nnx.Module):
 
     def _make_positions(self, form: VitConfig, width: int) -> None:
         """Make the parameters that tell one patch from another: stored, computed or rotary."""
-        self.periods = None
-        self.frequency = None
-        self.position = None
-        self.calibration = None
-        self.calibration_position = None
-        if form.rotary:
-            self.periods = table(width // form.model.touch.heads // 4)
-        elif form.grid is None:
-            self.frequency = table(form.axes, -(-width // (2 * form.axes)))
-        places = 0
-        if form.grid is not None:
-            places = int(np.prod(form.grid))
-            self.position = table(places + form.class_token, width)
-        if form.calibration:
-            self.calibration = TubePatch(form.calibration, form.model)
-            if places:
-                self.calibration_position = table(places, width)
+        # Each attribute is set once: nnx keeps an attribute that was None as a static one.
+        is_stored = form.grid is not None
+        places = int(np.prod(form.grid)) if form.grid is not None else 0
+        heads = form.model.touch.heads
+        self.periods = table(width // heads // 4) if form.rotary else None
+        is_computed = not form.rotary and not is_stored
+        self.frequency = table(form.axes, -(-width // (2 * form.axes))) if is_computed else None
+        self.position = table(places + form.class_token, width) if is_stored else None
+        has_images = form.calibration > 0
+        self.calibration = TubePatch(form.calibration, form.model) if has_images else None
+        self.calibration_position = table(places, width) if has_images and is_stored else None
 
     def __call__(self, clip: Array, sensor: Array, calibration: Array | None = None) -> VitOutput:
         """Return the tokens of prepared clips (B, T, H, W, 3) of sensor rows (B,).

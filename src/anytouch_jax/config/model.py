@@ -103,6 +103,7 @@ class ModelConfig:
     decoder_norm_eps: NotNegative[float] = 1e-12  # Epsilon of the decoder's layer norms.
     decoder_sensor_tokens: bool = False  # Give the decoder the sensor tokens before encoding (release).
     patch_encoder: Literal["shared", "sensor"] = "shared"  # One, or one a sensor (T3).
+    sight: Number = 0  # Values of the convolutional trunk that join the features of touch. 0: no trunk.
     fields: Number = 0  # Channels of the decoder of depth, shear, contact and force. 0: none.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"  # linear is the release, cosine is ours.
     lora_rank: Number = 0  # Rank of the image tower's LoRA. 0: off.

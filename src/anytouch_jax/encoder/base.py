@@ -75,7 +75,7 @@ class Encoder:
             "parameters": count_of(count) + (" of the touch encoder" if towers else "") if count else "",
             "input": f"uint8 RGB {model.image_size} x {model.image_size}, 1 frame or clips of {model.frames} or more",
             "background": "needed, the picture of the untouched gel" if self.needs_background else background,
-            "features": str(model.embed),
+            "features": str(model.embed + model.sight),
             "sensors": f"trained on {', '.join(trained)}" if trained else ", ".join(model.sensors),
         }
 
@@ -349,7 +349,7 @@ class Encoder:
         tower.
         """
         embeddings = texts if isinstance(texts, np.ndarray) and texts.dtype.kind == "f" else self.encode_text(texts)  # type: ignore[arg-type]
-        z_touch, z_text = np.asarray(touch, np.float32), np.asarray(embeddings, np.float32)
+        z_touch, z_text = self._aligned(touch), np.asarray(embeddings, np.float32)
         if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
             width = z_text.shape[-1]
             raise UserError(f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}")
@@ -368,10 +368,16 @@ class Encoder:
         def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
             return net.match(params, losses.normalise(first), losses.normalise(second))
 
-        head, one, other = self._part("match", run, "matcher"), *(np.asarray(x, np.float32) for x in (first, second))
+        head, one, other = self._part("match", run, "matcher"), *(self._aligned(x) for x in (first, second))
         if one.shape != other.shape or one.ndim != 2:
             raise UserError(f"match takes two sets of features of one shape (B, E), not {one.shape}, {other.shape}")
         return np.asarray(head(arrays.filled(one), arrays.filled(other)))[: len(one)]
+
+    def _aligned(self, touch: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Return what alignment and matching train of touch features (B, E + sight): not what sight adds."""
+        values, model = np.asarray(touch, np.float32), self.config.model
+        with_sight = values.ndim == 2 and values.shape[1] == model.embed + model.sight
+        return values[:, : model.embed] if with_sight else values
 
     def _part(self, method: str, run: Callable[..., jax.Array], name: str, *more: str) -> Callable[..., jax.Array]:
         """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go to the device."""
@@ -492,9 +498,13 @@ def touch_features(
     check_choices(pooling, join)
     clips = normalise_touch(clips)
     if pooling == "class":
-        return net.encode_touch(params, clips, sensor, join).astype(jnp.float32)
-    both = net.encode_poolings(params, clips, sensor, join)  # an unused half is not computed
-    return jnp.concatenate(both if pooling == "both" else both[1:], axis=-1).astype(jnp.float32)
+        values = [net.encode_touch(params, clips, sensor, join)]
+    else:
+        both = net.encode_poolings(params, clips, sensor, join)  # an unused half is not computed
+        values = [*(both if pooling == "both" else both[1:])]
+    if net.model.sight:
+        values.append(net.see(params, clips, sensor, join))
+    return jnp.concatenate(values, axis=-1).astype(jnp.float32)
 
 
 def features_and_fields(
@@ -502,8 +512,11 @@ def features_and_fields(
 ) -> tuple[jax.Array, FieldOutput]:
     """Return features f32 (B, E) and fields of touches u8 (B, T, H, W, 3), sensor rows and aspects (B,)."""
     check_choices(pooling, "mean")
-    token, mean, out = net.encode_and_measure(params, normalise_touch(clips), sensor, aspect)
-    values = {"class": (token,), "mean": (mean,), "both": (token, mean)}[pooling]
+    clips = normalise_touch(clips)
+    token, mean, out = net.encode_and_measure(params, clips, sensor, aspect)
+    values = {"class": [token], "mean": [mean], "both": [token, mean]}[pooling]
+    if net.model.sight:
+        values.append(net.see(params, clips, sensor))
     wide = jax.tree.map(lambda value: value.astype(jnp.float32), out)
     return jnp.concatenate(values, axis=-1).astype(jnp.float32), wide
 

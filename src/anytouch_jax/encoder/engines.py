@@ -19,6 +19,7 @@ import numpy as np
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
 from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.errors import UserError
+from anytouch_jax.nn.sight import BLOCKS, READ, STEM
 from anytouch_jax.ops.fields import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE, FieldOutput
 
 Engine = Literal["xla", "onnxruntime", "openvino"]
@@ -101,8 +102,10 @@ def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling =
         start = 1 + model.sensor_tokens
         patches = graph("Slice", x, [start], [start + model.patches], [1])
         values.append(graph.dense(graph("ReduceMean", patches, [1], keepdims=0), touch["projection"]))
+    count = len(values) * model.embed + model.sight
+    if model.sight:
+        values.append(_sight(graph, touch["sight"], frames))
     graph.nodes.append(helper.make_node("Concat", values, ["features"], "features", axis=-1))
-    count = len(values) * model.embed
     about = helper.make_tensor_value_info
     inputs = [about("frames", TensorProto.UINT8, ("B", frames, side, side, 3)), about("sensor", TensorProto.INT32, "B")]
     outputs = [about("features", TensorProto.FLOAT, ("B", count))]
@@ -137,6 +140,35 @@ def _tokens(graph: _Graph, touch: Any, model: ModelConfig, frames: int) -> str:
     rows = touch["sensor_tokens"]
     start = np.broadcast_to(touch["class_token"] + position[0], (len(rows), 1, rows.shape[-1]))
     return graph("Concat", graph("Gather", np.concatenate([start, rows], axis=1), "sensor"), x, axis=1)
+
+
+def _sight(graph: _Graph, own: Any, frames: int) -> str:
+    """Return the values (B, model.sight) of `nn.sight.Sight` for the last frame of pixels (B, T, H, W, 3)."""
+    x = graph("Squeeze", graph("Slice", "frames", [frames - 1], [frames], [1]), [1])
+    x = graph("Add", graph("Mul", graph("Cast", x, to=1), _SCALE), _SHIFT)
+    x = graph("Transpose", x, perm=[0, 3, 1, 2])
+
+    def convolved(x: str, part: Any, side: int, stride: int, group: int = 1) -> str:
+        kernel = part["kernel"].reshape(side, side, -1, part["kernel"].shape[-1]).transpose(3, 2, 0, 1)
+        settings: dict[str, Any] = {"kernel_shape": [side] * 2, "pads": [side // 2] * 4, "strides": [stride] * 2}
+        return graph("Conv", x, kernel, part["bias"], group=group, **settings)
+
+    def clipped(x: str) -> str:
+        return graph("Clip", x, np.float32(0), np.float32(6))
+
+    x, means = clipped(convolved(x, own["stem"], 3, 2)), []
+    for number, form in enumerate(BLOCKS):
+        block, inside = own[f"block{number}"], x
+        if "wide" in block:
+            inside = clipped(convolved(inside, block["wide"], 1, 1))
+        inside = clipped(convolved(inside, block["depth"], form.side, form.stride, form.inside))
+        y = convolved(inside, block["narrow"], 1, 1)
+        # The first block has other channels than its input, and so has each with a stride.
+        before = BLOCKS[number - 1].outputs if number else STEM
+        x = graph("Add", x, y) if form.stride == 1 and form.outputs == before else y
+        if number in READ:
+            means.append(graph("ReduceMean", x, [2, 3], keepdims=0))
+    return graph.dense(graph("Concat", *means, axis=-1), own["read"])
 
 
 def _fields(graph: _Graph, own: Any, model: ModelConfig, frames: int, states: list[str]) -> dict[str, tuple[int, ...]]:

@@ -68,6 +68,13 @@ class Net:
         """Return both poolings (B, E) in one pass: the class token and the mean over patch tokens."""
         return self.bind(params).encode_poolings(clip, sensor, join)
 
+    def see(self, params: Params, clip: Array, sensor: Array, join: str = "mean") -> Array:
+        """Return values (B, model.sight) of the last frame of normalised clips (B, T, H, W, 3), see `nn.sight`.
+
+        Of a longer clip they are joined over its segments, as the features of `encode_touch`.
+        """
+        return self.bind(params).see(clip, sensor, join)
+
     def encode_tokens(self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the projected sequence (B, 1 + S + K, E) of class, sensor and patch tokens: the decoder's input."""
         return self.bind(params).encode_tokens(clip, sensor, keep_ids)

@@ -23,6 +23,7 @@ from anytouch_jax.nn.layers import (
     stored,
     table,
 )
+from anytouch_jax.nn.sight import Sight
 from anytouch_jax.ops import tokens
 
 
@@ -63,6 +64,8 @@ class TouchEncoder(nnx.Module):
         self.blocks = stacked_blocks(model.touch, model, model.norm_eps, ACTIVATIONS[model.activation])
         self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
+        if model.sight:
+            self.sight = Sight(model)
         self.patch_size, self.depth, self.width, self.remat = model.patch, model.touch.depth, width, model.remat
 
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:

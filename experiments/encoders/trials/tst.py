@@ -1,0 +1,10 @@
+import sys
+from e11 import *
+import e11
+F=np.load(sys.argv[1]); m=F['mean']; raw=blk(m,0,1,2,4,7); tr=D.split=='train'
+mu,sg=raw[tr].mean(0),raw[tr].std(0)+1e-6; X=((raw-mu)/sg).astype(np.float32)
+q=F['sim']; q=np.concatenate([q[:,c[b]:c[b+1]] for b in (0,1,2,4,7)],1); e11.qs=((q-mu)/sg).reshape(-1,2,q.shape[1])
+C=std(tiny[:,:192]); f=tr
+for a in sys.argv[2:]:
+    P=X if a=='raw' else st(lda3(X,f,int(a),a=.5),f)
+    print(a,'T+X',[round(100*v,1) for v in test(cat(T,P))],flush=True)

@@ -184,7 +184,8 @@ def test_a_picture_frames_or_a_head_decide_what_a_camera_subtracts(encoder):
     with pytest.raises(UserError, match="not both"):
         Preprocess(encoder, GEL, frames=frames)
     with pytest.raises(
-        UserError, match=r"at\.estimate_background\(frames\).*at\.Preprocess\(encoder, frames=frames\)"
+        UserError,
+        match=r"at\.estimate_background\(frames\).*at\.Preprocess\(encoder, frames=frames\)",
     ):
         encoder.preprocess(GEL)
     plain = Preprocess(replace(encoder, config=replace(encoder.config, data=DataConfig())))

@@ -18,6 +18,8 @@ from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
+from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.training.start import resolve
 from anytouch_jax.weights import checkpoint
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.tree import flatten
@@ -28,7 +30,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from runs import arrays_of, train
-from test_pretrain import clips_only, run_config
+from test_training import clips_only, run_config
 world, stage, run, stop = sys.argv[1:]
 result = train(clips_only(run_config(Path(world), int(stage))), Path(run), stop_after=int(stop))
 np.savez(f"{run}.npz", **arrays_of(result))
@@ -89,6 +91,28 @@ def test_a_run_folder(straight, world):
     assert (
         metadata["preprocessing"]["touch"]["size"] == 28
         and metadata["preprocessing"]["touch"]["channels"] == "RGB"
+    )
+
+
+def test_a_start_is_resolved_before_anything_is_written(straight, world, tmp_path):
+    """The record has all that decides a run: its vocabulary, its warm-up, its first parameters."""
+    config = clips_only(run_config(world, 2))
+    options = {"init": straight[0], "clip": None, "mesh": make_mesh(), "log": lambda _: None}
+    start = resolve(config, tmp_path / "r", **options)
+    assert not (tmp_path / "r").exists() and not start.resumes
+    assert start.config.model.text.vocab == start.tokenizer.vocab_size < 2048
+    assert start.config.optim.warmup == 1 and config.optim.warmup is None
+    assert start.metadata["source"] == {"init": str(straight[0]), "clip": None}
+    learned = load_model(straight[0]).params
+    for name, array in parts(learned, "touch").items():
+        np.testing.assert_array_equal(parts(start.params, "touch")[name], array, err_msg=name)
+    again = resolve(run_config(world), straight[0], **options | {"init": None})
+    assert again.resumes and again.tokenizer is None
+    assert any(
+        "is not read" in note
+        for note in resolve(
+            run_config(world), straight[0], **options | {"init": tmp_path / "other"}
+        ).notes
     )
 
 

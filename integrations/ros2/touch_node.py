@@ -6,9 +6,11 @@ ros2 run needs a package. This file runs alone:
 
     python integrations/ros2/touch_node.py --ros-args -p sensor:=digit
 
-Wrench and points need an encoder that measures. Their frame is the parameter frame: x to the right
-of the picture, y down, z into the gel. The wrench is that of the object on the gel, about the
-centre of pressure.
+Wrench and points need an encoder that measures. Their frame is the parameter frame, the optical
+frame of the camera (REP 103), which is right-handed: x to the right of the picture, y down, z away
+from the camera, towards the object. The wrench is that of the object on the gel, about the centre
+of pressure: a press has a negative z. The surface of the gel lies at z = 0, and at negative z where
+it is pressed.
 """
 
 import contextlib
@@ -36,7 +38,10 @@ PARAMETERS = {
 
 
 def wrench(fields, header: Header) -> WrenchStamped:
-    x, y, z = map(float, fields.force[0])
+    x, y, into_the_gel = map(float, fields.force[0])
+    # The gel lies between the camera and the object, so into the gel is towards the camera.
+    z = -into_the_gel
+    # The torque turns from x to y, which is about z.
     turn = Vector3(x=0.0, y=0.0, z=float(fields.torque[0]) / 1000)
     return WrenchStamped(header=header, wrench=Wrench(force=Vector3(x=x, y=y, z=z), torque=turn))
 

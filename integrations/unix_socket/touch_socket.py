@@ -22,7 +22,8 @@ def line_of(frame: Any) -> dict[str, Any]:
     if frame.estimated:
         line["background"] = "estimated"
     if frame.fields is not None:
-        # Force in N, depth in mm and others, with deviations.
+        # Force in N, depth in mm and others, with deviations. x is to the right of the picture, y
+        # down, and force_z into the gel. Slip is None where nothing touches.
         line["fields"] = frame.fields.summary()
     return line
 

@@ -52,6 +52,40 @@ class FieldBatch(NamedTuple, Generic[A]):
     slip: A
 
 
+class FieldOutput(NamedTuple, Generic[A]):
+    """Fields (B, h, w) at half the picture's resolution, each with its deviation.
+
+    Attributes:
+        depth: over the width of the picture.
+        shear: (..., 2) along x and y of the picture, over its width.
+        contact: logits.
+        pressure: over the gel's modulus.
+        depth_log: logarithms of Laplace deviations of the depth, over LENGTH of
+            `fields.outputs`.
+        shear_log: those of the shear, over LENGTH.
+        force: (B, 3), tangential x and y and normal, over modulus times width squared.
+        torque: (B,), over modulus times width cubed.
+        slip: (B,), logits of the fraction of the contact that slides.
+        force_log: (B, 2), of the tangential force over FORCE, and of the logarithm of the normal
+            force.
+        torque_log: (B,), over TORQUE.
+        slip_log: (B,).
+    """
+
+    depth: A
+    shear: A
+    contact: A
+    pressure: A
+    depth_log: A
+    shear_log: A
+    force: A
+    torque: A
+    slip: A
+    force_log: A
+    torque_log: A
+    slip_log: A
+
+
 @shown_short
 class TouchBatch(NamedTuple, Generic[A]):
     """Stage 1.

@@ -30,18 +30,23 @@ WEIGHTS = {
     "image encoder": Door("zoo.start:touch_of_photographs"),
     "torch": Door("zoo.torch_file:read_torch"),
 }
+# What reads sensor.json of a fitted sensor, a folder NAME.sensor.
+SENSORS = {
+    "fitted": Door("sim.sensing.own:read_numbers", "sim"),
+}
 # Sources of training batches, by the word of --data. Each has the interface of `batch.BatchSource`.
 BATCHES = {
     "simulated": Door("sim.batches:SimulatedLoader", "sim"),
 }
-# Heads beside the embedding: what builds their module, their loss and what they measure.
+# Heads beside the embedding. Each is a `nn.heads.Head`; its loss is a row of OBJECTIVES.
 HEADS = {
     "fields": Door("fields.head:HEAD"),
     "fields measure": Door("fields.measure:measure_of"),
+    "fields units": Door("fields.units:describe_units"),
 }
-# Further terms of the training objectives, weighted by `objective.terms`.
+# Further terms of the loss, weighted by `objective.terms`. Each is an `objectives.Objective`.
 OBJECTIVES = {
-    "fields": Door("fields.loss:field_terms"),
+    "fields": Door("fields.loss:OBJECTIVE"),
 }
 # What computes the features of touch instead of XLA.
 ENGINES = {

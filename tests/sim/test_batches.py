@@ -10,17 +10,9 @@ from batch_leaves import assert_same
 
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
-from anytouch_jax.sim.batches import (
-    MOVED,
-    SIMULATED,
-    SimulatedLoader,
-    _partners,
-    augmented,
-    caption_tokenizer,
-    field_batch,
-    load_real,
-    moved_gel,
-)
+from anytouch_jax.sim.batches import SIMULATED, SimulatedLoader, _partners, caption_tokenizer
+from anytouch_jax.sim.preparation import MOVED, field_batch, moved_gel
+from anytouch_jax.sim.real import load_real
 from anytouch_jax.training import pretrain
 
 TINY = Stack(width=16, depth=1, heads=2, mlp=16)
@@ -129,15 +121,6 @@ def test_real_partners_are_of_the_same_place_and_another_unit(recordings):
     assert len(gels) == 2 and np.any(np.all(gels[:, 0] == 90, axis=(1, 2, 3))), (
         "one stored picture, one median"
     )
-
-
-def test_augmentation_moves_all_frames_alike():
-    clip = np.zeros((3, 2, 20, 20, 3), np.uint8)
-    clip[:, :, 4:9, 11:15] = 200
-    config = tiny(**{"data.affine": (20.0, 0.1, 0.2), "data.flip": 0.5})
-    moved = np.asarray(augmented(jax.random.key(2), clip, config))
-    np.testing.assert_array_equal(moved[:, 0], moved[:, 1])
-    assert np.abs(moved[0].astype(int) - clip[0]).max() > 0 and moved.max() > 150
 
 
 def test_a_gel_moves_by_fractions_of_a_pixel_since_its_picture():

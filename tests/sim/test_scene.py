@@ -1,9 +1,13 @@
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from anytouch_jax.cli.data import SimulateOptions
+from anytouch_jax.config import SimulatedConfig
+from anytouch_jax.config.scenes import SceneOptions
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import scene
 from anytouch_jax.sim.scene import Gesture, Scenes
@@ -30,7 +34,7 @@ def recordings(scenes, number=0):
         ({"vision": 1.5}, "vision must be"),
         ({"grade": "rough"}, "grade must be"),
         ({"units": "two"}, "units must be"),
-        ({"seed": -1}, "seed must be 0 or more, not -1"),
+        ({"seed": -1}, "seed must be 0 to 4294967295, not -1"),
         ({"depth": (0.5, 3.0)}, "depth 3 mm may go through the gel of"),
         ({"fields": ("shear", "shear")}, "each field once"),
         ({"held_out": -0.3}, "held_out must be"),
@@ -187,3 +191,23 @@ def test_directions_are_those_of_the_picture():
     assert seen("twist", twist=0.2)["label.twist"] == "clockwise"
     assert seen("twist", twist=0.2, mirror=(-1, 1))["label.twist"] == "counterclockwise"
     assert seen("twist", twist=0.2, mirror=(-1, -1))["label.twist"] == "clockwise"
+
+
+def test_settings_of_training_and_of_data_sets_differ_only_where_that_is_meant():
+    """The same setting has one default, but for those that `SimulatedConfig` gives a reason for."""
+    training = {field.name: field.default for field in fields(SimulatedConfig)}
+    data_set = {field.name: field.default for field in fields(SceneOptions)}
+    shared = training.keys() & data_set.keys()
+    different = {name for name in shared if training[name] != data_set[name]}
+    assert different == {"objects", "seed", "sensors", "depth", "vision"}
+    assert shared - different == {"text"}
+
+
+def test_a_data_set_is_what_the_command_line_says():
+    options = SimulateOptions(
+        Path("out"), touches=3, sensors=("digit",), held_out=0.0, size=64, units="one", first=5
+    )
+    made = Scenes(**{field.name: getattr(options, field.name) for field in fields(SceneOptions)})
+    assert made == Scenes(
+        touches=3, sensors=("digit",), held_out=0.0, size=64, units="one", first=5
+    )

@@ -19,15 +19,14 @@ from tyro.conf import Positional
 from anytouch_jax.cli import output
 from anytouch_jax.config.parsing import (
     Above0,
-    Below1,
     Count,
     Finite,
     NotNegative,
     Range,
-    Seed,
     Share,
     Threads,
 )
+from anytouch_jax.config.scenes import SceneOptions
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
 from anytouch_jax.progress import bar
@@ -38,7 +37,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class SimulateOptions:
+class _OutputFolder:
+    """The first option of `SimulateOptions`: a base of its own, so that it has no default."""
+
+    out: Path  # Folder for images and manifest.parquet.
+
+
+@dataclass(frozen=True)
+class SimulateOptions(SceneOptions, _OutputFolder):
     """Simulate touches felt by several sensors, with photographs, captions, forces and slip.
 
     Example: anytouch data simulate --out data/scenes --touches 400 --sensors gelsight_mini digit
@@ -47,34 +53,6 @@ class SimulateOptions:
     Run the same command again to continue after an interruption.
     """
 
-    out: Path  # Folder for images and manifest.parquet.
-    touches: Count[int] = 400  # Number of places to touch. Every sensor feels each place once.
-    sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
-    """Sensors: gelsight, gelsight_mini, gelslim, digit, 9dtact, duragel, tac3d (a force field), or
-    your NAME.sensor.
-    """
-    seed: Seed = 0  # Random seed.
-    grade: Literal["fine", "coarse"] = "fine"
-    """fine repeats the motion frame by frame for all sensors; coarse shares only the place."""
-    # Solve contact in a few rounds, or to convergence.
-    fidelity: Literal["fast", "exact"] = "fast"
-    # Frames of a recording. They show a part of one gesture, with pauses and regrasps.
-    frames: Count[int] = 10
-    objects: Count[int] = 200  # Number of objects.
-    depth: NotNegative[tuple[float, float]] = (0.3, 1.0)  # Range of the deepest press, mm.
-    vision: Share = 0.7  # Share of the recordings with a photograph.
-    text: Share = 0.7  # Share of the recordings with a caption.
-    # Share of the objects in the test split, by pairs of primitive and texture.
-    held_out: Below1 = 0.25
-    # Number of the first touch. Others give other touches of the same objects and splits.
-    first: NotNegative[int] = 0
-    fields: tuple[str, ...] = ()  # Fields to write as .npy: displacement, pressure, shear.
-    # Pixels of an image's shorter side. 0 keeps the sensor's resolution.
-    size: NotNegative[int] = 224
-    units: Literal["each", "one"] = "each"
-    """each simulates a new device for every recording; one uses one device of each sensor, mounted
-    straight.
-    """
     threads: Threads = 2  # Threads that render photographs and write files.
 
 
@@ -85,10 +63,9 @@ def run_simulate(options: SimulateOptions) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     enable_compilation_cache()
-    scenes = Scenes(
-        **{name: value for name, value in vars(options).items() if name not in ("out", "threads")}
-    )
-    if missing := _missing_splits(scenes):
+    scenes = Scenes(**{each.name: getattr(options, each.name) for each in fields(SceneOptions)})
+    missing = _missing_splits(scenes)
+    if missing:
         output.log(
             f"no touch is in split {' or '.join(missing)}. Use more touches or about 16 objects or "
             "more."
@@ -117,8 +94,10 @@ def run_simulate(options: SimulateOptions) -> int:
 
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
-    """Exit at once on Ctrl-C: a thread that compiles would not react for a minute, and files are
-    written atomically.
+    """Exit at once on Ctrl-C.
+
+    A thread that compiles would not react for a minute. Files are written atomically, so nothing is
+    left half done.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.default_int_handler:  # ignored, as in a script's background
@@ -158,11 +137,8 @@ def _unconverged(manifest: Path) -> str:
 
     if "label.converged" not in pq.read_schema(manifest).names:
         return ""
-    column = (
-        pq.read_table(manifest, columns=["label.converged"])["label.converged"]
-        .drop_null()
-        .to_numpy()
-    )
+    table = pq.read_table(manifest, columns=["label.converged"])
+    column = table["label.converged"].drop_null().to_numpy()
     count = int((column < 1).sum())
     if count:
         return f". {count} of {len(column)} frames did not converge (label.converged)"

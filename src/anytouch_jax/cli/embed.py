@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from anytouch_jax.cli.inputs import FrameOptions as FrameOptions
-from anytouch_jax.cli.inputs import FramesInput, Inputs
+from anytouch_jax.cli.inputs import FramesInput, Inputs, count_frames
 from anytouch_jax.cli.inputs import SensorOptions as SensorOptions
 from anytouch_jax.cli.inputs import choose_gel as choose_gel
 from anytouch_jax.cli.inputs import contact_of_rows as contact_of_rows
@@ -42,7 +42,7 @@ class EmbedOptions(FrameOptions):
     Example: anytouch embed --data frames/ --sensor digit --out features.npz
     """
 
-    # Manifests (.csv, .parquet), or one folder of frames, picture or video.
+    # Manifests (.csv, .parquet), or one folder of frames, stack (.npy, .npz), picture or video.
     data: tuple[Path, ...]
     out: Path  # The .npz to write: features (n, d), rows (n,), key/* (n,).
     split: str | None = None  # Only this split of a manifest.
@@ -169,7 +169,6 @@ def _embed_frames(work: _Work, source: FramesInput) -> Features:
     """Embed every clip of consecutive frames of a folder or a video, keyed by its last frame."""
     import numpy as np
 
-    from anytouch_jax.data.images import count_frames
     from anytouch_jax.encoder.embed import embed_frames
 
     options = work.options
@@ -193,7 +192,7 @@ def _embed_frames(work: _Work, source: FramesInput) -> Features:
         batch=options.batch,
     )
     features.predictions["contact"] = np.asarray(contact)[features.rows]
-    if "path" not in features.keys:
+    if times:
         log_if_cut(data, len(times))
         features.keys["time"] = np.asarray(times)[features.rows]
     features.gels.update(gels_of(source.preprocess, options))
@@ -223,7 +222,8 @@ def save_features(
     if head is not None and len(features.values):
         predictions = features.predictions | _predictions(head, features.values)
         features = replace(features, predictions=predictions)
-        _log_other_sensors(head, features, options.sensor)
+        named = None if options.sensor is None else options.sensor_name
+        _log_other_sensors(head, features, named)
     about |= {
         "encoder": encoder.source,
         "weights": encoder.fingerprint,

@@ -121,19 +121,28 @@ def _seen_by(model: Path, table: Manifest, unit: UnitHealth) -> UnitHealth:
     )
 
 
-def _lines(path: Path) -> list[str]:
+def _of_a_word(word: str) -> list[str]:
+    """Return lines about the encoders, one of them by its name, or the cameras, [] for no such
+    word.
+    """
     from anytouch_jax.weights import registry
 
-    if str(path) == "encoders":
+    if word == "encoders":
         return [_named(name) for name in registry.list_encoders()]
-    if str(path) in registry.list_encoders():
-        return [_named(str(path)), *_weights(registry.locate(path))]
-    if str(path) == "cameras":
-        from anytouch_jax.live.cameras import list_cameras
+    if word in registry.list_encoders():
+        return [_named(word), *_weights(registry.locate(word))]
+    if word == "cameras":
+        from anytouch_jax.live.cameras import describe_cameras
 
-        return [line for camera in list_cameras() for line in camera.lines()] or [
-            "no camera is connected"
-        ]
+        return describe_cameras() or ["no camera is connected"]
+    return []
+
+
+def _lines(path: Path) -> list[str]:
+    """Return lines about whatever a user names. Raises UserError for what is of no known kind."""
+    lines = _of_a_word(str(path))
+    if lines:
+        return lines
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix = path.suffix.lower()

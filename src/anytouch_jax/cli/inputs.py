@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import log, refuse_join, refuse_unused
@@ -32,8 +32,10 @@ class SensorOptions:
 
     # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
     model: Path = Path(DEFAULT)
-    # Sensor of the frames. Without it, or if it is unknown, the universal tokens are used.
     sensor: str | None = None
+    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit`. Without it,
+    or if it is unknown, the universal tokens are used.
+    """
     # Picture of the untouched gel: it is subtracted, and decides contact.
     background: Path | None = None
     # Turn the frames clockwise by so many degrees, before anything else.
@@ -42,6 +44,13 @@ class SensorOptions:
     """Mirror the frames after that: across exchanges left and right, down exchanges top and
     bottom.
     """
+
+    @property
+    def sensor_name(self) -> str:
+        """The name that the word of --sensor stands for. Raises UserError for a damaged folder."""
+        from anytouch_jax.encoder.sensor_words import resolve_sensor
+
+        return resolve_sensor(self.sensor or UNIVERSAL).name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +105,40 @@ def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequen
     return False
 
 
+def check_sensor(options: SensorOptions) -> None:
+    """Raise UserError for a sensor that is misspelt or damaged, before the encoder is loaded.
+
+    Loading takes seconds. Where only the weights name their sensors, `load_inputs` checks again.
+    """
+    from anytouch_jax.encoder.sensor_words import resolve_sensor
+
+    if options.sensor is None:
+        return
+    word = resolve_sensor(options.sensor)
+    stored = _stored_sensors(options.model)
+    if not word.is_fitted and stored is not None:
+        check_spelling(word.name, stored)
+
+
+def _stored_sensors(model: Path) -> tuple[str, ...] | None:
+    """Return the sensors of an encoder as its files state them, None if they do not."""
+    from anytouch_jax.config import parse_json
+    from anytouch_jax.weights import registry, safetensors
+
+    if str(model).startswith("hf:"):  # it would be downloaded
+        return None
+    path = registry.locate(model)
+    stated: Any = None
+    # What is damaged is reported by the reader of weights.
+    with suppress(UserError, OSError, ValueError, KeyError, TypeError):
+        if path.is_dir():
+            stated = parse_json((path / "config.json").read_bytes())["model"]["sensors"]
+        elif path.suffix == ".safetensors" and path.is_file():
+            metadata = safetensors.read_file_metadata(path)
+            stated = parse_json(metadata[safetensors.MODEL_KEY])["sensors"]
+    return tuple(map(str, stated)) if isinstance(stated, list) else None
+
+
 class Inputs(NamedTuple):
     """The encoder, the pooling and the head that options name."""
 
@@ -116,16 +159,19 @@ def load_inputs(options: FrameOptions) -> Inputs:
     """
     from anytouch_jax.encoder.encoder import check_frames, load_encoder
     from anytouch_jax.encoder.linear_head import load_head
+    from anytouch_jax.encoder.sensor_words import resolve_sensor
     from anytouch_jax.train.mesh import enable_compilation_cache
 
+    check_sensor(options)
+    word = resolve_sensor(options.sensor or UNIVERSAL)
     head = None if options.head is None else load_head(options.head)
     pooling = options.pooling
     if pooling is None:
         pooling = "class" if head is None else head.pooling
     enable_compilation_cache()
     encoder = load_encoder(options.model, engine=options.engine).computed_in(options.dtype)
-    if options.sensor is not None:
-        check_spelling(options.sensor, encoder.config.model.sensors)
+    if not word.is_fitted:
+        check_spelling(word.name, encoder.config.model.sensors)
     if str(options.model) == DEFAULT:
         log(f"encoder: {DEFAULT} (name another with --model)")
     check_frames(encoder.config.model, options.frames)
@@ -155,8 +201,8 @@ def frames_input(
     from anytouch_jax.encoder.contact_gate import ContactGate
     from anytouch_jax.encoder.interface import Preprocess
 
-    sensor = options.sensor or UNIVERSAL
-    row = encoder.sensor_row(sensor, log)
+    row = encoder.sensor_row(options.sensor or UNIVERSAL, log)
+    sensor = options.sensor_name
     if options.background is not None and not encoder.subtracts:
         log(
             "--background only decides contact: this encoder was trained on frames without "
@@ -269,9 +315,13 @@ def _some_frames(data: Path) -> Iterator[np.ndarray]:
 
     Broken ones are left out.
     """
-    from anytouch_jax.data import images
+    from anytouch_jax.data import images, stacks
     from anytouch_jax.data.background.rule import FRAMES
 
+    stack = stacks.read_stack(data)
+    if stack is not None:
+        yield from stacks.stacked_frames(stack[:: -(-len(stack) // FRAMES)], data)
+        return
     files = images.picture_files(data)
     if files is None:
         yield from images.frames_from_video(data)
@@ -289,7 +339,7 @@ def gels_of(preprocess: Preprocess, options: SensorOptions) -> dict[str, np.ndar
     gel = preprocess.background
     if gel is None:
         return {}
-    return {options.sensor or UNIVERSAL: reduced(orient_frame(gel, options.rotate, options.flip))}
+    return {options.sensor_name: reduced(orient_frame(gel, options.rotate, options.flip))}
 
 
 def log_universal(encoder: Encoder, options: SensorOptions) -> None:
@@ -351,20 +401,32 @@ def contact_of_rows(
     return np.where(np.isnan(known), by_score, known)
 
 
-def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[NumberedFrame]:
-    """Yield number, name and RGB u8 pixels of each frame; the frames of a video have no names.
+def count_frames(data: Path) -> int:
+    """Return the number of frames of a folder, a stack, a picture or a video's header."""
+    from anytouch_jax.data import images, stacks
 
-    A folder's pictures come in natural order.
+    stack = stacks.read_stack(data)
+    return images.count_frames(data) if stack is None else len(stack)
+
+
+def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[NumberedFrame]:
+    """Yield number, name and RGB u8 pixels of each frame.
+
+    A folder's pictures come in natural order. The frames of a video or a stack have no names.
 
     Args:
-        data: a folder, a picture or a video.
+        data: a folder, a picture, a stack of frames (.npy, .npz) or a video.
         on_bad_sample: with "skip", a picture that cannot be read is None, and the first are logged.
         times: the time stamps of a video's frames are appended to it, s.
     """
-    from anytouch_jax.data import images
+    from anytouch_jax.data import images, stacks
 
+    stack = stacks.read_stack(data)
     if data.is_dir():
         yield from _frames_of_folder(data, on_bad_sample)
+    elif stack is not None:
+        for number, frame in enumerate(stacks.stacked_frames(stack, data)):
+            yield number, "", frame
     elif images.picture_files(data):
         yield 0, data.name, images.decode(data)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -16,10 +17,14 @@ if TYPE_CHECKING:
 
 
 def log(sentence: str) -> None:
-    """Print a sentence that is not a result on standard error."""
-    from rich.console import Console
+    """Print a sentence that is not a result on standard error.
 
-    Console(stderr=True, highlight=False).print(shorten(sentence), markup=False, soft_wrap=True)
+    Not by a console of rich: it would write past the bar that may be on the terminal, at the end of
+    its line, and the bar would be drawn over it. The bar takes what goes to `sys.stderr`, and shows
+    it above itself.
+    """
+    sys.stderr.write(shorten(sentence) + "\n")
+    sys.stderr.flush()
 
 
 def print_table(markdown: str) -> None:

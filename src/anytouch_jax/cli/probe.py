@@ -54,7 +54,8 @@ class LabelOptions(ProbeOptions):
 
     Use --where label.contact_score 7 for firm touches only, after `anytouch data contact`. The
     penalty is chosen on split val, or by grouped cross-validation inside train. The report is on
-    split test.
+    split test. A manifest without a split, as one of your recordings, has each recording left out
+    in turn.
     """
 
     label: str = "object"  # Label column. The prefix "label." may be left out.
@@ -68,6 +69,8 @@ class LabelOptions(ProbeOptions):
     """
     where: Finite[tuple[str, float] | None] = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
+    train_sensor: str | None = None  # Fit the heads on recordings of this sensor.
+    test_sensor: str | None = None  # Test them on the same classes by this sensor.
     # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
     frames: Count[int] = 1
     # Features: class token, mean of the patch tokens, or both.
@@ -76,6 +79,10 @@ class LabelOptions(ProbeOptions):
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says
     so.
+    """
+    regression: Literal["auto", "yes", "no"] = "auto"
+    """Whether the label is a number: R2, mean absolute error and Spearman's correlation. By auto it
+    is if the column has numbers with a fraction.
     """
     # Also print parts of the test rows: classes that alignment may have named, and others.
     details: bool = False
@@ -114,12 +121,16 @@ class TasksOptions(BatteryOptions):
 
     tasks: tuple[str, ...] = ("all",)
     """Tasks: material, roughness, hardness, grasp, grasp_after, object, slip, force, twist, slide,
-    indenter, or all.
+    indenter, any other label column of the manifest, or all.
     """
     heads: tuple[Literal["linear", "knn", "gradient"], ...] = ("linear",)
     """Heads. gradient is the authors': one layer trained by AdamW."""
     protocol: Literal["honest", "published"] = "honest"
     """published also reports the choice on the test split, as in the authors' code."""
+    regression: Literal["auto", "yes", "no"] = "auto"
+    """Whether labels are numbers, for tasks that do not say so. By auto they are if the column has
+    numbers with a fraction.
+    """
     frames: Count[int | None] = None  # Frames of a touch (default: those of each task).
     # Features: class token, mean of the patch tokens, or both.
     pooling: Literal["class", "mean", "both"] = "class"
@@ -154,7 +165,7 @@ def run_label(options: LabelOptions) -> int:
     if options.leave_out is not None:
         refuse_unused(
             options,
-            ("group", "seeds", "protocol", "save"),
+            ("group", "seeds", "protocol"),
             "with --leave-out, which makes its own folds",
         )
     models = _models(options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -51,8 +52,9 @@ def run_fit(options: FitOptions) -> int:
     files, named = list_images(options.frames)
     background = options.background or named.get("background")
     gel = None if background is None else to_rgb(decode(background), background)
+    pictures = [to_rgb(decode(file), file) for file in files]
     fitted = fit_sensor(
-        [to_rgb(decode(file), file) for file in files],
+        pictures,
         options.name,
         options.width_mm,
         options.out,
@@ -70,8 +72,7 @@ def run_fit(options: FitOptions) -> int:
     print(f"{options.out}: {options.name}, {fitted.colour.source}")
     print(
         f"{picture}: real pictures above simulated ones. A linear classifier knows one from the "
-        f"other in {share:.0%} "
-        "of the cases, where 50 % is chance."
+        f"other in {share:.0%} of the cases, where 50 % is chance."
     )
     return 0
 
@@ -113,20 +114,7 @@ def run_adapt(options: AdaptOptions) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     simulated = Path(options.sensor).suffix == OWN_SENSOR
-    if simulated:
-        unused = ("data", "frames", "labels", "steps")
-        refuse_unused(options, unused, f"with a sensor of {OWN_SENSOR}, which is simulated")
-    elif not options.data:
-        raise UserError(
-            f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as "
-            "--sensor"
-        )
-    else:
-        refuse_unused(
-            options, ("minutes", "deep"), "with --data, where the frames are what is fitted"
-        )
-    if not options.frames:
-        refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
+    _check_adapt(options, simulated)
     check_empty(options.out)
     check_home(options.out)
     enable_compilation_cache()
@@ -155,12 +143,30 @@ def run_adapt(options: AdaptOptions) -> int:
     return 0
 
 
+def _check_adapt(options: AdaptOptions, simulated: bool) -> None:
+    """Raise UserError for options that do not go together, before anything is loaded."""
+    if simulated:
+        unused = ("data", "frames", "labels", "steps")
+        refuse_unused(options, unused, f"with a sensor of {OWN_SENSOR}, which is simulated")
+    elif not options.data:
+        raise UserError(
+            f"name frames of {options.sensor} with --data, or a sensor of `anytouch sensor fit` as "
+            "--sensor"
+        )
+    else:
+        refuse_unused(
+            options, ("minutes", "deep"), "with --data, where the frames are what is fitted"
+        )
+    if not options.frames:
+        refuse_unused(options, ("labels", "steps", "seed"), "with --frames 0, which fits nothing")
+
+
 def _simulated(options: AdaptOptions) -> int:
     """Train the tokens of a sensor of `anytouch sensor fit`."""
     from anytouch_jax.encoder.adapt import save
     from anytouch_jax.sim.fitting.tokens import adapt_by_simulation
 
-    state = options.out.with_name(f"{options.out.name}.part.npz")
+    state = options.out.with_name(f"{options.out.name}.part")
     log("compiling the simulator: about two minutes at first")
     adapted = adapt_by_simulation(
         options.model,
@@ -175,13 +181,11 @@ def _simulated(options: AdaptOptions) -> int:
         log(f"interrupted: {state} keeps the state. Run the same command again to continue.")
         return 130
     save(adapted, options.model, options.out)
-    state.unlink(missing_ok=True)
+    shutil.rmtree(state, ignore_errors=True)
     name = adapted.metadata["source"]["sensor"]
     print(
         f"{options.out}: tokens of {name}, {len(adapted.losses)} steps. Of held-out simulated "
-        f"touches by {name}, the "
-        f"nearest one by a known sensor is the same touch in {adapted.after:.1%}. With universal "
-        "tokens it is in "
-        f"{adapted.before:.1%}."
+        f"touches by {name}, the nearest one by a known sensor is the same touch in "
+        f"{adapted.after:.1%}. With universal tokens it is in {adapted.before:.1%}."
     )
     return 0

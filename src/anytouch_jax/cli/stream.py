@@ -85,9 +85,11 @@ def run_stream(options: StreamOptions) -> int:
     settings = options.settings()
     _check_stream(options)
     from anytouch_jax.live import stream
+    from anytouch_jax.live.freshness import nominal_rate
 
     # The source is opened first, because it fails within a second.
     source, live = stream.open_source(options.data, settings, log)
+    nominal = nominal_rate(source)  # a source that is released has none
     if not live:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "with a film")
     given = inputs.load_inputs(options)
@@ -123,6 +125,8 @@ def run_stream(options: StreamOptions) -> int:
     inputs.log_universal(given.encoder, options)
     for line in stream.budget(result):
         log(line)
+    if live:
+        _log_rate(result, nominal)
     if not prints_lines:
         print(f"{options.out}: {len(result.values)} features of {result.values.shape[1]} values")
     if result.error is not None:
@@ -167,6 +171,16 @@ def _check_film(options: StreamOptions, result: Result) -> None:
             "Lower one of them."
         )
     inputs.log_if_cut(Path(options.data), int(result.numbers[-1]) + 1)
+
+
+def _log_rate(result: Result, nominal: float) -> None:
+    """Log how many fresh frames a second a camera gave, and a warning if they are too few."""
+    rate = result.rate(nominal)
+    if rate is None:
+        return
+    log(f"camera: {rate}")
+    if rate.warning():
+        log(rate.warning())
 
 
 def _save_stream(
@@ -317,6 +331,7 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     """Return the live page of a camera, or of a film in its place."""
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.linear_head import load_head
+    from anytouch_jax.live.examples import EXAMPLE, SENSOR
     from anytouch_jax.live.page.live import Live
     from anytouch_jax.train.mesh import enable_compilation_cache
 
@@ -329,13 +344,19 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
     # Live touch is compared with the first features that are shown.
     spaces: list[Any] = [source for source in sources if source.kind == "space"]
+    sensor = options.sensor
+    out = options.out
+    if camera == EXAMPLE:
+        sensor = SENSOR
+        # What it teaches is not mixed with recordings of the user's own sensor.
+        out = out.with_name(f"{out.name}_examples")
     return Live(
         camera,
         encoder,
-        sensor=options.sensor,
+        sensor=sensor,
         head=head,
         space=spaces[0] if spaces else None,
-        out=options.out,
+        out=out,
         camera=options.settings(),
         log=log,
     )

@@ -8,28 +8,22 @@ from typing import Annotated, Literal
 
 from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check
 from anytouch_jax.errors import ConfigError, letters_apart
+from anytouch_jax.sensors import RECORDS
 from anytouch_jax.shown import shown_short
 
 UNIVERSAL = "universal"
-SENSORS = (
-    "gelsight",
-    "digit",
-    "gelslim",
-    "gelsight_mini",
-    "duragel",
-    "9dtact",
-    "allsight",
-    "tacto",
-    "taxim",
-    UNIVERSAL,
-)
+# Stored weights count on the order of the rows: gelsight to duragel are those of the release.
+SENSORS = (*(name for name, record in RECORDS.items() if record.has_tokens), UNIVERSAL)
 _MOST = 1 << 20  # of every size: a damaged configuration must not ask for the whole memory
 Size = Annotated[int, Range(1, _MOST, f"1 to {_MOST}")]
 Number = Annotated[int, Range(0, _MOST, f"0 to {_MOST}")]
-FIELD_SENSORS = ("tac3d",)  # force fields, not images: left out of training
+# force fields, not images: left out of training
+FIELD_SENSORS = tuple(name for name, record in RECORDS.items() if record.measures == "field")
 OWN_SENSOR = ".sensor"  # ending of a folder of `anytouch sensor fit`
 # sensors without tokens whose names are nearly those of others
-OTHER_SENSORS = ("dtact", "tactip")
+OTHER_SENSORS = tuple(
+    name for name, record in RECORDS.items() if record.measures == "image" and not record.has_tokens
+)
 _LETTERS = 2  # by which a misspelt name differs from the right one
 
 
@@ -38,11 +32,11 @@ class SpellingError(ConfigError):
 
 
 def check_spelling(name: str, known: Iterable[str] = ()) -> None:
-    """Raise SpellingError for a name within two letters of a known one; case, - and blanks do not
-    count as letters.
+    """Raise SpellingError for a name within two letters of a known one.
 
-    Known are SENSORS, FIELD_SENSORS and `known`. A name with more digits, such as digit_2, is a new
-    one. So are OTHER_SENSORS.
+    Without this a misspelt sensor gets tokens of its own and trains them on what belongs to
+    another. Case, - and blanks do not count as letters. Known are SENSORS, FIELD_SENSORS and
+    `known`. A name with more digits, such as digit_2, is a new one. So are OTHER_SENSORS.
     """
 
     def plain(sensor: str) -> str:
@@ -55,15 +49,14 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
     word = plain(name)
     if name in names or word in OTHER_SENSORS:
         return
+    # Words of other lengths are further apart: the distance is the slow part.
     alike = [sensor for sensor in sorted(names) if abs(len(sensor) - len(name)) <= _LETTERS]
-    apart, nearest = min(
-        ((letters_apart(word, plain(one)), one) for one in alike), default=(_LETTERS + 1, "")
-    )
+    distances = [(letters_apart(word, plain(one)), one) for one in alike]
+    apart, nearest = min(distances, default=(_LETTERS + 1, ""))
     if apart <= _LETTERS and digits(word) <= digits(nearest):
         raise SpellingError(
             f"sensor {name!r} is not known: did you mean {nearest}? The name of a new sensor "
-            "differs from it by more "
-            f"than {_LETTERS} letters"
+            f"differs from it by more than {_LETTERS} letters"
         )
 
 
@@ -101,8 +94,9 @@ class TextTower:
 @shown_short
 @dataclass(frozen=True)
 class ModelConfig:
-    """All shapes and arithmetic of the network; `sensors` names the rows of tokens, or of patch
-    encoders too (T3).
+    """All shapes and arithmetic of the network.
+
+    `sensors` names the rows of the sensor tokens, and of the patch encoders too in T3.
     """
 
     image_size: Size  # Side of an image, pixels.
@@ -140,10 +134,10 @@ class ModelConfig:
     def __post_init__(self) -> None:
         check(self, "--model.")
         if self.decoder.width % 4:
-            width = (
-                f"a multiple of 4 (sines and cosines of rows and columns), not {self.decoder.width}"
+            raise ConfigError(
+                "--model.decoder.width must be a multiple of 4 (sines and cosines of rows and "
+                f"columns), not {self.decoder.width}"
             )
-            raise ConfigError(f"--model.decoder.width must be {width}")
         if self.image_size % self.patch:
             raise ConfigError(
                 f"image_size {self.image_size} must be a multiple of patch {self.patch}"
@@ -172,10 +166,8 @@ class ModelConfig:
             )
         check_spelling(name, self.sensors)
         if name not in self.sensors:
-            known = ", ".join(self.sensors)
-            table = " ".join(self.sensors)
             raise ConfigError(
-                f"unknown sensor {name!r}. Choose one of {known}, or add it by --model.sensors "
-                f"{name} {table}"
+                f"unknown sensor {name!r}. Choose one of {', '.join(self.sensors)}, or add it by "
+                f"--model.sensors {name} {' '.join(self.sensors)}"
             )
         return self.sensors.index(name)

@@ -5,11 +5,11 @@ All other parameters are frozen.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,15 +25,17 @@ from anytouch_jax.encoder.features import network, precision
 from anytouch_jax.encoder.labelled import choose_frames as choose_frames
 from anytouch_jax.encoder.new_sensor import Adapted as Adapted
 from anytouch_jax.encoder.new_sensor import check_empty as check_empty
+from anytouch_jax.encoder.new_sensor import metadata_of
 from anytouch_jax.encoder.new_sensor import put_tokens as put_tokens
 from anytouch_jax.encoder.new_sensor import read_model as read_model
 from anytouch_jax.encoder.new_sensor import save as save
 from anytouch_jax.encoder.new_sensor import with_row as with_row
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.ops import losses
-from anytouch_jax.progress import tracked
-from anytouch_jax.weights.load import Loaded
+from anytouch_jax.train.loop import Work
+from anytouch_jax.train.tuning import tune_for_steps
 
 Loss = Callable[[Params, jax.Array, jax.Array], jax.Array]  # of (params, clip u8, class i32)
 BATCH = 16  # frames of a step
@@ -113,6 +115,7 @@ def adapt_with(
         raise UserError(
             "the tokens are fitted to classes; name a column with --labels, or copy with --frames 0"
         )
+    sensor = resolve_sensor(sensor).name
     loaded, params = read_model(run)
     config, params, row = with_row(loaded, params, sensor, str(run), log)
     source = {
@@ -122,7 +125,7 @@ def adapt_with(
         "labels": settings.labels,
         "manifest": manifest.content_hash,
     }
-    metadata = _metadata(loaded, config, sensor, source)
+    metadata = metadata_of(loaded, config, sensor, source)
     if settings.labels is None or not settings.frames:
         nothing = float("nan")
         return Adapted(config, params, (), nothing, nothing, "fitted", metadata)
@@ -147,8 +150,8 @@ def adapt_with(
             loss,
             touch,
             row,
-            clip,
-            classes[fitted],
+            Labelled(clip, classes[fitted]),
+            config=config,
             steps=settings.steps,
             rate=settings.rate,
             seed=settings.seed,
@@ -160,57 +163,50 @@ def adapt_with(
         )
 
 
-def _metadata(
-    loaded: Loaded, config: Config, sensor: str, source: dict[str, Any]
-) -> dict[str, Any]:
-    """Return what the checkpoint of an adapted model says about it."""
-    stored = loaded.metadata if loaded.from_run else {}
-    metadata: dict[str, Any] = {
-        name: stored[name] for name in ("preprocessing", "data") if name in stored
-    }
-    metadata["sensors"] = list(config.model.sensors)
-    metadata["source"] = source
-    if loaded.trained_sensors is not None:
-        metadata["seen"] = [*loaded.trained_sensors, sensor]
-    return metadata
+class Labelled(NamedTuple):
+    """Frames of a step: clip u8 (B, 1, H, W, 3), class i32 (B,)."""
+
+    clip: np.ndarray
+    target: np.ndarray
 
 
 def _fit(
     loss: Loss,
     params: Params,
     row: int,
-    clip: np.ndarray,
-    target: np.ndarray,
+    frames: Labelled,
     *,
+    config: Config,
     steps: int,
     rate: float,
     seed: int,
 ) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Return the tokens (S, D) of the row after `steps` of Adam with a cosine schedule, and the
-    loss of each step.
-    """
-    tx = optax.adam(optax.cosine_decay_schedule(rate, steps))
-    arrays = jax.device_put((params, clip, target))
+    """Return the tokens (S, D) of the row after `steps` of Adam, and the loss of each step."""
+    root = jax.random.key(seed)
 
     @jax.jit
-    def step(
-        tokens: jax.Array, state: Any, key: jax.Array, arrays: Any
-    ) -> tuple[jax.Array, Any, jax.Array]:
-        params, clip, target = arrays
-        key_rows, _ = jax.random.split(key)
+    def drawn(number: Any) -> jax.Array:
+        key_rows, _ = jax.random.split(jax.random.fold_in(root, number))
         # Drawn with replacement: epochs would need another shape for every number of frames.
-        rows = jax.random.randint(key_rows, (BATCH,), 0, clip.shape[0])
-        value, grad = jax.value_and_grad(
-            lambda t: loss(put_tokens(params, row, t), clip[rows], target[rows])
-        )(tokens)
-        updates, state = tx.update(grad, state)
-        return optax.apply_updates(tokens, updates), state, value
+        return jax.random.randint(key_rows, (BATCH,), 0, len(frames.clip))
 
-    tokens = jnp.asarray(params["touch"]["sensor_tokens"][row])
-    state = tx.init(tokens)
-    root = jax.random.key(seed)
-    history = []
-    for number in tracked(range(steps), "steps"):
-        tokens, state, value = step(tokens, state, jax.random.fold_in(root, number), arrays)
-        history.append(value)
-    return np.asarray(tokens), tuple(float(value) for value in history)
+    def batches(start: int, stop: int) -> Iterator[tuple[int, Labelled, dict[str, Any]]]:
+        for number in range(start, stop):
+            rows = np.asarray(drawn(number))
+            yield number, Labelled(frames.clip[rows], frames.target[rows]), {}
+
+    def loss_of(
+        params: Params, batch: Labelled, key: jax.Array, progress: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        merged = put_tokens(params["frozen"], row, params["tokens"])
+        return loss(merged, jnp.asarray(batch.clip), jnp.asarray(batch.target)), {}
+
+    tokens = params["touch"]["sensor_tokens"][row]
+    work = Work(
+        {"tokens": tokens, "frozen": params},
+        loss_of,
+        batches,
+        frozen=(("^frozen/", True), ("", False)),
+    )
+    result = tune_for_steps(config, work, rate=rate, steps=steps)
+    return np.asarray(result.state.trainable["tokens"]), result.losses

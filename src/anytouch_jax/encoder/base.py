@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation
@@ -29,12 +30,11 @@ from anytouch_jax.encoder.features import features_and_fields, network
 from anytouch_jax.encoder.features import precision as precision
 from anytouch_jax.encoder.features import touch_features as touch_features
 from anytouch_jax.encoder.features import touch_only as touch_only
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.encoder.interface import Preprocess as Preprocess
 from anytouch_jax.encoder.measured import Fields, Measure, missing, open_measure
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.encoder.towers import PART_NAMES, Towers
 from anytouch_jax.errors import UserError, refuse_forked
-from anytouch_jax.nn.functional import Net, build
 from anytouch_jax.shown import count_of, described, leaves
 
 
@@ -106,18 +106,14 @@ class Encoder(Towers):
         # Compiled programs, which are cached properties, stay in their process.
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
-    @cached_property
-    def net(self) -> Net:
-        """The network of the touch encoder."""
-        return build(self.config.model)
-
     def sensor_row(self, name: str, log: Log = warn) -> int:
         """Return the row of a sensor, or, logged, of the universal tokens (Sec. 3.5).
 
         Raises SpellingError for a name that is nearly a known one.
         """
         model = self.config.model
-        name = str(name)
+        word = resolve_sensor(name)
+        name = word.name
         in_table = name in model.sensors
         # Without trained sensors nobody knows whether the universal tokens were drawn.
         drawn = self.universal_drawn or not self.trained_sensors
@@ -127,8 +123,11 @@ class Encoder(Towers):
             is_trained = self.trained_sensors is None or name in self.trained_sensors
         if in_table and is_trained:
             return model.sensors.index(name)
-        check_spelling(name, model.sensors)
+        if not word.is_fitted:
+            check_spelling(name, model.sensors)
         why = f"is not in this model's table ({', '.join(model.sensors)})"
+        if word.is_fitted:
+            why = "has no tokens of its own here, which `anytouch adapt` makes"
         if in_table:
             why = f"was not in training, which had {', '.join(self.trained_sensors or ())}"
         used = "the mean of the trained sensors' tokens (no universal ones)"
@@ -308,8 +307,8 @@ class Encoder(Towers):
             frames: those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B,
                 T, h, w, 3), whose last frame is measured. A still shows little of slip.
             background: the untouched gel.
-            sensor: its name.
-            width_mm: the mm that the picture's width shows. A sensor that is not in
+            sensor: its name, or the folder NAME.sensor of a fitted one.
+            width_mm: the mm that the picture's width shows. A name that is not in
                 `fields.measure.GELS` needs it. Without it lengths are fractions of that width, and
                 there is no force.
             log: takes a sentence on each fault of the frames.
@@ -356,7 +355,7 @@ class Encoder(Towers):
         """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it.
 
         Args:
-            sensor: its name.
+            sensor: its name, or the folder NAME.sensor of a fitted one.
             background: the untouched gel, RGB (h, w, 3), as the camera takes it.
             width_mm: the mm that the picture's width shows, see `measure`.
             log: takes a sentence on each fault of the first frame.
@@ -417,5 +416,5 @@ def random_encoder(config: Config, seed: int = 0) -> Encoder:
     """Return an untrained encoder of the same form: the control of every probe."""
     config = touch_only(config)
     with precision(config):
-        params = {"touch": build(config.model).init(jax.random.key(seed))["touch"]}
+        params = {"touch": network(config.model).init(jax.random.key(seed))["touch"]}
     return Encoder(config, params, f"random({seed})")

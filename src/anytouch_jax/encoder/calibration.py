@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 from scipy.special import expit, log_softmax, softmax
 
 from anytouch_jax.encoder.arrays import Array
@@ -222,7 +222,7 @@ def calibrate(
     z = rows.logits[known].astype(np.float64)
     held_out = rows.held_out[known]
     truth = np.searchsorted(classes, rows.y[known])
-    temperature = fit_temperature(z, truth, held_out)
+    temperature = modest_temperature(z, held_out, fit_temperature(z, truth, held_out))
     p = probabilities(z, temperature)
     # The score of a row is what its true class lacks to certainty. Sets are those of Sadinle, Lei
     # and Wasserman (2019): every class whose score is at most the limit.
@@ -283,6 +283,42 @@ def fit_temperature(logits: Array, y: Array, groups: Array) -> float:
     # The loss is convex in the inverse temperature, so it has one minimum in the logarithm too.
     bounds = tuple(np.log((0.05, 20.0)))
     return float(np.exp(minimize_scalar(loss, bounds=bounds, method="bounded").x))
+
+
+def support(groups: int) -> float:
+    """Return the probability that the next group is right, when all of some `groups` were.
+
+    It is Laplace's rule of succession: seven recordings that were all right support 8/9.
+    """
+    return (groups + 1) / (groups + 2)
+
+
+def modest_temperature(logits: Array, groups: Array, least: float) -> float:
+    """Return a temperature of at least `least` whose confidence the groups support.
+
+    The log loss of a few groups that are all right falls as long as confidence rises, so its
+    minimum is as sure as the bounds allow. The mean confidence shall not exceed `support`.
+
+    Args:
+        logits: (n, K), or (n, 1) of two classes.
+        groups: (n,), each of which has the same weight.
+        least: the temperature that was fitted.
+    """
+    weights = group_weights(groups)
+    most = support(len(np.unique(groups)))
+
+    def excess(power: float) -> float:
+        p = probabilities(logits, float(np.exp(power)))
+        return float((weights * p.max(axis=1)).sum()) - most
+
+    low = float(np.log(least))
+    if excess(low) <= 0:
+        return least
+    high = low + 1.0
+    # At an infinite temperature all classes are equal, and `support` is at least 2/3.
+    while excess(high) > 0:
+        high += 1.0
+    return float(np.exp(brentq(excess, low, high)))
 
 
 def group_weights(groups: Array) -> Array:

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import Config, ModelConfig
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import Join, Params, Pooling
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build

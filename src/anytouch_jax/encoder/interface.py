@@ -24,6 +24,7 @@ from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import Join, Log, Params, Pooling, warn
 from anytouch_jax.encoder.measured import missing
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 
 
@@ -127,10 +128,12 @@ class TouchEncoder(ABC):
         Raises SpellingError for a name that is nearly a known one.
         """
         names = self.config.model.sensors
-        name = str(name)
+        word = resolve_sensor(name)
+        name = word.name
         if name in names:
             return names.index(name)
-        check_spelling(name, names)
+        if not word.is_fitted:
+            check_spelling(name, names)
         log(f"sensor {name!r} is not in this model's table ({', '.join(names)})")
         return self.config.model.universal_row
 

@@ -14,9 +14,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.doors import HEADS, enter
 from anytouch_jax.encoder.arrays import Array
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.errors import UserError
 from anytouch_jax.shown import shown_short
 
@@ -37,7 +37,7 @@ class Fields:
         contact: probability.
         force: (B, 3), N along x, along y and into the gel.
         torque: (B,), N mm about the centre of pressure.
-        slip: (B,), fraction of the contact that slides.
+        slip: (B,), fraction of the contact that slides, NaN without contact.
         area: (B,), mm2.
         centre: (B, 2), mm of the pressure from the middle of the picture, x to the right and y
             down, NaN without contact.
@@ -94,9 +94,11 @@ class Fields:
         return self._each(resized)
 
     def points(self) -> Array:
-        """Return the surface of the gel f32 (B, h, w, 3) in mm.
+        """Return the surface of the gel f32 (B, h, w, 3) in mm, in a right-handed frame.
 
-        x goes to the right and y down from the middle, z into the gel.
+        It is the optical frame of a camera (REP 103): from the middle of the picture, x goes to the
+        right, y down, and z away from the camera. The untouched gel lies at z = 0, and a press
+        brings its surface nearer to the camera, so z is minus the depth.
         """
         height, width = self.depth.shape[1:]
         mm = self.width_mm or 1.0
@@ -104,7 +106,7 @@ class Fields:
         across = (x / width - 0.5) * mm
         down = (y / height - 0.5) * mm * self.shape
         flat = [np.broadcast_to(axis, self.depth.shape) for axis in (across, down)]
-        return np.stack([*flat, self.depth], -1).astype("f4")
+        return np.stack([*flat, -self.depth], -1).astype("f4")
 
     def summary(self, row: int = 0) -> dict[str, float | None]:
         """Return the numbers of a frame by name, each with its deviation `*_std`.

@@ -144,3 +144,18 @@ def put_tokens(params: Params, row: int, tokens: Any) -> Params:
     """Return `params` with other tokens (S, D) in one row."""
     table = jnp.asarray(params["touch"]["sensor_tokens"]).at[row].set(tokens)
     return params | {"touch": params["touch"] | {"sensor_tokens": table}}
+
+
+def metadata_of(
+    loaded: Loaded, config: Config, sensor: str, source: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what the checkpoint of an adapted model says about it."""
+    stored = loaded.metadata if loaded.from_run else {}
+    metadata: dict[str, Any] = {
+        name: stored[name] for name in ("preprocessing", "data") if name in stored
+    }
+    metadata["sensors"] = list(config.model.sensors)
+    metadata["source"] = source
+    if loaded.trained_sensors is not None:
+        metadata["seen"] = [*loaded.trained_sensors, sensor]
+    return metadata

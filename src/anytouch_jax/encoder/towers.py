@@ -47,6 +47,11 @@ class Towers(TouchEncoder):
     tokenizer_file: Path | None
 
     @cached_property
+    def net(self) -> Net:
+        """The network of the touch encoder."""
+        return network(self.config.model)
+
+    @cached_property
     def _compiled(self) -> dict[Any, Any]:
         """What was called: touch by pooling and join, other parts by their method."""
         return {}

@@ -114,13 +114,31 @@ def _refits(
     return {"refit_mean": mean, "refit_std": deviation, "seeds": len(accuracies)}
 
 
-def leave_groups_out(
+def _single_group_note(data: LabelledFeatures, used: Array) -> tuple[str, ...]:
+    """Return a note on classes of one group, which no head knows when that group is left out."""
+    pairs = np.unique(np.stack([data.y[used], _codes(data.groups[used])]), axis=1)
+    classes, groups = np.unique(pairs[0], return_counts=True)
+    single = data.names[classes[groups == 1]]
+    if not len(single):
+        return ()
+    listed = ", ".join(map(str, single[:10]))
+    if len(single) > 10:
+        listed += f" and {len(single) - 10} more"
+    return (f"classes of one group alone count as errors when it is left out: {listed}",)
+
+
+def _codes(names: Array) -> Array:
+    return np.unique(names, return_inverse=True)[1]
+
+
+def leave_groups_out(  # noqa: PLR0913 - three arrays, and settings that are each used alone
     features: Array,
     labels: npt.ArrayLike,
     groups: npt.ArrayLike,
     *,
+    measured: bool = False,
     folds: int | None = 10,
-    penalties: Sequence[float] = (10.0, *heads.PENALTIES),
+    penalties: Sequence[float] | None = None,
     scaling: Scaling = "column",
     subsets: Subsets | None = None,
     name: str = "linear, groups left out",
@@ -133,10 +151,11 @@ def leave_groups_out(
 
     Args:
         features: f32 (n, d), frozen.
-        labels: (n,) classes.
+        labels: (n,) classes or numbers.
         groups: (n,) names of what is left out together.
+        measured: the labels are continuous, so the head is a regression.
         folds: into so many the groups are dealt; None leaves each group out alone.
-        penalties: of logistic regression.
+        penalties: of the head; by default from 10 down for classes, from 100 for numbers.
         scaling: of the features; see `ProbeHead`.
         subsets: parts that are scored too, name -> mask over all rows.
         name: of the probe in tables.
@@ -145,25 +164,63 @@ def leave_groups_out(
         UserError: as `splits.check_rows` does.
     """
     everywhere = np.full(len(np.asarray(labels, object)), "train")
-    data, rows, notes = splits.check_rows(features, labels, groups, everywhere, tested=False)
+    data, rows, notes = splits.check_rows(
+        features, labels, groups, everywhere, measured=measured, tested=False
+    )
     used = rows.fit
-    chosen = []
-    predicted = np.full(len(data.y), -1)
-    baseline = np.full(len(data.y), -1)
+    if penalties is None:
+        penalties = heads.RIDGE if measured else (10.0, *heads.PENALTIES)
     head = ProbeHead("linear", scaling, tuple(penalties))
     count = folds
     if count is None:
         count = len(np.unique(data.groups[used]))
-    parts = list(splits.group_folds(used, data.groups, data.y, count))
-    for fit, out in tracked(parts, "folds"):
-        cut = Split(fit, fit[:0], out)
-        found = predict(data, cut, head, "honest", refit=True)
+    parts = splits.group_folds(used, data.groups, None if measured else data.y, count)
+    cuts = [Split(fit, fit[:0], out) for fit, out in parts]
+    if not measured:
+        notes += _single_group_note(data, used)
+    return probe_cuts(data, cuts, head, name=name, notes=notes, subsets=subsets)
+
+
+def probe_cuts(
+    data: LabelledFeatures,
+    cuts: Sequence[Split],
+    head: ProbeHead,
+    *,
+    name: str,
+    protocol: Protocol = "honest",
+    notes: tuple[str, ...] = (),
+    subsets: Subsets | None = None,
+) -> ProbeResult:
+    """Probe by several splits, which test every row at most once, and score all tested rows.
+
+    Args:
+        data: features, labels and groups of all rows.
+        cuts: the splits, each with a head of its own.
+        head: with the options to select from, in each split anew.
+        name: of the probe in tables.
+        protocol: how they are selected.
+        notes: what a reader should know.
+        subsets: parts that are scored too, name -> mask over all rows.
+    """
+    chosen = []
+    predicted = np.full(len(data.y), -1, data.y.dtype)
+    baseline = np.full(len(data.y), -1, data.y.dtype)
+    for cut in tracked(cuts, "folds"):
+        found = predict(data, cut, head, protocol, refit=True)
         chosen.append(found.selected.option)
-        predicted[out] = found.predicted
-        baseline[out] = constant_prediction(data, cut)
-    values, times = np.unique(chosen, return_counts=True)
-    listed = ", ".join(f"{value:g} ({n} x)" for value, n in zip(values, times, strict=True))
-    notes += (f"penalties of the folds: {listed}",)
-    median = Selection(0, float(np.median(chosen)), "cross-validation, median of the folds")
-    scored = Scored(Split(used, used[:0], used), predicted[used], baseline[used], median)
-    return result_of(name, "honest", data, scored, notes, subsets)
+        predicted[cut.test] = found.predicted
+        baseline[cut.test] = constant_prediction(data, cut)
+    selected = found.selected
+    if len(cuts) > 1:
+        values, times = np.unique(chosen, return_counts=True)
+        listed = ", ".join(f"{value:g} ({n} x)" for value, n in zip(values, times, strict=True))
+        what = "penalties" if head.name == "linear" else "numbers of neighbours"
+        notes += (f"{what} of the folds: {listed}",)
+        median = float(np.median(chosen))
+        selected = Selection(0, median, "cross-validation, median of the folds")
+    fitted = np.unique(np.concatenate([[*cut.fit, *cut.val] for cut in cuts]))
+    tested = np.sort(np.concatenate([cut.test for cut in cuts]))
+    scored = Scored(
+        Split(fitted, fitted[:0], tested), predicted[tested], baseline[tested], selected
+    )
+    return result_of(name, protocol, data, scored, notes, subsets)

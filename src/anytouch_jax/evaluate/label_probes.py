@@ -10,7 +10,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, sources
-from anytouch_jax.evaluate.label_rows import commonest_class, select_rows, subsets_of, task_of
+from anytouch_jax.evaluate.label_rows import constant_result, plan_rows, select_rows, task_of
 from anytouch_jax.evaluate.label_scores import features_of, probe_source
 from anytouch_jax.evaluate.options import LabelProbeOptions, Models, Paths
 from anytouch_jax.evaluate.results import ProbeResult, probe_json
@@ -52,13 +52,13 @@ def probe_label(
     rows = select_rows(table, task, options)
     encoders = sources.opened(models)
     gels = UnitGels(table)
-    rows = sources.with_gel(rows, gels, encoders)
-    subsets = subsets_of(table, task, rows, options.leave_out)
+    plan = plan_rows(table, task, sources.with_gel(rows, gels, encoders), options)
+    rows = plan.rows
     log(f"{len(rows.rows)} of {len(table)} rows take part")
     log(gels.report(rows.rows[:, 0]))
-    for note in rows.notes:
+    for note in plan.notes:
         log(note)
-    chance = commonest_class(rows, options)
+    chance = constant_result(plan)
     encoding = feature_cache.Encoding(
         pooling=options.pooling, join=options.join, folder=options.cache, gels=gels
     )
@@ -74,7 +74,7 @@ def probe_label(
     results = list[ProbeResult]()
     for source in probed:
         x = features_of(source, rows, options.frames)
-        found = probe_source(source, x, rows, options, subsets)
+        found = probe_source(source, x, plan, options)
         results += found
         log(f"probed {source.name}")
         if options.save is not None and source.encoder is not None and not source.is_control:

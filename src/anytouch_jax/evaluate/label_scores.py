@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from anytouch_jax.encoder.arrays import Array
-from anytouch_jax.evaluate import feature_cache, heads
-from anytouch_jax.evaluate.array_probes import leave_groups_out, probe_features
+from anytouch_jax.evaluate import feature_cache, heads, splits
+from anytouch_jax.evaluate.array_probes import leave_groups_out, probe_cuts, probe_features
 from anytouch_jax.evaluate.feature_cache import FeatureSource
+from anytouch_jax.evaluate.heads import ProbeHead
+from anytouch_jax.evaluate.label_rows import LabelPlan
 from anytouch_jax.evaluate.options import LabelProbeOptions
 from anytouch_jax.evaluate.results import ProbeResult
-from anytouch_jax.evaluate.scoring import Subsets
 from anytouch_jax.evaluate.tasks import TaskRows
 
 HEADS: dict[str, heads.HeadName] = {"linear": "linear", "kNN": "knn"}  # by their names in tables
@@ -22,34 +25,55 @@ def features_of(source: FeatureSource, rows: TaskRows, frames: int) -> Array:
 
 
 def probe_source(
-    source: FeatureSource,
-    x: Array,
-    rows: TaskRows,
-    options: LabelProbeOptions,
-    subsets: Subsets,
+    source: FeatureSource, x: Array, plan: LabelPlan, options: LabelProbeOptions
 ) -> list[ProbeResult]:
-    """Return the results of one source of features: of each head, the linear one first."""
-    if options.leave_out is not None:
-        name = f"{source.name}: linear, {options.leave_out} left out"
+    """Return the results of one source of features `x` (n, d), the linear head first."""
+    rows = plan.rows
+    if plan.left_out:
         return [
             leave_groups_out(
-                x, rows.labels, rows.groups, name=name, scaling=source.scaling, subsets=subsets
+                x,
+                rows.labels,
+                rows.groups,
+                measured=plan.measured,
+                scaling=source.scaling,
+                subsets=plan.subsets,
+                name=f"{source.name}: linear, {plan.left_out} left out",
             )
         ]
     results = []
-    for shown, name in HEADS.items():
-        scaling: heads.Scaling = source.scaling if name == "linear" else "column"
+    for shown, kind in HEADS.items():
+        # kNN compares by cosine, which no scaling of all features changes
+        head = ProbeHead(kind, source.scaling if kind == "linear" else "column")
+        name = f"{source.name}: {shown}"
+        if plan.cuts:
+            results.append(_between_sensors(x, plan, head, options, name))
+            continue
         results.append(
             probe_features(
                 x,
                 rows.labels,
                 rows.groups,
                 rows.split,
-                heads.ProbeHead(name, scaling),
+                head,
+                measured=plan.measured,
                 protocol=options.protocol,
                 seeds=options.seeds,
-                subsets=subsets,
-                name=f"{source.name}: {shown}",
+                subsets=plan.subsets,
+                name=name,
             )
         )
     return results
+
+
+def _between_sensors(
+    x: Array, plan: LabelPlan, head: ProbeHead, options: LabelProbeOptions, name: str
+) -> ProbeResult:
+    """Return the result of a head that is fitted on one sensor and tested on another."""
+    rows = plan.rows
+    everywhere = np.full(len(rows.labels), "train")
+    data, _, notes = splits.check_rows(
+        x, rows.labels, rows.groups, everywhere, measured=plan.measured, tested=False
+    )
+    notes += (f"fitted on {options.train_sensor}, tested on {options.test_sensor}",)
+    return probe_cuts(data, plan.cuts, head, name=name, protocol=options.protocol, notes=notes)

@@ -12,7 +12,7 @@ from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS
 from anytouch_jax.evaluate.feature_cache import FeatureSource, Order
 from anytouch_jax.evaluate.heads import GradientRecipe, HeadName
 from anytouch_jax.evaluate.statistics import Protocol
-from anytouch_jax.evaluate.tasks import Task
+from anytouch_jax.evaluate.tasks import Regression, Task
 
 Paths = Sequence[str | Path]
 Tasks = Sequence[str | Task] | Literal["all"]
@@ -34,6 +34,9 @@ class ProbeOptions:
             as the authors' released code does.
         pooling: class token, mean of the patch tokens, or both.
         join: how the segments of a clip longer than the model's are joined.
+        regression: whether the label is continuous. "auto" goes by its column: numbers with a
+            fraction are. Then a score is R2, with the mean absolute error and Spearman's
+            correlation beside it.
     """
 
     features: Paths = ()
@@ -44,6 +47,7 @@ class ProbeOptions:
     protocol: Protocol = "honest"
     pooling: Pooling = "class"
     join: Join = "mean"
+    regression: Regression = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +61,8 @@ class LabelProbeOptions(ProbeOptions):
         leave_out: column of which every value is held out in turn, instead of the splits.
         where: keep rows whose column is above a number.
         sensor: keep rows of this sensor.
+        train_sensor: fit on rows of this sensor, and test on rows of `test_sensor`.
+        test_sensor: of the same classes.
         frames: of a touch: 1 for stills, 3 or more for the clip that ends at each row.
         save: file for the linear head of the only model, with its calibration.
         coverage: fraction of touches whose set of classes holds the true one, of a saved head.
@@ -68,6 +74,8 @@ class LabelProbeOptions(ProbeOptions):
     leave_out: str | None = None
     where: tuple[str, float] | None = None
     sensor: str | None = None
+    train_sensor: str | None = None
+    test_sensor: str | None = None
     frames: int = 1
     save: Path | None = None
     coverage: float = COVERAGE

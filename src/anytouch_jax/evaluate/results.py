@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import Array, Protocol
+from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
 from anytouch_jax.evaluate.tables import interval_text, markdown_table, plain, share_text
 from anytouch_jax.shown import shown_short
 
@@ -28,7 +28,16 @@ _OF_CLASSES = (
     "classes",
     "parts",
 )
-_OF_NUMBERS = ("r2", "mae", "mae_low", "mae_high", "baseline_mae")
+_OF_NUMBERS = (
+    "r2",
+    "mae",
+    "mae_low",
+    "mae_high",
+    "baseline_mae",
+    "spearman",
+    "spearman_low",
+    "spearman_high",
+)
 
 
 @dataclass(frozen=True)
@@ -45,14 +54,20 @@ class SubsetResult:
 @shown_short
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The test rows, whether each was right, and its group.
+    """The test rows of a result, one by one.
 
-    `fitted`: the linear model and the names of its classes.
+    Attributes:
+        rows: places (n,) of the rows.
+        correct: whether each was right, bool (n,); empty for a continuous label.
+        groups: names (n,).
+        sums: by which they are scored.
+        fitted: the linear model and the names of its classes.
     """
 
     rows: Array
     correct: Array
     groups: Array
+    sums: GroupSums
     fitted: tuple[LinearModel | None, Array] | None = None
 
 
@@ -86,6 +101,9 @@ class ProbeResult:
         mae_low: lower end of its 95 % interval.
         mae_high: upper end.
         baseline_mae: mean absolute error of train's mean.
+        spearman: rank correlation of predictions and labels, None where one of them is constant.
+        spearman_low: lower end of its 95 % interval.
+        spearman_high: upper end.
         notes: what a reader of the score should know.
         outcome: the test rows one by one; not in JSON.
     """
@@ -112,6 +130,9 @@ class ProbeResult:
     mae_low: float | None = None
     mae_high: float | None = None
     baseline_mae: float = NAN
+    spearman: float | None = None
+    spearman_low: float | None = None
+    spearman_high: float | None = None
     notes: tuple[str, ...] = ()
     outcome: Outcome | None = field(default=None, repr=False, compare=False)
 
@@ -186,6 +207,9 @@ def _result_cells(result: ProbeResult) -> dict[str, str]:
             "mae": result.mae,
             "unit": "",
             "chance_mae": result.baseline_mae,
+            "spearman": result.spearman,
+            "spearman_low": result.spearman_low,
+            "spearman_high": result.spearman_high,
             "train": result.n_train,
             "test": result.n_test,
             "groups": result.test_groups,
@@ -224,11 +248,13 @@ def _part_cells(result: ProbeResult) -> list[dict[str, str]]:
 
 def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
     """Return the cells of a result of `probe_tasks` that every table has."""
+    more = {}
     if row["metric"] == "r2":
         mae = f"{row['mae']:.3g} {row['unit']}".strip()
         score = f"R2 {row['mean']:.3f}, {mae}"
         interval = interval_text(row["low"], row["high"], 1.0, 3)
         chance = f"{row['chance_mae']:.3g} {row['unit']}".strip()
+        more["Spearman"] = _rank_text(row)
     else:
         score = share_text(row["mean"])
         interval = interval_text(row["low"], row["high"])
@@ -239,4 +265,15 @@ def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
         "chance": chance,
         "train": str(row["train"]),
         "test (groups)": f"{row['test']} ({row['groups']})",
+        **more,
     }
+
+
+def _rank_text(row: Mapping[str, Any]) -> str:
+    """Return Spearman's correlation with its interval, "-" for constant predictions."""
+    if row.get("spearman") is None:
+        return "-"
+    text = f"{row['spearman']:.3f}"
+    if row["spearman_low"] is None:
+        return text
+    return f"{text} ({interval_text(row['spearman_low'], row['spearman_high'], 1.0, 3)})"

@@ -25,7 +25,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import Array, mean_interval
+from anytouch_jax.evaluate.statistics import Array, fraction_interval, mean_interval
 from anytouch_jax.evaluate.tasks import best_rows
 
 Metric = Literal["cosine", "euclidean"]
@@ -277,8 +277,8 @@ def _summary(
     nearness = None
     if near:
         nearness = sum(value * count for value, count in near) / sum(count for _, count in near)
-    low, high = mean_interval(scores.top1, scores.groups)
-    low5, high5 = mean_interval(scores.top5, scores.groups)
+    low, high = fraction_interval(scores.top1, scores.groups)
+    low5, high5 = fraction_interval(scores.top5, scores.groups)
     fields: dict[str, Any] = {
         "query_sensor": ALL,
         "gallery_sensor": ALL,
@@ -618,7 +618,7 @@ def score_matching(
         codes = [
             sensor[anchor] * (1 + sensor.max()) + sensor[other] for other in (positive, negative)
         ]
-        low, high = mean_interval(correct, objects[anchor])
+        low, high = fraction_interval(correct, objects[anchor])
         labels = np.repeat([1, 0], [len(right), len(wrong)])
         auc = float(roc_auc_score(labels, np.concatenate([right, wrong])))
         alone = best_rule(codes[0], codes[1], anchor)

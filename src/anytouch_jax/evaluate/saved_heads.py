@@ -26,14 +26,22 @@ def save_probed(
     gels: UnitGels,
     log: Log,
 ) -> None:
-    """Write the linear head that a result was scored with, calibrated on rows it has not seen."""
+    """Write the linear head that a result was scored with, calibrated on rows it has not seen.
+
+    Where groups were left out in turn it is fitted on all rows.
+    """
     path = options.save
     encoder = source.encoder
     if path is None or encoder is None or result.outcome is None:
         return
-    model, names = result.outcome.fitted or (None, np.array([]))
+    penalty = result.penalty or 1.0
+    model = None
+    if result.outcome.fitted is not None:
+        model, names = result.outcome.fitted
     if model is None:
-        return
+        # Groups were left out in turn, each for another head: the one to keep has all rows.
+        model, names, penalty = fit_all(x, rows)
+        log("The saved head is fitted on all rows")
     head = heads.linear_head(
         model,
         names,
@@ -45,8 +53,20 @@ def save_probed(
     if encoder.subtracts:
         head = replace(head, gels=gels.pictures(rows.rows[:, 0]))
     limits = {"coverage": options.coverage, "false_alarms": options.false_alarms}
-    save_head(path, calibrated(head, x, rows, result.penalty or 1.0, log, **limits))
+    save_head(path, calibrated(head, x, rows, penalty, log, **limits))
     log(f"{path}: the linear head")
+
+
+def fit_all(x: Array, rows: TaskRows) -> tuple[heads.LinearModel, Array, float]:
+    """Return a linear head of all rows, the names of its classes, and its penalty.
+
+    The penalty is chosen by cross-validation over groups.
+    """
+    everywhere = np.full(len(rows.split), "train")
+    data, cut, _ = splits.check_rows(x, rows.labels, rows.groups, everywhere, tested=False)
+    penalty = splits.select_option(heads.ProbeHead(), data, cut, "honest").option
+    (model,) = data.fit(heads.ProbeHead(options=(penalty,)), cut.fit).models
+    return model, data.names, penalty
 
 
 def calibrated(

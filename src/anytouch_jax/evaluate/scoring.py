@@ -67,7 +67,8 @@ def score_sums(data: LabelledFeatures, predicted: Array, tested: Array) -> Group
     groups = data.groups[tested]
     if len(data.names):
         return statistics.classification_sums(predicted == truth, groups)
-    return statistics.regression_sums(predicted - truth, truth - truth.mean(), groups)
+    centred = truth - truth.mean()
+    return statistics.regression_sums(predicted - truth, centred, groups, predicted)
 
 
 class Scored(NamedTuple):
@@ -104,19 +105,19 @@ def result_of(
     truth = data.y[tested]
     groups = data.groups[tested]
     measured = not len(data.names)
-    scores = statistics.scores(
-        [score_sums(data, scored.predicted, tested)],
-        [score_sums(data, scored.constant, tested)],
-        measured,
-    )
+    sums = score_sums(data, scored.predicted, tested)
+    constant = score_sums(data, scored.constant, tested)
+    scores = statistics.scores([sums], [constant], measured)
     option = None
     chosen_on = ""
     if scored.selected is not None:
         option = scored.selected.option
         chosen_on = scored.selected.chosen_on
     more: dict[str, Any] = {}
+    correct = np.zeros(0, bool)
     if measured:
-        more = {key: scores[key] for key in ("mae", "mae_low", "mae_high")}
+        names = ("mae", "mae_low", "mae_high", "spearman", "spearman_low", "spearman_high")
+        more = {key: scores[key] for key in names}
         more |= {"r2": scores["mean"], "baseline_mae": scores["chance_mae"]}
     else:
         correct = scored.predicted == truth
@@ -128,7 +129,6 @@ def result_of(
             "parts": _parts(subsets or {}, tested, correct, groups),
             "balanced_accuracy": float(np.mean(by_class)),
             "classes": tuple(map(str, data.names[learned])),
-            "outcome": Outcome(tested, correct, groups),
         }
         if scores["low"] is None:
             notes = (*notes, "test has one group only: no interval")
@@ -143,6 +143,7 @@ def result_of(
         n_test=len(tested),
         test_groups=len(np.unique(groups)),
         notes=notes,
+        outcome=Outcome(tested, correct, groups, sums),
         **more,
     )
 
@@ -154,7 +155,7 @@ def _parts(
     parts = []
     for part, mask in subsets.items():
         kept = np.asarray(mask, bool)[tested]
-        low, high = statistics.mean_interval(correct[kept], groups[kept])
+        low, high = statistics.fraction_interval(correct[kept], groups[kept])
         accuracy = float(correct[kept].mean()) if kept.any() else NAN
         parts.append(SubsetResult(part, accuracy, low, high, int(kept.sum())))
     return tuple(parts)

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import rankdata
 
 Array = npt.NDArray[Any]
 Protocol = Literal["honest", "published"]
@@ -46,12 +47,34 @@ def classification_sums(correct: Array, groups: Array) -> GroupSums:
     return GroupSums(groups, np.stack([values, np.ones(len(correct))], axis=1))
 
 
-def regression_sums(error: Array, truth: Array, groups: Array) -> GroupSums:
-    """Return the sums of `_r2_of` and `_mae_of`.
+def regression_sums(
+    error: Array, truth: Array, groups: Array, predicted: Array | None = None
+) -> GroupSums:
+    """Return the sums of `_r2_of`, `_mae_of` and `_spearman_of`.
 
-    `truth` is best centred, because the square of an offset hides the spread.
+    Args:
+        error: (n,) of the predictions.
+        truth: (n,), best centred, because the square of an offset hides the spread.
+        groups: (n,).
+        predicted: (n,), whose ranks count; by default the truth plus the error.
     """
-    columns = [error**2, np.abs(error), truth, truth**2, np.ones(len(error))]
+    if predicted is None:
+        predicted = truth + error
+    # Ranks among all rows, once: ranks of every draw would cost a sort each, and differ little.
+    own_rank = rankdata(predicted) / len(error) - 0.5
+    true_rank = rankdata(truth) / len(error) - 0.5
+    columns = [
+        error**2,
+        np.abs(error),
+        truth,
+        truth**2,
+        np.ones(len(error)),
+        own_rank,
+        true_rank,
+        own_rank**2,
+        true_rank**2,
+        own_rank * true_rank,
+    ]
     return GroupSums(groups, np.stack(columns, axis=1))
 
 
@@ -73,6 +96,19 @@ def _r2_of(sums: Array) -> Array:
 def _mae_of(sums: Array) -> Array:
     """Return the mean absolute error from sums as `_r2_of` reads them."""
     return np.asarray(sums[..., 1] / sums[..., 4])
+
+
+def _spearman_of(sums: Array) -> Array:
+    """Return Spearman's rank correlation, NaN for equal labels or equal predictions.
+
+    The sums from the fifth on are (..., [rows, rank, true rank, squares of both, product]).
+    """
+    rows = sums[..., 4]
+    own = sums[..., 7] - sums[..., 5] ** 2 / rows
+    true = sums[..., 8] - sums[..., 6] ** 2 / rows
+    both = sums[..., 9] - sums[..., 5] * sums[..., 6] / rows
+    has_spread = (own > 1e-9) & (true > 1e-9)
+    return np.asarray(both / np.sqrt(np.where(has_spread, own * true, np.nan)))
 
 
 def _metric(measured: bool) -> Metric:
@@ -149,6 +185,32 @@ def _draws(count: int, stream: int) -> list[Array]:
     return blocks
 
 
+def fraction_interval(values: Array, groups: Array) -> Interval:
+    """Return the 95 % interval of a fraction, the mean of `values` (n,) in 0..1.
+
+    It is the bootstrap over `groups` (n,). Where every group has the same value, 0 or 1, each draw
+    has it too, and the interval would be a point: sixty recordings that are all right would promise
+    100.0 to 100.0 %. There it is the exact one of Clopper and Pearson (1934), a group a trial.
+
+    Use it for accuracies and recalls. A difference has `paired_gain` or `mean_interval`.
+    """
+    return _fraction_interval([classification_sums(values, groups)])
+
+
+def _fraction_interval(runs: Sequence[GroupSums]) -> Interval:
+    """Return the interval of `fraction_interval` for several runs, the seeds of a probe."""
+    low, high = _bootstrap_interval(runs, _mean_of)
+    if low is None or low != high or low not in (0.0, 1.0):
+        return low, high
+    groups = len(np.unique(np.concatenate([run.groups for run in runs])))
+    # All groups right: the fraction is above p, unless 2.5 % of p ** groups happened. Runs test the
+    # same groups, so more of them are no more trials.
+    least = 0.025 ** (1 / groups)
+    if low == 1.0:
+        return least, 1.0
+    return 0.0, 1.0 - least
+
+
 def mean_interval(values: Array, groups: Array) -> Interval:
     """Return the 95 % interval of the mean of `values` (n,), by a bootstrap over `groups` (n,)."""
     return _bootstrap_interval([classification_sums(values, groups)], _mean_of)
@@ -157,7 +219,9 @@ def mean_interval(values: Array, groups: Array) -> Interval:
 def scores(
     runs: Sequence[GroupSums], baselines: Sequence[GroupSums], measured: bool
 ) -> dict[str, Any]:
-    """Return mean, interval, values and chance of accuracy (R2 and MAE if `measured`).
+    """Return mean, interval, values and chance of accuracy.
+
+    If `measured` they are of R2, with the mean absolute error and Spearman's correlation beside it.
 
     There is a run, and a baseline that predicts a constant, for each seed.
     """
@@ -166,7 +230,7 @@ def scores(
         return [float(of(run.sums.sum(0))) for run in several]
 
     metric = _metric(measured)
-    low, high = _bootstrap_interval(runs, metric)
+    low, high = _bootstrap_interval(runs, metric) if measured else _fraction_interval(runs)
     result: dict[str, Any] = {
         "metric": "r2" if measured else "accuracy",
         "mean": float(np.mean(values(metric, runs))),
@@ -177,10 +241,15 @@ def scores(
     }
     if measured:
         mae_low, mae_high = _bootstrap_interval(runs, _mae_of)
+        rank_low, rank_high = _bootstrap_interval(runs, _spearman_of)
+        rank = float(np.mean(values(_spearman_of, runs)))
         result |= {
             "mae": float(np.mean(values(_mae_of, runs))),
             "mae_low": mae_low,
             "mae_high": mae_high,
             "chance_mae": float(np.mean(values(_mae_of, baselines))),
+            "spearman": rank if np.isfinite(rank) else None,
+            "spearman_low": rank_low,
+            "spearman_high": rank_high,
         }
     return result

@@ -53,7 +53,7 @@ def plan_tasks(
             "The manifest has no label of any task. `anytouch probe label` takes any column."
         )
     errors = []
-    for task in [tasks.find_named(tasks.TASKS, name, "task") for name in names]:
+    for task in [_find(table, name) for name in names]:
         try:
             plans.append(_plan(table, task, options, among))
         except UserError as error:
@@ -64,6 +64,20 @@ def plan_tasks(
     for name, reason in left_out.items():
         log(f"{name}: not probed ({reason})")
     return plans, left_out
+
+
+def _find(table: Manifest, name: str | Task) -> Task:
+    """Return a task by its name, or that of a label column of the manifest. Raises UserError."""
+    columns = table.table.column_names
+    is_column = isinstance(name, str) and (name in columns or f"label.{name}" in columns)
+    if name not in tasks.TASKS and is_column:
+        return tasks.label_task(table, str(name))
+    if isinstance(name, str) and name not in tasks.TASKS:
+        raise UserError(
+            f"There is no task {name!r}. Choose among {', '.join(tasks.TASKS)}, or name a label "
+            "column of the manifest."
+        )
+    return tasks.find_named(tasks.TASKS, name, "task")
 
 
 def _plan(
@@ -80,6 +94,7 @@ def _plan(
         if count is not None and count < 1:
             raise UserError(f"{name} must be at least 1, not {count}.")
     sides = options.sides
+    task = tasks.with_kind(table, task, options.regression)
     rows = tasks.select(table, task, options.frames)
     splits.assign_roles(task, rows, sides)  # raises for sensors that no row has, before `among`
     rows = among(rows)

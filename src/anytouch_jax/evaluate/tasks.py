@@ -24,6 +24,8 @@ from anytouch_jax.evaluate.statistics import Array
 
 T = TypeVar("T")
 Which = Literal["all", "press", "contact", "moving"]
+# whether a label is continuous: decided by its column, or given
+Regression = Literal["auto", "yes", "no"]
 
 # newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
 FORCE = 0.05
@@ -248,6 +250,34 @@ def _group_columns(table: Manifest, label: str) -> list[str]:
     return columns
 
 
+def with_kind(table: Manifest, task: Task, regression: Regression = "auto") -> Task:
+    """Return a task of classes as a regression if its label is continuous.
+
+    By "auto" it is one if the column has a number with a fraction: a stiffness of 10.25 is no
+    class. Whole numbers may be names of classes (object 17), so they are a regression by "yes"
+    alone. Raises UserError for "yes" on text.
+    """
+    fixed = task.kind == "regression" or task.above is not None or bool(task.classes)
+    if fixed or task.label not in table.table.column_names or regression == "no":
+        return task
+    kind = table.column(task.label).type
+    is_number = pa.types.is_floating(kind) or pa.types.is_integer(kind)
+    if regression == "yes":
+        if not is_number:
+            raise UserError(
+                f"Column {task.label!r} contains text. A regression needs numbers. Leave out "
+                "--regression yes."
+            )
+        return replace(task, kind="regression")
+    if not pa.types.is_floating(kind):
+        return task
+    values = table.number_column(task.label)
+    values = values[np.isfinite(values)]
+    if (values != np.round(values)).any():
+        return replace(task, kind="regression")
+    return task
+
+
 def find_column(table: Manifest, name: str) -> str:
     """Return `label.<name>` or else `name`, whichever the manifest has. Raises UserError."""
     columns = table.table.column_names
@@ -382,7 +412,8 @@ def label_text(value: Any, source: str = "The label") -> str:
         return str(value)
     if not np.isfinite(value) or value != int(value):
         raise UserError(
-            f"{source} contains {value:g}, a measured quantity, not a class. Probe it as a number."
+            f"{source} contains {value:g}, a measured quantity, not a class. Probe it with "
+            "--regression yes, or in Python with measured=True."
         )
     return str(int(value))
 

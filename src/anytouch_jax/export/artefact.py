@@ -20,11 +20,12 @@ import jax
 import numpy as np
 from jax import export as jax_export
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import UNIVERSAL, parse_json
 from anytouch_jax.data.images import decode_bytes
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import Engine
-from anytouch_jax.encoder.field_outputs import FieldOutput
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.export import engines
 from anytouch_jax.shown import described
@@ -141,10 +142,10 @@ class Exported:
 
     def _row(self, name: str) -> int:
         sensors: dict[str, int] = self.about["sensors"]
+        name = resolve_sensor(name).name
         if name not in sensors:
             raise UserError(
-                f"sensor {str(name)!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any "
-                "other"
+                f"sensor {name!r} is not one of {', '.join(sensors)}; {UNIVERSAL} serves any other"
             )
         return sensors[name]
 

@@ -15,10 +15,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import UNIVERSAL, from_json
 from anytouch_jax.encoder.arrays import METADATA, Engine, Join, Pooling, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.encoder.measured import missing
 from anytouch_jax.errors import UserError
 from anytouch_jax.export.export import Exported, load

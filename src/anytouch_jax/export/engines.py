@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.encoder.arrays import Engine as Engine
 from anytouch_jax.encoder.arrays import EngineChoice as EngineChoice
-from anytouch_jax.encoder.field_outputs import FieldOutput
 from anytouch_jax.errors import UserError
 from anytouch_jax.export.graph import BLOCK
 from anytouch_jax.export.graph import touch_graph as touch_graph

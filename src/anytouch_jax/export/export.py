@@ -18,11 +18,12 @@ import jax
 import numpy as np
 from jax import export as jax_export
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import to_json
 from anytouch_jax.data.images import encode
+from anytouch_jax.doors import HEADS, enter
 from anytouch_jax.encoder import arrays
 from anytouch_jax.encoder.arrays import METADATA, Array, Join, Params, Pooling
-from anytouch_jax.encoder.field_outputs import LENGTH, FieldOutput
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.export import engines
 from anytouch_jax.export.artefact import FORMAT, describes, platform_here
@@ -30,6 +31,7 @@ from anytouch_jax.export.artefact import Exported as Exported
 from anytouch_jax.export.artefact import load as load
 from anytouch_jax.export.artefact import read_checked as read_checked
 from anytouch_jax.export.engines import Engine
+from anytouch_jax.fields.outputs import LENGTH
 from anytouch_jax.files import atomic_write
 
 if TYPE_CHECKING:
@@ -48,6 +50,17 @@ features = jax.jit(run.call)(frames, sensor)  # {shape}, int32 (B,)""",
     "onnx": """import onnxruntime
 run = onnxruntime.InferenceSession({name!r}).run
 features = run(["features"], {{"frames": frames, "sensor": sensor}})[0]  # {shape}, int32 (B,)""",
+    "fields": """import numpy
+import onnxruntime
+run = onnxruntime.InferenceSession({name!r}).run
+# Of {sensor}: the mm that the width of its picture shows, the kPa of its gel, and the logarithm of
+# the height over the width of its picture.
+width_mm, modulus_kpa, aspect = {width_mm}, {modulus_kpa}, {aspect}
+given = {{"frames": frames, "sensor": sensor}}  # {shape}, int32 (B,)
+given["aspect"] = numpy.full(len(frames), aspect, numpy.float32)
+features, depth, force = run(["features", "depth", "force"], given)
+depth = width_mm * depth  # mm
+force = modulus_kpa * width_mm**2 / 1000 * force  # N along x, along y and into the gel""",
 }
 
 
@@ -230,10 +243,14 @@ def _description(
         about["config"] = json.loads(to_json(encoder.config))
         about["weights"] = encoder.fingerprint
         about["universal_drawn"] = encoder.universal_drawn
+    example: dict[str, Any] = {}
     if settings.fields:
+        units = enter(HEADS["fields units"])(encoder.metadata, model.sensors)
+        example = units.pop("example")
         about["fields"] = {
             "outputs": list(FieldOutput._fields),
             "calibration": encoder.metadata.get(METADATA, {}),
+            **units,
         }
         about["aspect"] = (
             "float32 (B,): the logarithm of the height over the width that the picture shows"
@@ -243,6 +260,7 @@ def _description(
     blank = encoder.blank
     shape = f"{blank.dtype} (B, {settings.frames}, {', '.join(map(str, blank.shape))})"
     pictures = settings.gels or {}
+    text = _EXAMPLE["fields" if settings.fields else settings.form]
     return about | {
         "source": encoder.source,
         "output": f"features: float32 (B, {made.width}), not normalised",
@@ -258,7 +276,7 @@ def _description(
         "trained_sensors": None if trained is None else list(trained),
         "worst_difference": made.worst,
         "gels": {name: b64encode(encode(gel)).decode() for name, gel in pictures.items()},
-        "example": _EXAMPLE[settings.form].format(name=path.name, shape=shape),
+        "example": text.format(name=path.name, shape=shape, **example),
     }
 
 

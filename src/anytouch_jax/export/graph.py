@@ -16,16 +16,9 @@ import numpy as np
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
 from anytouch_jax.encoder.arrays import Pooling
-from anytouch_jax.encoder.field_outputs import (
-    FORCE,
-    HALF,
-    LENGTH,
-    STATES,
-    STRESS,
-    TORQUE,
-)
 from anytouch_jax.errors import UserError
 from anytouch_jax.export.packages import needed
+from anytouch_jax.fields.outputs import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE
 
 OPSET = 20  # the first with Gelu
 BLOCK = "block"  # start of the names of nodes in blocks

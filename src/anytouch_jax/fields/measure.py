@@ -14,18 +14,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.data.background.dots import DotFlow
 from anytouch_jax.data.background.layout import known_gels as known_gels
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import METADATA, Array, Log
-from anytouch_jax.encoder.field_outputs import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.encoder.measured import Fields as Fields
 from anytouch_jax.encoder.measured import missing as missing
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields.faults import faults_of as faults_of
+from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
 from anytouch_jax.fields.pictures import depth_levels as depth_levels
 from anytouch_jax.fields.pictures import overlay as overlay
 from anytouch_jax.fields.pictures import write_surface as write_surface
+from anytouch_jax.sensors import RECORDS
 
 
 class KnownGel(NamedTuple):
@@ -37,12 +40,9 @@ class KnownGel(NamedTuple):
 
 
 GELS = {
-    "gelsight": KnownGel(18.88, 0.75, 150),
-    "gelsight_mini": KnownGel(18.88, 0.75, 180),
-    "gelslim": KnownGel(20.0, 0.75, 220),
-    "digit": KnownGel(14.25, 4 / 3, 120),
-    "9dtact": KnownGel(24.0, 0.75, 120),
-    "duragel": KnownGel(18.7, 0.75, 350),
+    name: KnownGel(record.size_mm[1], record.proportions, record.modulus_kpa)
+    for name, record in RECORDS.items()
+    if record.size_mm and record.proportions and record.modulus_kpa
 }
 # kPa of an unknown gel, and its standard deviation as a fraction of it.
 OTHER_MODULUS = 170.0
@@ -81,7 +81,7 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
 
     Args:
         metadata: of the weights, which may hold factors on deviations and moduli of sensors.
-        sensor: its name. GELS knows the width of some.
+        sensor: its name, or the folder of a fitted one. GELS knows the width of some.
         width_mm: the mm that the picture's width shows, if it is another one.
 
     Raises:
@@ -100,15 +100,19 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
         raise UserError(
             "the calibration of fields in the weights is damaged; load the weights again"
         ) from None
-    gel = GELS.get(sensor)
+    word = resolve_sensor(sensor)
+    gel = GELS.get(word.name)
+    # Nobody has measured the stiffness of an own gel: sensor.json holds a usual one.
+    spread = OTHER_SPREAD if gel is None and word.name not in moduli else 0.0
+    if word.width_mm is not None and word.shape is not None:
+        gel = KnownGel(word.width_mm, word.shape, word.modulus_kpa or OTHER_MODULUS)
     if gel is None:
-        spread = 0.0 if sensor in moduli else OTHER_SPREAD
-        modulus = moduli.get(sensor, OTHER_MODULUS)
+        modulus = moduli.get(word.name, OTHER_MODULUS)
         return Scale(width_mm, modulus, spread, shape=None, factors=factors)
     # Another width is that of a cropped picture, whose shape nobody knows.
     shape = gel.shape if width_mm is None else None
-    modulus = moduli.get(sensor, gel.modulus)
-    return Scale(width_mm or gel.width, modulus, spread=0.0, shape=shape, factors=factors)
+    modulus = moduli.get(word.name, gel.modulus)
+    return Scale(width_mm or gel.width, modulus, spread, shape=shape, factors=factors)
 
 
 _ARRAYS = tuple(
@@ -158,7 +162,7 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
     """Return the output of the network in mm and N.
 
     Args:
-        out: arrays (B, ...), see `encoder.field_outputs.FieldOutput`.
+        out: arrays (B, ...), see `batch.FieldOutput`.
         scale: that of the sensor.
         shape: the picture's height over its width.
         faults: sentences. With some, no deviation is below the value itself.
@@ -173,15 +177,17 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
     area = cell * inside.sum((1, 2))
     # A pixel that is in contact with probability p adds its area times the smaller of p and 1 - p.
     area_std = cell * np.minimum(contact, 1 - contact).sum((1, 2))
-    # The length of the rim of a round contact of this area, NaN without contact.
-    rim = np.sqrt(4 * np.pi * np.where(area > 0, area, np.nan))
+    # 1 with contact, and NaN without: where nothing touches, nothing slips and has a centre.
+    touched = np.where(area > 0, 1, np.nan)
+    # The length of the rim of a round contact of this area.
+    rim = np.sqrt(4 * np.pi * area * touched)
     values: dict[str, Any] = {
         "depth": mm * out.depth,
         "depth_std": mm * LENGTH * factors["depth"] * _deviation(out.depth_log),
         "shear": mm * out.shear,
         "shear_std": mm * LENGTH * factors["shear"] * _deviation(out.shear_log),
-        "slip": _logistic(out.slip),
-        "slip_std": np.minimum(factors["slip"] * _deviation(out.slip_log), 1),
+        "slip": touched * _logistic(out.slip),
+        "slip_std": touched * np.minimum(factors["slip"] * _deviation(out.slip_log), 1),
         "area": area,
         "area_std": area_std,
         "centre": mm * _centre(inside, out.pressure, area, shape),
@@ -353,11 +359,12 @@ def measure_of(
 
     Args:
         metadata: those of the weights, see `scale_of`.
-        sensor: its name.
+        sensor: its name, or the folder of a fitted one.
         background: the untouched gel RGB u8 (h, w, 3), as the camera takes it.
         width_mm: the mm that the picture's width shows, see `scale_of`.
         log: takes a sentence on each fault of the first frame.
         rotate: degrees by which frames are turned.
         flip: how they are mirrored after that.
     """
-    return Measure(scale_of(metadata, sensor, width_mm), sensor, background, log, rotate, flip)
+    scale = scale_of(metadata, sensor, width_mm)
+    return Measure(scale, resolve_sensor(sensor).name, background, log, rotate, flip)

@@ -1,9 +1,16 @@
-"""Outputs of the decoder of fields, under the name that the decoder knows them by."""
+"""Typical sizes of the outputs of the decoder of fields, which are free of scale.
 
-from anytouch_jax.encoder.field_outputs import FORCE as FORCE
-from anytouch_jax.encoder.field_outputs import HALF as HALF
-from anytouch_jax.encoder.field_outputs import LENGTH as LENGTH
-from anytouch_jax.encoder.field_outputs import STATES as STATES
-from anytouch_jax.encoder.field_outputs import STRESS as STRESS
-from anytouch_jax.encoder.field_outputs import TORQUE as TORQUE
-from anytouch_jax.encoder.field_outputs import FieldOutput as FieldOutput
+The outputs themselves are `batch.FieldOutput`, because the core passes them on.
+"""
+
+from __future__ import annotations
+
+from anytouch_jax.batch import FieldOutput as FieldOutput
+
+STATES = 3  # hidden states of the encoder that are read
+HALF = 2  # pixels of the picture for one of the fields, along each axis
+# The last layer works with numbers of order one, and these bring them to the size of a usual touch.
+LENGTH = 0.02
+STRESS = 0.02
+FORCE = 0.01
+TORQUE = 0.002

@@ -8,14 +8,18 @@ import cv2
 import numpy as np
 
 from anytouch_jax.encoder.arrays import Array
-from anytouch_jax.encoder.field_outputs import LENGTH
 from anytouch_jax.encoder.measured import Fields
+from anytouch_jax.fields.outputs import LENGTH
 from anytouch_jax.files import atomic_write
 
 _EDGE = 4  # pixels, along each side, of one vertex of a surface
 _ARROWS = 14  # along the shorter side
 _LONGER = 4  # times its length is how a shear is drawn
 _OPAQUE = np.float32(0.7)  # the most that the colours of depth cover a frame
+_ABOUT = (
+    "comment unit: mm (widths of the picture, if its width in mm is not known)\n"
+    "comment frame: right-handed, x right, y down, z away from the camera (REP 103)\n"
+)
 _GREEN = (120, 255, 120)
 _WHITE = (255, 255, 255)
 
@@ -80,15 +84,15 @@ def _line(one: Fields) -> str:
 def write_surface(path: Path, frame: Array, measured: Fields, row: int = 0) -> None:
     """Write the surface of the gel as a PLY mesh in mm, coloured by the frame.
 
-    Depth goes down along z.
+    Its frame is the right-handed one of `Fields.points`, which a comment in the file says. Faces
+    turn their front away from the camera, to where the object is.
     """
     height = max(frame.shape[0] // _EDGE, 2)
     width = max(frame.shape[1] // _EDGE, 2)
     colours = ("red", "green", "blue")
     kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in colours]
     points = np.empty((height, width), kinds)
-    # y and z up, as in space
-    at = measured[row].at(height, width).points()[0] * (1, -1, -1)
+    at = measured[row].at(height, width).points()[0]
     for place, axis in enumerate("xyz"):
         points[axis] = at[..., place]
     small = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
@@ -99,20 +103,23 @@ def write_surface(path: Path, frame: Array, measured: Fields, row: int = 0) -> N
         f"property {'float' if kind == '<f4' else 'uchar'} {name}\n" for name, kind in kinds
     )
     header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {points.size}\n{properties}"
+        f"ply\nformat binary_little_endian 1.0\n{_ABOUT}element vertex {points.size}\n{properties}"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     atomic_write(path, header.encode() + points.tobytes() + faces.tobytes())
 
 
 def _triangles(height: int, width: int) -> Array:
-    """Return the faces of a grid of vertices, two triangles for each of its cells."""
+    """Return the faces of a grid of vertices, two triangles for each of its cells.
+
+    Their corners turn from x (right) to y (down), so their normals point along z.
+    """
     grid = np.arange(height * width, dtype="<i4").reshape(height, width)
     top_left = grid[:-1, :-1]
     top_right = grid[:-1, 1:]
     low_left = grid[1:, :-1]
     low_right = grid[1:, 1:]
-    corners = [top_left, low_left, top_right, top_right, low_left, low_right]
+    corners = [top_left, top_right, low_left, top_right, low_right, low_left]
     triangles = np.stack(corners, -1).reshape(-1, 3)
     faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"] = 3

@@ -18,6 +18,7 @@ import cv2
 
 from anytouch_jax.data.images import QUIET, open_video
 from anytouch_jax.errors import UserError
+from anytouch_jax.live.freshness import measure_rate
 
 SYSTEM = Path("/sys/class/video4linux")
 DEVICES = Path("/dev")
@@ -95,6 +96,27 @@ def list_cameras() -> list[Camera]:
             serial = _text(device / "serial") or _text(device.parent / "serial")
             found.append(Camera(int(digits), _text(place / "name") or place.name, serial, modes))
     return sorted(found)
+
+
+def describe_cameras() -> list[str]:
+    """Return lines on each connected camera: its name, its formats, and what it gives now.
+
+    It is read for a second, because many give fewer frames than they say.
+    """
+    lines = []
+    for camera in list_cameras():
+        lines += camera.lines()
+        with QUIET:
+            source = cv2.VideoCapture(camera.number)
+        if not source.isOpened():
+            lines.append("  it cannot be opened now: another program may use it")
+            continue
+        rate = measure_rate(source)
+        source.release()
+        lines.append(f"  gives {rate}")
+        if rate.warning():
+            lines.append(f"  {rate.warning()}")
+    return lines
 
 
 def camera_of(source: str | Path) -> int | str | None:

@@ -18,6 +18,7 @@ from anytouch_jax.data.images import QUIET, frame_time, to_rgb
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.encoder.base import Preprocess
 from anytouch_jax.errors import UserError
+from anytouch_jax.live.freshness import WINDOW, Rate, capture_age, nominal_rate
 from anytouch_jax.shown import shown_short
 
 RETRY = 2.0  # seconds in which a missed read of a camera is tried again
@@ -60,6 +61,8 @@ class Frame(NamedTuple):
         time: its time stamp in a video, in seconds.
         picture: "ok", "frozen" or "black".
         missed: missed reads so far.
+        repeated: frames so far with the bytes of the frame before.
+        waited: seconds from its capture to its reading, NaN if the driver does not tell.
     """
 
     number: int
@@ -69,6 +72,8 @@ class Frame(NamedTuple):
     time: float | None = None
     picture: str = "ok"
     missed: int = 0
+    repeated: int = 0
+    waited: float = float("nan")
 
 
 @shown_short
@@ -81,6 +86,7 @@ class Clip(NamedTuple):
         resize: seconds of preprocessing the newest one.
         contact: 1, 0 or NaN (unknown) of the newest one.
         estimated: whether the background is a running estimate.
+        decide: seconds in which its contact was decided.
     """
 
     last: Frame
@@ -88,6 +94,7 @@ class Clip(NamedTuple):
     resize: float
     contact: float = float("nan")
     estimated: bool = False
+    decide: float = 0.0
 
 
 class Mailbox:
@@ -177,14 +184,23 @@ def read_clips(
                 missed = frame.missed
             begin = time.perf_counter()
             ring.append(preprocess(frame.pixels))
-            resize = time.perf_counter() - begin
+            resized = time.perf_counter()
             # The gate is asked about every frame, also before the first whole clip: it learns.
             touched = float("nan") if contact is None else contact(frame.pixels)
+            decided = time.perf_counter()
             if len(ring) < (frames - 1) * stride + 1:
                 continue
             clip = np.stack(list(ring)[::stride])
             estimated = getattr(preprocess, "estimated", False)
-            if not mailbox.put(Clip(frame, clip, resize, touched, estimated)):
+            made = Clip(
+                last=frame,
+                frames=clip,
+                resize=resized - begin,
+                contact=touched,
+                estimated=estimated,
+                decide=decided - resized,
+            )
+            if not mailbox.put(made):
                 break
         mailbox.close()
     except BaseException as error:
@@ -228,9 +244,10 @@ def camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]
     failing: float | None = None  # when the first of the reads failed that have failed since
     fault = ""
     shape = None
-    watch = _Watch(log)
+    watch = _Watch(log, nominal_rate(source))
     while True:
         pixels, grabbed, reason = _read_camera(source)
+        waited = capture_age(source)
         mailbox.alive = decoded = time.perf_counter()
         if mailbox.is_closed:
             return
@@ -259,7 +276,16 @@ def camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]
         shape = pixels.shape
         picture = watch.look(number, pixels, decoded)
         rgb = to_rgb(pixels, f"frame {number}")[..., ::-1]
-        yield Frame(number, rgb, grabbed, decoded - grabbed, None, picture, missed)
+        yield Frame(
+            number=number,
+            pixels=rgb,
+            read=grabbed,
+            decode=decoded - grabbed,
+            picture=picture,
+            missed=missed,
+            repeated=watch.repeated,
+            waited=waited - (decoded - grabbed),
+        )
         number += 1
 
 
@@ -280,10 +306,16 @@ def _read_camera(source: Source) -> tuple[np.ndarray | None, float, str]:
 
 
 class _Watch:
-    """Whether the pictures of a camera are frozen or black. Each kind of fault is logged once."""
+    """Whether the pictures of a camera are frozen, black or too few.
 
-    def __init__(self, log: Log) -> None:
+    Each kind of fault is logged once.
+    """
+
+    def __init__(self, log: Log, nominal: float) -> None:
+        self.repeated = 0  # frames with the bytes of the frame before
         self._log = log
+        self._nominal = nominal
+        self._window: tuple[float, int] | None = None  # its begin, and fresh frames until then
         self._last = b""
         self._logged: set[str] = set()
         self._since: dict[str, float] = {}
@@ -298,6 +330,8 @@ class _Watch:
         """Return "black" or "frozen" if the picture has been so for STUCK seconds, else "ok"."""
         last = self._last
         self._last = pixels.tobytes()
+        self.repeated += self._last == last
+        self._judge(number + 1 - self.repeated, now)
         for kind, is_so, advice in (
             ("black", pixels[::8, ::8].mean() < BLACK, "Check its light and its cover."),
             ("frozen", self._last == last, "It repeats the same bytes: check its cable."),
@@ -310,3 +344,16 @@ class _Watch:
                 )
                 return kind
         return "ok"
+
+    def _judge(self, fresh: int, now: float) -> None:
+        """Compare the rate of `fresh` frames with the nominal one, a window at a time."""
+        if self._window is None:
+            self._window = now, fresh
+            return
+        begin, before = self._window
+        if now - begin < WINDOW:
+            return
+        rate = Rate((fresh - before) / (now - begin), self._nominal)
+        if rate.warning():
+            self.report("slow", rate.warning())
+        self._window = now, fresh

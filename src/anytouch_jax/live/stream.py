@@ -26,6 +26,7 @@ from anytouch_jax.errors import UserError, handled
 
 # Callers find these next to `stream`.
 from anytouch_jax.live.cameras import open_source as open_source
+from anytouch_jax.live.freshness import Rate
 from anytouch_jax.live.reader import BLACK as BLACK
 from anytouch_jax.live.reader import RETRY as RETRY
 from anytouch_jax.live.reader import CameraError as CameraError
@@ -39,7 +40,9 @@ from anytouch_jax.live.reader import (
 )
 from anytouch_jax.shown import shown_short
 
-PARTS = ("decode", "resize", "copy", "encoder")
+# What the time from a frame to its features is made of. Its rest is the wait, for the encoder to be
+# done with an earlier frame.
+PARTS = ("decode", "resize", "contact", "wait", "copy", "encoder")
 KEPT = 100_000  # last frames whose times are stored if their features are not
 HANG = 20.0  # seconds to wait for a read that does not return; V4L2 itself gives up after 10
 CELL = 14  # pixels of a side over which a change is averaged
@@ -59,7 +62,7 @@ class Embedded(NamedTuple):
         number: of the frame, from 0.
         at: seconds from the start of the stream to the frame.
         values: the features f32 (E,).
-        seconds: those of PARTS.
+        seconds: those of PARTS, whose sum is the age.
         age: seconds from the grabbed frame to its features.
         started: start of the stream in Unix seconds.
         time: the time stamp of a video's frame in seconds, or `at` of a camera's.
@@ -69,12 +72,14 @@ class Embedded(NamedTuple):
         reused: see `Reuse`.
         estimated: the background is a running estimate, which may still improve.
         fields: what was measured, if anything.
+        repeated: frames of the camera so far with the bytes of the frame before.
+        waited: seconds from the capture of the frame to its reading, NaN if unknown.
     """
 
     number: int
     at: float
     values: np.ndarray
-    seconds: tuple[float, float, float, float]
+    seconds: tuple[float, ...]
     age: float
     started: float = 0.0
     time: float = 0.0
@@ -84,6 +89,8 @@ class Embedded(NamedTuple):
     reused: bool = False
     estimated: bool = False
     fields: Fields | None = None
+    repeated: int = 0
+    waited: float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,11 +212,21 @@ def stream_with(encoder: Encoder, source: Source, settings: StreamSettings) -> G
                 end = time.perf_counter()
                 last = clip.last
                 at = last.read - start
+                wait = begin - last.read - last.decode - clip.resize - clip.decide
+                seconds = (
+                    last.decode,
+                    clip.resize,
+                    clip.decide,
+                    # Clocks are read one after the other, so an empty wait may be just below 0.
+                    max(0.0, wait),
+                    copied - begin,
+                    end - copied,
+                )
                 yield Embedded(
                     number=last.number,
                     at=at,
                     values=embed.values,
-                    seconds=(last.decode, clip.resize, copied - begin, end - copied),
+                    seconds=seconds,
                     age=end - last.read,
                     started=started,
                     time=at if last.time is None else last.time,
@@ -219,6 +236,8 @@ def stream_with(encoder: Encoder, source: Source, settings: StreamSettings) -> G
                     reused=reused,
                     estimated=clip.estimated,
                     fields=embed.fields,
+                    repeated=last.repeated,
+                    waited=last.waited,
                 )
         finally:
             mailbox.close()
@@ -368,6 +387,8 @@ class Result(NamedTuple):
         black: pictures that were black.
         error: a camera that delivers nothing any more.
         fields: numbers (n,) by name, as in a line of `Fields.summary`.
+        repeated: frames of the camera so far with the bytes of the frame before (n,).
+        waited: seconds (n,) from the capture of a frame to its reading.
     """
 
     values: np.ndarray
@@ -387,6 +408,25 @@ class Result(NamedTuple):
     reused: np.ndarray = np.zeros(0, bool)
     estimated: np.ndarray = np.zeros(0, bool)
     fields: dict[str, np.ndarray] | None = None
+    repeated: np.ndarray = np.zeros(0, int)
+    waited: np.ndarray = np.zeros(0)
+
+    def rate(self, nominal: float = float("nan")) -> Rate | None:
+        """Return what the camera gave, whatever was dropped; None of less than two frames.
+
+        `nominal` is what it says, in frames a second.
+        """
+        if len(self.numbers) < 2 or not np.ptp(self.at) > 0:
+            return None
+        count = int(np.ptp(self.numbers))
+        repeated = int(np.ptp(self.repeated))
+        known = self.waited[~np.isnan(self.waited)]
+        return Rate(
+            fresh=(count - repeated) / float(np.ptp(self.at)),
+            nominal=nominal,
+            repeated=repeated / count,
+            age=float(np.median(known)) if len(known) else float("nan"),
+        )
 
 
 def collect(
@@ -447,6 +487,8 @@ def collect(
         reused=_column(stored, "reused").astype(bool),
         estimated=_column(stored, "estimated").astype(bool),
         fields=measured,
+        repeated=_column(stored, "repeated").astype(int),
+        waited=_column(stored, "waited").astype(float),
     )
 
 

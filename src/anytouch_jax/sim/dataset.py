@@ -5,6 +5,8 @@ A group's files are written first, then its table in `parts/`. When all parts ex
 it.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import io
 import json
@@ -25,6 +27,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, atomic_write, lock
 from anytouch_jax.sim import scene
+from anytouch_jax.sim.draws import Leaf
 from anytouch_jax.sim.recorder import ClipOutput, Recorder
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import photo
@@ -46,10 +49,21 @@ def simulate(
     threads: int = 2,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Path:
-    """Simulate `scenes` into the folder `out`, or continue there, and return the manifest's path.
+    """Simulate a data set, or continue one that was interrupted.
 
-    A seed gives the same bytes on the same machine. Raises UserError if `out` has other contents or
-    cannot be written.
+    A seed gives the same bytes on the same machine.
+
+    Args:
+        scenes: What to simulate.
+        out: Folder to write.
+        threads: That render photographs and write files.
+        progress: Called with the number of finished touches and of all.
+
+    Returns:
+        The path of the manifest.
+
+    Raises:
+        UserError: If `out` has other contents or cannot be written.
     """
     # pyarrow reads a leading ~ and a colon in its own way
     out = Path(out).expanduser().resolve()
@@ -76,12 +90,13 @@ def simulate(
 
 def _simulate(
     scenes: Scenes,
-    things: Any,
+    things: Sequence[objects.Object],
     splits: Sequence[str],
     out: Path,
     threads: int,
     progress: Callable[[int, int], None],
 ) -> Path:
+    """Simulate all groups that are not finished yet, and return the manifest's path."""
     target = out / MANIFEST
     if target.exists():
         # left by a kill after the rename
@@ -106,15 +121,14 @@ def _simulate(
                 [scene.draw_recording(scenes, touch, name) for touch in touches]
                 for name in scenes.sensors
             ]
-            futures = [
-                pool.submit(
-                    _write_recording, scenes, things[recording.touch.object], recording, take, out
-                )
-                for recordings, takes in zip(
-                    by_sensor, solving.map(recorder.record, by_sensor), strict=True
-                )
-                for recording, take in zip(recordings, takes, strict=True)
-            ]
+            clips = solving.map(recorder.record, by_sensor)
+            futures = []
+            for recordings, takes in zip(by_sensor, clips, strict=True):
+                for recording, take in zip(recordings, takes, strict=True):
+                    thing = things[recording.touch.object]
+                    futures.append(
+                        pool.submit(_write_recording, scenes, thing, recording, take, out)
+                    )
             _write_table([row for future in futures for row in future.result()], file)
             done += len(group)
             progress(done, scenes.touches)
@@ -137,8 +151,11 @@ def _claim(scenes: Scenes, out: Path) -> None:
     if file.exists():
         old = _read_settings(file)
         new = json.loads(text)
-        pairs = {name: (old.get(name), new.get(name)) for name in (*new, *old)}
-        changes = [f"{name} {a!r}, not {b!r}" for name, (a, b) in pairs.items() if a != b]
+        changes = [
+            f"{name} {old.get(name)!r}, not {new.get(name)!r}"
+            for name in dict.fromkeys((*new, *old))
+            if old.get(name) != new.get(name)
+        ]
         if not changes:
             return
         raise UserError(
@@ -170,62 +187,85 @@ def _write_recording(
     """Write the files of one recording. Returns the rows of its frames and of its background."""
     touch = recording.touch
     sensor = find_sensor(recording.sensor)
-    kind = sensor.kind
+    is_field = sensor.kind == "field"
     name = f"{touch.number:06d}-{sensor.name}"
-    common = _common_row(scenes, thing, recording, sensor.name) | {"sequence": name}
     folder = Path(sensor.name) / f"{touch.number:06d}"
     (out / folder).mkdir(parents=True, exist_ok=True)
-    photograph = caption = None
-    if recording.has_photo:
-        photograph = folder / "photo.jpg"
-        rng = np.random.default_rng([scenes.seed, scene.PHOTO, recording.seed])
-        image = photo.photograph(thing, touch.place, rng, scenes.size or 224)
-        _write_image(out / photograph, image)
-    if recording.has_text:
-        caption = objects.caption(
-            thing, np.random.default_rng([scenes.seed, scene.CAPTION, recording.seed])
-        )
-    background = None if kind == "field" else folder / "background.jpg"
-    common |= {"image_path": photograph and photograph.as_posix(), "text": caption}
-    common["background_path"] = background and background.as_posix()
+    photograph = _write_photograph(scenes, thing, recording, folder, out)
+    background = None if is_field else folder / "background.jpg"
+    common = _common_row(scenes, thing, recording, sensor.name) | {
+        "sequence": name,
+        "image_path": _posix(photograph),
+        "text": _caption(scenes, thing, recording),
+        "background_path": _posix(background),
+    }
+    quality = int(recording.unit.quality)
     rows = []
     for t in range(scenes.frames):
-        path = folder / f"{t:03d}{'.npy' if kind == 'field' else '.jpg'}"
-        field = folder / f"{t:03d}.npy" if scenes.fields or kind == "field" else None
-        if kind != "field":
-            _write_image(out / path, take.image[t], int(recording.unit.quality))
+        path = folder / f"{t:03d}{'.npy' if is_field else '.jpg'}"
+        field = folder / f"{t:03d}.npy" if scenes.fields or is_field else None
+        if take.image is not None:
+            _write_image(out / path, take.image[t], quality)
         if field is not None:
-            data = io.BytesIO()
-            np.save(data, take.field[t], allow_pickle=False)
-            _write_bytes(out / field, data.getvalue())
-        rows.append(
-            common
-            | {"path": path.as_posix(), "frame_index": t, "field_path": field and field.as_posix()}
-            | {
-                f"label.{name}": float(np.float32(values[t]))
-                for name, values in take.labels.items()
-            }
-            | (
-                {} if recording.depth[t] > 0 else {"touch": None}
-            )  # no place is touched in this frame
-        )
+            assert take.field is not None
+            _write_array(out / field, take.field[t])
+        row = common | {
+            "path": path.as_posix(),
+            "frame_index": t,
+            "field_path": _posix(field),
+        }
+        for label, values in take.labels.items():
+            row[f"label.{label}"] = float(np.float32(values[t]))
+        if not recording.depth[t] > 0:
+            row["touch"] = None  # no place is touched in this frame
+        rows.append(row)
     if background is not None:
-        _write_image(out / background, take.background, int(recording.unit.quality))
-        lock = {"path": background.as_posix(), "sequence": f"{name}-background", "frame_index": 0}
-        rows.append(
-            common | lock | {"split": "background", "touch": None, "text": None, "image_path": None}
-        )
+        assert take.background is not None
+        _write_image(out / background, take.background, quality)
+        own = {"path": background.as_posix(), "sequence": f"{name}-background", "frame_index": 0}
+        nothing = {"split": "background", "touch": None, "text": None, "image_path": None}
+        rows.append(common | own | nothing)
     return rows
+
+
+def _write_photograph(
+    scenes: Scenes, thing: objects.Object, recording: Recording, folder: Path, out: Path
+) -> Path | None:
+    """Write the photograph of a recording that has one, and return its path below `out`."""
+    if not recording.has_photo:
+        return None
+    path = folder / "photo.jpg"
+    rng = np.random.default_rng([scenes.seed, scene.PHOTO, recording.seed])
+    _write_image(
+        out / path, photo.photograph(thing, recording.touch.place, rng, scenes.size or 224)
+    )
+    return path
+
+
+def _caption(scenes: Scenes, thing: objects.Object, recording: Recording) -> str | None:
+    """Return the caption of a recording that has one."""
+    if not recording.has_text:
+        return None
+    rng = np.random.default_rng([scenes.seed, scene.CAPTION, recording.seed])
+    return objects.caption(thing, rng)
+
+
+def _posix(path: Path | None) -> str | None:
+    return None if path is None else path.as_posix()
 
 
 def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording, sensor: str) -> Row:
     """Return the columns that all frames of a recording share."""
     touch = recording.touch
+    # The unit is a column that splits keep together: a new device for every touch, or one for all.
+    unit = f"{sensor}-{scenes.seed}"
+    if scenes.units == "each":
+        unit = f"{sensor}-{touch.split}-{touch.number:06d}"
     return {
         "sensor": sensor,
         "split": touch.split,
         "dataset": f"simulated-{scenes.grade}",
-        "unit": f"{sensor}-{f'{touch.split}-{touch.number:06d}' if scenes.units == 'each' else scenes.seed}",
+        "unit": unit,
         "stride": 1,
         "touch": f"{touch.number:06d}",
         "object": thing.name,
@@ -242,9 +282,10 @@ def _common_row(scenes: Scenes, thing: objects.Object, recording: Recording, sen
 
 
 def _write_table(rows: list[Row], file: Path) -> None:
+    """Write the table of a part, after the files that it lists are on the disk."""
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: [row.get(name) for row in rows] for name in names})
-    # the files that the table lists: once a part is cheaper than once an image
+    # Once a part is cheaper than once an image.
     os.sync()
     with atomic_path(file, part=file.with_suffix(".tmp")) as part:
         pq.write_table(table, part)
@@ -261,8 +302,15 @@ def _is_readable(part: Path) -> bool:
         return False
 
 
-def _write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
-    good, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+def _write_array(path: Path, array: Leaf) -> None:
+    data = io.BytesIO()
+    np.save(data, array, allow_pickle=False)
+    _write_bytes(path, data.getvalue())
+
+
+def _write_image(path: Path, image: Leaf, quality: int = 95) -> None:
+    bgr = np.asarray(image)[..., ::-1]
+    good, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not good:
         raise RuntimeError(f"OpenCV could not encode {path}")
     _write_bytes(path, data.tobytes())

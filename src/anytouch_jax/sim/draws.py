@@ -1,7 +1,8 @@
 """Random draws of the simulator: one description of a distribution serves numpy and JAX.
 
 A distribution is a function of an `Rng`: a numpy generator, or `Draws` from a JAX key inside a
-compiled program.
+compiled program. So a data set on disk and endless training draw from the same distributions,
+though not the same numbers.
 """
 
 import math
@@ -13,7 +14,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import gamma as gamma_distribution
+
+Leaf = npt.NDArray[Any] | jax.Array  # numpy, or jax under vmap and jit
+Size = int | tuple[int, ...]
 
 
 class Draws:
@@ -32,27 +37,27 @@ class Draws:
         self._used = dict.fromkeys(self._block, 0)
 
     def _take(self, kind: str, shape: tuple[int, ...]) -> jax.Array:
+        block = self._block[kind]
         first = self._used[kind]
-        count = math.prod(shape)
-        self._used[kind] += count
-        if first + count > len(self._block[kind]):
-            raise ValueError(
-                f"more than {len(self._block[kind])} {kind} values; ask for a larger block"
-            )
-        return self._block[kind][first : first + count].reshape(shape)
+        end = first + math.prod(shape)
+        self._used[kind] = end
+        # A slice that is too short would repeat nothing and warn of nothing, so it is an error.
+        if end > len(block):
+            raise ValueError(f"more than {len(block)} {kind} values; ask for a larger block")
+        return block[first:end].reshape(shape)
 
-    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> jax.Array:
+    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Size | None = None) -> jax.Array:
         """Return uniform values in low..high."""
         low = jnp.asarray(low, jnp.float32)
         high = jnp.asarray(high, jnp.float32)
         shape = np.broadcast_shapes(low.shape, high.shape) if size is None else _shape(size)
         return low + (high - low) * self._take("uniform", shape)
 
-    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = ()) -> jax.Array:
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Size = ()) -> jax.Array:
         """Return normal values of mean `loc` and standard deviation `scale`."""
         return loc + scale * self._take("normal", _shape(size))
 
-    def standard_normal(self, size: Any = ()) -> jax.Array:
+    def standard_normal(self, size: Size = ()) -> jax.Array:
         """Return normal values of mean 0 and standard deviation 1."""
         return self.normal(size=size)
 
@@ -68,9 +73,11 @@ class Draws:
     def integers(self, low: int, high: int | None = None) -> jax.Array:
         """Return an integer from low to high - 1, or from 0 to low - 1.
 
-        At most 2**23 values are distinct.
+        At most 2**23 values are distinct, because a uniform float32 has no more.
         """
-        low, high = (0, low) if high is None else (low, high)
+        if high is None:
+            low, high = 0, low
+        # A uniform value is below 1, but its product may be rounded up to `high`.
         return jnp.minimum(low + (self.uniform() * (high - low)).astype(jnp.int32), high - 1)
 
     def choice(self, values: Any) -> jax.Array:
@@ -78,7 +85,7 @@ class Draws:
         return jnp.asarray(values)[self.integers(len(values))]
 
 
-def _shape(size: Any) -> tuple[int, ...]:
+def _shape(size: Size) -> tuple[int, ...]:
     if isinstance(size, int):
         return (size,)
     return tuple(size)
@@ -86,10 +93,15 @@ def _shape(size: Any) -> tuple[int, ...]:
 
 @lru_cache(maxsize=4)
 def _gamma_quantiles(shape: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return shares in 0..1, dense at both ends, and the logarithms of the quantiles there."""
-    share = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 4096))
-    share = np.clip(share, 1e-7, 1 - 1e-7)
-    return share.astype(np.float32), np.log(gamma_distribution.ppf(share, shape)).astype(np.float32)
+    """Return probabilities in 0..1, dense at both ends, and the logarithms of the quantiles there.
+
+    jax.random.gamma is a loop with rejection, which takes long to compile and cannot take its
+    numbers from a block.
+    """
+    probability = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 4096))
+    probability = np.clip(probability, 1e-7, 1 - 1e-7)
+    quantile = np.log(gamma_distribution.ppf(probability, shape))
+    return probability.astype(np.float32), quantile.astype(np.float32)
 
 
 Rng = np.random.Generator | Draws
@@ -103,7 +115,10 @@ def namespace_of(rng: Rng) -> ModuleType:
 
 
 def either(rng: Rng, condition: Any, draw: Callable[[], Any], otherwise: Any) -> Any:
-    """Return `draw()` if the condition holds. numpy draws only then, and JAX always."""
+    """Return `draw()` if the condition holds, else `otherwise`.
+
+    numpy draws only then. JAX always draws, because a traced condition is not known.
+    """
     if isinstance(rng, Draws):
         return jnp.where(condition, draw(), otherwise)
     if condition:

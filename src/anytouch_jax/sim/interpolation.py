@@ -1,5 +1,5 @@
 """Interpolation of maps: matrices that resample, differentiate and blur along one axis, and cubic
-lookup at points.
+look-up at points.
 
 On a grid of some hundred points a matrix product beats gathers and short convolutions on a CPU, and
 one product can resample, blur and differentiate at once. Maps are (rows, columns). M @ map acts on
@@ -11,21 +11,31 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.sim.draws import Leaf
+
 
 def spline(positions: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    """Return matrices (n, count) of the cubic B-spline of `count` samples: value, and derivative
-    per sample step.
+    """Return matrices of the cubic B-spline of `count` samples: value and derivative.
 
-    `positions` (n,) are in samples, 0 in the middle of the first one. The last sample is repeated
-    outside. The spline does not interpolate. It smooths by 0.58 samples, as a skin does, and never
-    overshoots.
+    The spline does not interpolate. It smooths by 0.58 samples, as a skin does, and never
+    overshoots, because its weights are positive and sum to one.
+
+    Args:
+        positions: (n,) in samples, 0 in the middle of the first one. Outside, the first or the last
+            sample is repeated.
+        count: Number of samples.
+
+    Returns:
+        Two matrices (n, count). The derivative is per sample step.
     """
     positions = jnp.clip(positions, 0.0, count - 1.0)
+    # Two samples more at each end: the spline at a border reaches so far.
     knots = jnp.arange(-2.0, count + 2.0)
     d = positions[:, None] - knots[None, :]
     a = jnp.abs(d)
     near = a < 1
     far = a < 2
+    # The cubic B-spline: 2/3 - a^2 + a^3/2 up to a distance of one, (2 - a)^3 / 6 up to two.
     value = jnp.where(near, 2 / 3 - a**2 + a**3 / 2, jnp.where(far, (2 - a) ** 3 / 6, 0.0))
     slope = jnp.sign(d) * jnp.where(
         near, -2 * a + 1.5 * a**2, jnp.where(far, -((2 - a) ** 2) / 2, 0.0)
@@ -55,19 +65,23 @@ def average(count: int, cells: int) -> npt.NDArray[np.float32]:
     Samples on a border are divided.
     """
     left = np.arange(cells)[:, None] * count / cells
-    overlap = np.minimum(left + count / cells, np.arange(count) + 1) - np.maximum(
-        left, np.arange(count)
-    )
+    right = np.minimum(left + count / cells, np.arange(count) + 1)
+    overlap = right - np.maximum(left, np.arange(count))
     return np.asarray(np.maximum(overlap, 0) * cells / count, np.float32)
 
 
-def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Return values of a centred `raster` (H, W) with `pitch` mm between pixels at `x`, `y` mm of
-    equal shape.
+def sample(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Return values of a centred raster at points, by a cubic (Catmull-Rom) spline.
 
-    It is cubic (Catmull-Rom): exact at pixels, with continuous slopes between them. Outside of the
-    raster and at NaN it is the lowest value on the border. A point costs sixteen reads. A raster of
-    half floats is read as float32.
+    It is exact at pixels, with continuous slopes between them: bilinear facets would be seen in the
+    image, which shows slopes. Outside of the raster and at NaN it is the lowest value on the
+    border. A point costs sixteen reads. A raster of half floats is read as float32.
+
+    Args:
+        raster: (H, W) values.
+        pitch: mm between pixels.
+        x: Places to the right of the middle, mm.
+        y: Places below the middle, mm, of the shape of `x`.
     """
     rows, columns = raster.shape
     dtype = jnp.promote_types(raster.dtype, jnp.float32)
@@ -91,6 +105,7 @@ def sample(raster: jax.Array, pitch: float, x: jax.Array, y: jax.Array) -> jax.A
     for row, across in zip(index[0], weights[0], strict=True):
         line = jnp.zeros_like(total)
         for column, along in zip(index[1], weights[1], strict=True):
+            # The indices are clipped above, so the read need not check them again.
             line = line + along * flat.at[row * columns + column].get(mode="promise_in_bounds")
         total = total + across * line
     border = jnp.concatenate([raster[0], raster[-1], raster[:, 0], raster[:, -1]])

@@ -1,20 +1,25 @@
-"""Simulation of single touches and of recordings: surface under the gel, contact, shear and image,
-in one program.
+"""Simulation of touches and recordings: surface under the gel, contact, shear and image.
+
+One clip is one program (`simulate_clip`), and `vmap` makes a batch of it. Three things call it:
+`Recorder` for data sets on disk, `endless` for training, and `simulate_touch` for a user's own
+surface.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import Array
 
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact import mechanics, shear
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel, PressResult
+from anytouch_jax.sim.draws import Leaf
 from anytouch_jax.sim.scene import Recording, Scenes
 from anytouch_jax.sim.sensing import optics
 from anytouch_jax.sim.sensing.own import find_sensor
@@ -40,38 +45,35 @@ LEAST = 64  # with fidelity fast the grid has half the image's pixels, or as man
 class ClipInput(NamedTuple):
     """The inputs of a simulated clip with T frames. Every array may have a leading batch axis.
 
-    `relief` (RELIEF, RELIEF) mm is the object's height map with SPACING mm between pixels, and
-    `place` (2,) mm the touched place on it. `start`, `motion`, `depth` and `tilt` are as in
-    `scene.Recording`. `modulus` is the object's in kPa, `friction` that on the gel, `unit` the
-    sensor unit, `drift` its light's, `seed` u32 the image noise's.
+    `start`, `motion`, `depth` and `tilt` are as in `scene.Recording`.
     """
 
-    relief: Any
-    place: Any
-    start: Any
-    motion: Any
-    depth: Any
-    tilt: Any
-    modulus: Any
-    friction: Any
-    unit: Any
-    drift: Any
-    seed: Any
+    relief: Leaf  # (RELIEF, RELIEF) mm, the object's height map with SPACING mm between pixels
+    place: Leaf  # (2,) mm, the touched place on it
+    start: Leaf  # (3,) mm, mm, rad
+    motion: Leaf  # (T, 3) mm, mm, rad
+    depth: Leaf  # (T,) mm
+    tilt: Leaf  # (2,) rise per mm
+    modulus: Leaf  # kPa of the object
+    friction: Leaf  # on the gel
+    unit: Unit
+    drift: Leaf  # (T, 3, 3) of the unit's light
+    seed: Leaf  # u32, of the image noise
 
 
 class ClipOutput(NamedTuple):
     """A simulated clip with T frames."""
 
-    image: Any  # u8 (T, h, w, 3), or None for a field sensor
-    background: Any  # u8 (h, w, 3), or None for a field sensor
+    image: Leaf | None  # u8 (T, h, w, 3), or None for a field sensor
+    background: Leaf | None  # u8 (h, w, 3), or None for a field sensor
     # f32 (T, 20, 20, 6) mm and N of a field sensor, or (T, h, w, channels) of requested fields, or
     # None
-    field: Any
+    field: Leaf | None
     # f32 (T,) each: normal force N, force_x and force_y N along the image, torque N mm about the
     # centre of pressure, depth mm of the deepest point, area mm2, x and y mm of the pressure in the
     # image, slip (share of the contact that slides). With fidelity exact also whether the solver
     # converged.
-    labels: dict[str, Any]
+    labels: Mapping[str, Leaf]
 
 
 def solve_grid(
@@ -79,11 +81,12 @@ def solve_grid(
 ) -> tuple[tuple[int, int], float]:
     """Return (rows, columns) of the solve grid over a sensor's field, and its pitch in mm.
 
-    Its pixels are square.
+    Its pixels are square. Its sides are multiples of four, so that two coarser grids fit.
     """
-    pitch = min(sensor.field) / (
-        min(max(LEAST, size // 2), GRID) if fidelity == "fast" and size else GRID
-    )
+    points = GRID
+    if fidelity == "fast" and size:
+        points = min(max(LEAST, size // 2), GRID)
+    pitch = min(sensor.field) / points
     rows, columns = (4 * round(side / pitch / 4) for side in sensor.field)
     return (rows, columns), pitch
 
@@ -91,10 +94,8 @@ def solve_grid(
 def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
     """Return heights (T, h, w) mm of the object under the gel's points `x`, `y` mm.
 
-    The first contact is at 0.
-
-    The object turns and slides about the middle of the gel. Its tilt is that of the sensor in the
-    hand.
+    The first contact is at 0. The object turns and slides about the middle of the gel. Its tilt is
+    that of the sensor in the hand.
     """
     x, y = gel_to_object(clip.unit, x, y)
     frames = len(clip.motion)
@@ -119,28 +120,34 @@ def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
 
 
 def gel_motion(clip: ClipInput) -> Array:
-    """Return the motion (T, 3) mm, mm, rad of the object between frames in the gel's frame, first
-    since the touch.
+    """Return the motion (T, 3) mm, mm, rad of the object between frames, first since the touch.
+
+    It is in the gel's frame.
     """
     steps = jnp.diff(clip.motion, axis=0, prepend=jnp.zeros((1, 3)))
     return jnp.stack([*rotated(steps[:, 0], steps[:, 1], clip.unit.rotation), steps[:, 2]], 1)
 
 
 class View(NamedTuple):
-    """How a sensor is solved and shown: the grid (rows, columns), its `pitch` mm, and the image
-    (height, width).
+    """How a sensor is solved and shown."""
 
-    `photometry` replaces that of the sensor. `stretched` is as in `optics.picture_view`. `fields`
-    is the (height, width) of the fields of the last frame. If it is None, all frames have fields,
-    in the size of the image.
-    """
-
-    grid: tuple[int, int]
-    pitch: Any
-    image: tuple[int, int]
-    photometry: optics.Photometry | None = None
-    stretched: bool = False
+    grid: tuple[int, int]  # (rows, columns) of the solve grid
+    pitch: float | Array  # mm of the solve grid
+    image: tuple[int, int]  # (height, width) in pixels
+    photometry: optics.Photometry | None = None  # instead of that of the sensor
+    stretched: bool = False  # as in `optics.picture_view`
+    # (height, width) of the fields of the last frame. If it is None, all frames have fields, in the
+    # size of the image.
     fields: tuple[int, int] | None = None
+
+
+class _Contact(NamedTuple):
+    """What the gel feels in every frame."""
+
+    gel: Gel
+    press: PressResult
+    shear: shear.Shear  # its displacement includes the sideways motion by pressing
+    labels: dict[str, Array]
 
 
 def simulate_clip(
@@ -152,19 +159,45 @@ def simulate_clip(
     fields: tuple[str, ...] = (),
     view: View | None = None,
 ) -> ClipOutput:
-    """Simulate one clip by `sensor`: contact of every frame, shear with its history, images and
-    labels.
+    """Simulate one clip: contact of every frame, shear with its history, images and labels.
 
-    `size` is the short side of the image in pixels, 0 for the sensor's resolution. `view` replaces
-    the grid and the image that follow from `size`. With it, the numbers of `sensor` may be traced,
-    so that one program serves many.
+    Args:
+        clip: What is touched, where and how.
+        sensor: By what. With a `view` its numbers may be traced, so that one program serves many.
+        fidelity: How contact is solved (`mechanics.press`).
+        size: Short side of the image in pixels, 0 for the sensor's resolution.
+        fields: Names of FIELDS to return.
+        view: Replaces the grid and the image that follow from `size`.
     """
-    view = (
-        View(*solve_grid(sensor, size, fidelity), optics.picture_size(sensor, size))
-        if view is None
-        else view
+    if view is None:
+        grid, pitch = solve_grid(sensor, size, fidelity)
+        view = View(grid, pitch, optics.picture_size(sensor, size))
+    contact = _touched(clip, sensor, view, fidelity)
+    labels = contact.labels
+    if fidelity == "fast":
+        del labels["converged"]  # a few iterations do not converge
+    keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
+    if sensor.kind == "field":
+        measured = _measured(contact, sensor, clip.unit.noise, view.pitch, keys[1:])
+        return ClipOutput(None, None, measured, labels)
+    behind = optics.backdrop(sensor, clip.unit, view.image, stretched=view.stretched)
+    picture = optics.Picture(sensor, clip.unit, view.image, view.photometry, view.stretched)
+
+    def shown(dent: Array, moved: Array, key: Array, drift: Leaf) -> Array:
+        skin = optics.Skin(dent, moved, view.pitch)
+        return optics.show(skin, picture, key, behind=behind, drift=drift)
+
+    image = jax.vmap(shown)(
+        contact.press.displacement, contact.shear.displacement, keys[1:], clip.drift
     )
-    (rows, columns) = view.grid
+    background = optics.show(None, picture, keys[0], behind=behind)
+    mapped = _fields(fields, contact, picture, view)
+    return ClipOutput(image, background, mapped, labels)
+
+
+def _touched(clip: ClipInput, sensor: Sensor, view: View, fidelity: Fidelity) -> _Contact:
+    """Return the normal contact, the tangential contact and the labels of every frame."""
+    rows, columns = view.grid
     pitch = view.pitch
     y, x = jnp.meshgrid(
         *((jnp.arange(n) - (n - 1) / 2) * pitch for n in (rows, columns)), indexing="ij"
@@ -179,35 +212,10 @@ def simulate_clip(
         lambda p: mechanics.sideways(p, gel, pitch, fidelity=fidelity, coarse=True)
     )(contact.pressure)
     sheared = _sheared(clip, contact, squeezed, gel, pitch, fidelity)
+    # The traction resisted the sideways motion. The skin's motion is that by both.
     sheared = sheared._replace(displacement=sheared.displacement + squeezed)
     labels = _labels(clip, contact, sheared, pitch) | {"depth": _depth(clip, relief)}
-    if fidelity == "fast":
-        del labels["converged"]  # a few iterations do not converge
-    keys = jax.random.split(jax.random.key(clip.seed), len(clip.depth) + 1)
-    if sensor.kind == "field":
-        points = sensor.resolution[0]
-        noise = clip.unit.noise
-        measure = partial(optics.measure_field, pitch=pitch, points=points, noise=noise, gel=gel)
-        measured = jax.vmap(
-            lambda z, xy, *maps: measure(
-                z, mechanics.enlarged(xy, z.shape), *maps[:-1], key=maps[-1]
-            )
-        )(contact.displacement, sheared.displacement, contact.pressure, sheared.traction, keys[1:])
-        return ClipOutput(None, None, measured, labels)
-    shown: dict[str, Any] = {"sensor": sensor, "unit": clip.unit, "stretched": view.stretched}
-    behind = optics.backdrop(resolution=view.image, **shown)
-    look = {"resolution": view.image, "photometry": view.photometry, "behind": behind} | shown
-    image = jax.vmap(
-        lambda u, t, key, drift: optics.render(u, t, pitch, key=key, drift=drift, **look)
-    )(contact.displacement, sheared.displacement, keys[1:], clip.drift)
-    background = optics.background(key=keys[0], **look)
-    onto_picture = partial(
-        optics.onto_picture, pitch=pitch, resolution=view.fields or view.image, **shown
-    )
-    if view.fields:
-        contact, sheared = jax.tree.map(lambda x: x[-1:], (contact, sheared))
-    mapped = _fields(fields, contact, sheared, onto_picture)
-    return ClipOutput(image, background, mapped, labels)
+    return _Contact(gel, contact, sheared, labels)
 
 
 def _sheared(
@@ -215,18 +223,17 @@ def _sheared(
     contact: PressResult,
     squeezed: Array,
     gel: Gel,
-    pitch: float,
+    pitch: float | Array,
     fidelity: Fidelity,
 ) -> shear.Shear:
-    """Return the tangential state of every frame, computed from the previous one, its motion on the
-    coarse grid.
-    """
+    """Return the tangential state of every frame, computed from the one before.
 
-    slide = partial(
-        shear.shear_step,
-        gel=gel,
-        pitch=pitch,
-        friction=clip.friction,
+    Its motion is on the coarse grid, where markers and fields take it from.
+    """
+    interface = shear.Interface(
+        gel,
+        pitch,
+        clip.friction,
         fidelity=fidelity,
         modulus_object=clip.modulus,
         centre=clip.unit.offset,
@@ -234,7 +241,9 @@ def _sheared(
     )
 
     def step(traction: Array, frame: tuple[PressResult, Array, Array]) -> tuple[Array, shear.Shear]:
-        state = slide(start._replace(traction=traction), frame[0], frame[1], squeezed=frame[2])
+        press, motion, change = frame
+        # Of the state before only the traction matters, so a scan carries no more.
+        state = shear.slide(start._replace(traction=traction), press, motion, interface, change)
         return state.traction, state
 
     _, rows, columns = contact.pressure.shape
@@ -243,9 +252,31 @@ def _sheared(
     return jax.lax.scan(step, start.traction, (contact, gel_motion(clip), change))[1]
 
 
+def _measured(
+    contact: _Contact, sensor: Sensor, noise: Leaf, pitch: float | Array, keys: Array
+) -> Array:
+    """Return what a field sensor measures in every frame, (T, points, points, 6)."""
+    points = sensor.resolution[0]
+    measure = partial(
+        optics.measure_field, pitch=pitch, points=points, noise=noise, gel=contact.gel
+    )
+
+    def frame(dent: Array, moved: Array, pressure: Array, traction: Array, key: Array) -> Array:
+        return measure(dent, mechanics.enlarged(moved, dent.shape), pressure, traction, key=key)
+
+    return jax.vmap(frame)(
+        contact.press.displacement,
+        contact.shear.displacement,
+        contact.press.pressure,
+        contact.shear.traction,
+        keys,
+    )
+
+
 def _labels(
-    clip: ClipInput, contact: PressResult, sheared: shear.Shear, pitch: float
+    clip: ClipInput, contact: PressResult, sheared: shear.Shear, pitch: float | Array
 ) -> dict[str, Array]:
+    """Return labels (T,) of every frame, in the directions of the image, which may be mirrored."""
     centre = jax.vmap(lambda p: jnp.asarray(mechanics.centroid(p, pitch)))(contact.pressure)
     shown = (centre - clip.unit.window[None]) * clip.unit.mirror[None]
     area = jax.vmap(lambda p: mechanics.area(p, pitch))(contact.pressure)
@@ -264,41 +295,54 @@ def _labels(
 
 
 def _depth(clip: ClipInput, relief: Array) -> Array:
-    """Return the depth mm (T,) of the highest point under the gel, from `relief` (T, h, w): not
-    that of the hand.
+    """Return the depth mm (T,) of the highest point under the gel, from heights (T, h, w).
+
+    It is not that of the hand: the object may have moved to a lower place since the first frame.
     """
     return jnp.maximum(clip.depth + jnp.max(relief, axis=(1, 2)), 0)
 
 
 def _fields(
-    names: tuple[str, ...],
-    contact: PressResult,
-    sheared: shear.Shear,
-    onto_picture: Callable[..., Array],
+    names: tuple[str, ...], contact: _Contact, picture: optics.Picture, view: View
 ) -> Array | None:
-    """Return the fields `names` at the image's pixels as channels: displacement mm, pressure kPa,
-    shear (2) mm.
+    """Return the fields `names` at the image's pixels as channels.
+
+    They are displacement mm, pressure kPa and shear (2) mm.
     """
-    compute = {
-        "displacement": lambda: onto_picture(contact.displacement[..., None]),
-        "pressure": lambda: jnp.maximum(
-            onto_picture(contact.pressure[..., None]), 0
-        ),  # a spline overshoots at an edge
-        "shear": lambda: onto_picture(
-            sheared.displacement, vectors=True, grid=contact.pressure.shape[1:]
-        ),
-    }
-    if names:
-        return jnp.concatenate([compute[name]() for name in names], -1)
-    return None
+    if not names:
+        return None
+    press = contact.press
+    sheared = contact.shear
+    if view.fields:
+        press, sheared = jax.tree.map(lambda x: x[-1:], (press, sheared))
+    onto_picture = partial(
+        optics.onto_picture,
+        pitch=view.pitch,
+        sensor=picture.sensor,
+        unit=picture.unit,
+        resolution=view.fields or view.image,
+        stretched=view.stretched,
+    )
+    grid = (press.pressure.shape[1], press.pressure.shape[2])
+    channels = []
+    for name in names:
+        if name == "displacement":
+            channels.append(onto_picture(press.displacement[..., None]))
+        elif name == "pressure":
+            # A spline overshoots at an edge of the maps.
+            channels.append(jnp.maximum(onto_picture(press.pressure[..., None]), 0))
+        else:
+            channels.append(onto_picture(sheared.displacement, vectors=True, grid=grid))
+    return jnp.concatenate(channels, -1)
 
 
 MAX_PIXELS = 24_000_000  # pixels of a batch; some dozen float32 planes of them are in memory
 
 
 class Recorder:
-    """Simulates recordings in batches of one size, so that each sensor is compiled once; a thread
-    for each sensor.
+    """Simulates recordings in batches of one size, so that each sensor is compiled once.
+
+    It may be used by a thread for each sensor.
     """
 
     def __init__(self, scenes: Scenes, objects: Sequence[Object], batch: int = 8) -> None:
@@ -312,7 +356,7 @@ class Recorder:
         self._relief = lru_cache(512)(
             lambda number: shapes.relief(objects[number].shape, RELIEF, SPACING)
         )
-        self._programs: dict[str, Any] = {}
+        self._programs: dict[str, Callable[[ClipInput], ClipOutput]] = {}
 
     def record(self, recordings: Sequence[Recording]) -> list[ClipOutput]:
         """Return the clips of at most `batch` recordings of one sensor, as numpy.
@@ -323,51 +367,49 @@ class Recorder:
         count = len(recordings)
         if not 0 < count <= self._batch or len({r.sensor for r in recordings}) > 1:
             raise ValueError(f"record takes 1 to {self._batch} recordings of one sensor")
-        return [
-            output
-            for first in range(0, count, self._at_once)
-            for output in self._simulate(recordings, first)
-        ]
+        outputs = list[ClipOutput]()
+        for first in range(0, count, self._at_once):
+            outputs += self._simulate(recordings[first : first + self._at_once])
+        return outputs
 
-    def _simulate(self, recordings: Sequence[Recording], first: int) -> list[ClipOutput]:
-        """Return the clips of as many recordings as memory allows, from number `first` on."""
-        clips = [self._clip(recording) for recording in recordings[first : first + self._at_once]]
+    def _simulate(self, recordings: Sequence[Recording]) -> list[ClipOutput]:
+        """Return the clips of as many recordings as memory allows."""
+        clips = [self._clip(recording) for recording in recordings]
         count = len(clips)
         # equal shapes compile once
         clips += clips[-1:] * (self._at_once - count)
         outputs = jax.device_get(self._program(recordings[0].sensor)(stack_trees(clips)))
         return [jax.tree.map(lambda x, i=i: x[i], outputs) for i in range(count)]
 
-    def _program(self, name: str) -> Any:
+    def _program(self, name: str) -> Callable[[ClipInput], ClipOutput]:
+        """Return the compiled simulation of a batch by a sensor."""
         if name not in self._programs:
             scenes = self._scenes
-            about: dict[str, Any] = {
-                "fidelity": scenes.fidelity,
-                "size": scenes.size,
-                "fields": scenes.fields,
-            }
-            self._programs[name] = jax.jit(
-                jax.vmap(partial(simulate_clip, sensor=find_sensor(name), **about))
+            one = partial(
+                simulate_clip,
+                sensor=find_sensor(name),
+                fidelity=scenes.fidelity,
+                size=scenes.size,
+                fields=scenes.fields,
             )
+            self._programs[name] = jax.jit(jax.vmap(one))
         return self._programs[name]
 
     def _clip(self, recording: Recording) -> ClipInput:
         touch = recording.touch
-        thing = self._objects[touch.object]
-        given = (touch.place, recording.start, recording.motion, recording.depth, recording.tilt)
-        place, start, motion, depth, tilt = (np.asarray(each, np.float32) for each in given)
+        material = self._objects[touch.object].material
         return ClipInput(
-            self._relief(touch.object),
-            place,
-            start,
-            motion,
-            depth,
-            tilt,
-            np.float32(thing.material.modulus),
-            np.float32(thing.material.friction),
-            recording.unit,
-            recording.drift,
-            np.uint32(recording.seed),
+            relief=self._relief(touch.object),
+            place=np.asarray(touch.place, np.float32),
+            start=np.asarray(recording.start, np.float32),
+            motion=np.asarray(recording.motion, np.float32),
+            depth=np.asarray(recording.depth, np.float32),
+            tilt=np.asarray(recording.tilt, np.float32),
+            modulus=np.asarray(material.modulus, np.float32),
+            friction=np.asarray(material.friction, np.float32),
+            unit=recording.unit,
+            drift=recording.drift,
+            seed=np.asarray(recording.seed, np.uint32),
         )
 
 
@@ -377,44 +419,49 @@ def stack_trees(trees: Sequence[Tree]) -> Tree:
 
 
 class SimulatedTouch(NamedTuple):
-    """Pictures u8 (B, h, w, 3), the gel's `background`, and fields of B touches at the picture's
-    pixels.
+    """What the camera sees and the gel feels of B touches, at the picture's pixels (h, w)."""
 
-    `depth` (B, h, w) is the gel's displacement in mm. `shear` (B, h, w, 2) is in mm along x and y
-    of the picture. `pressure` (B, h, w) is in kPa, `force` (B, 3) in N along x, y and into the gel,
-    `torque` (B,) in N mm.
-    """
-
-    image: Any
-    background: Any
-    depth: Any
-    shear: Any
-    pressure: Any
-    force: Any
-    torque: Any
+    image: Array  # u8 (B, h, w, 3)
+    background: Leaf  # u8 (B, h, w, 3), of the untouched gel
+    depth: Array  # (B, h, w) mm, the gel's displacement
+    shear: Array  # (B, h, w, 2) mm along x and y of the picture
+    pressure: Array  # (B, h, w) kPa
+    force: Array  # (B, 3) N along x, y and into the gel
+    torque: Array  # (B,) N mm
 
 
-def simulate_touch(
-    height_map: Any,
-    pose: Any,
+def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all optional but three
+    height_map: npt.ArrayLike | Array,
+    pose: npt.ArrayLike | Array,
     sensor: str = "digit",
     *,
-    drag: Any = (0.0, 0.0, 0.0),
+    drag: npt.ArrayLike | Array = (0.0, 0.0, 0.0),
     size: int = 224,
     modulus: float = 1e6,
     friction: float = 0.6,
     fidelity: Fidelity = "fast",
     unit: Unit | None = None,
 ) -> SimulatedTouch:
-    """Press a surface into the gel of a sensor, and return what the camera sees and the gel feels.
+    """Press a surface into the gel of a sensor: what the camera sees and the gel feels.
 
-    `height_map` (H, W) is in mm, with 0.1 mm between pixels, its highest part nearest to the gel.
-    `pose` (B, 4) is the touched place x and y in mm from the map's centre, the turn in rad, and the
-    depth in mm. `drag` (B, 3) mm, mm and rad moves the object over the gel under the whole
-    pressure. `modulus` kPa and `friction` are the object's. `unit` is a device
-    (`sensors.draw_unit`), by default the nominal one without markers. With fidelity "fast" all but
-    the pictures can be differentiated with respect to pose and drag. Use it under jit. Raises
-    UserError without a camera.
+    Use it under jit. With fidelity "fast" all but the pictures can be differentiated with respect
+    to pose and drag.
+
+    Args:
+        height_map: (H, W) mm, with 0.1 mm between pixels, its highest part nearest to the gel.
+        pose: (B, 4): the touched place x and y in mm from the map's centre, the turn in rad, and
+            the depth in mm.
+        sensor: A name, or a folder NAME.sensor.
+        drag: (B, 3) mm, mm and rad, by which the object moves over the gel under the whole
+            pressure.
+        size: Short side of the picture, pixels.
+        modulus: Of the object, kPa.
+        friction: Between object and gel.
+        fidelity: How contact is solved (`mechanics.press`).
+        unit: A device (`sensors.draw_unit`), by default the nominal one without markers.
+
+    Raises:
+        UserError: For a sensor without a camera, and for arrays of other shapes.
     """
     kind = find_sensor(sensor)
     if kind.kind != "image":
@@ -425,37 +472,37 @@ def simulate_touch(
     if relief.ndim != 2 or pose.shape[1] != 4:
         raise UserError(
             f"a height map is (H, W) mm with {SPACING} mm between pixels and a pose (B, 4), not "
-            f"{relief.shape} and "
-            f"{pose.shape}"
+            f"{relief.shape} and {pose.shape}"
         )
     moves = jnp.broadcast_to(jnp.atleast_2d(jnp.asarray(drag, jnp.float32)), (len(pose), 3))
     device = identity_unit(kind) if unit is None else unit
 
-    def one(pose: jax.Array, drag: jax.Array) -> SimulatedTouch:
+    def one(pose: Array, drag: Array) -> SimulatedTouch:
         clip = ClipInput(
-            relief,
-            pose[:2],
-            jnp.stack([0.0 * pose[0], 0.0 * pose[0], pose[2]]),
-            drag[None],
-            pose[3:],
-            jnp.zeros(2),
-            jnp.float32(modulus),
-            jnp.float32(friction),
-            device,
-            jnp.zeros((1, 3, 3)),
-            jnp.uint32(0),
+            relief=relief,
+            place=pose[:2],
+            start=jnp.stack([0.0 * pose[0], 0.0 * pose[0], pose[2]]),
+            motion=drag[None],
+            depth=pose[3:],
+            tilt=jnp.zeros(2),
+            modulus=jnp.float32(modulus),
+            friction=jnp.float32(friction),
+            unit=device,
+            drift=jnp.zeros((1, 3, 3)),
+            seed=jnp.uint32(0),
         )
         out = simulate_clip(clip, sensor=kind, fidelity=fidelity, size=size, fields=FIELDS)
+        assert out.image is not None and out.background is not None and out.field is not None
         force = jnp.stack([out.labels[name][-1] for name in ("force_x", "force_y", "force")])
         field = out.field[-1]
         return SimulatedTouch(
-            out.image[-1],
-            out.background,
-            field[..., 0],
-            field[..., 1:3],
-            field[..., 3],
-            force,
-            out.labels["torque"][-1],
+            image=out.image[-1],
+            background=out.background,
+            depth=field[..., 0],
+            shear=field[..., 1:3],
+            pressure=field[..., 3],
+            force=force,
+            torque=out.labels["torque"][-1],
         )
 
     return jax.vmap(one)(pose, moves)

@@ -15,11 +15,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.config.parsing import Below1, Count, NotNegative, Share, check
+from anytouch_jax.config import SimulatedConfig
+from anytouch_jax.config.parsing import check
+from anytouch_jax.config.scenes import SceneOptions
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.draws import Rng, either, namespace_of
+from anytouch_jax.sim.draws import Leaf, Rng, either, namespace_of
 from anytouch_jax.sim.sensing.own import find_sensor, sensor_number
-from anytouch_jax.sim.sensing.sensors import THINNEST, Unit, draw_drift, draw_unit
+from anytouch_jax.sim.sensing.sensors import THINNEST, Sensor, Unit, draw_drift, draw_unit
 from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
 
 Array = np.ndarray
@@ -39,38 +41,27 @@ _UNIT = 6
 
 
 @dataclass(frozen=True)
-class Scenes:
-    """What to simulate: `touches` places on `objects` objects, each recorded by every sensor for
-    `frames` frames.
+class Scenes(SceneOptions):
+    """A simulated data set: the options of `SceneOptions`, checked.
 
-    With grade "fine" all sensors share place, depth and motion, so frames correspond one to one.
-    With "coarse" every sensor has its own tilt, twist, offset, speed and motion, as by hand, and
-    only the place is shared. Data sets with the same seed, number of objects and held-out share
-    have the same objects and splits. They share no touch if their numbers, from `first` on, do not
-    overlap. Raises UserError for a scene that cannot be simulated.
+    `touches` places on `objects` objects are each recorded by every sensor for `frames` frames.
+    Half of the held-out share of the remaining objects is for validation, if enough objects are
+    left. With fewer than 12 objects all are for training. Raises UserError for a scene that cannot
+    be simulated.
     """
 
-    touches: Count[int] = 400
-    sensors: tuple[str, ...] = ("gelsight_mini", "digit", "duragel")
-    seed: NotNegative[int] = 0
-    grade: Grade = "fine"
-    fidelity: Literal["exact", "fast"] = "fast"
-    frames: Count[int] = 10
-    objects: Count[int] = 200
-    depth: tuple[float, float] = (0.3, 1.0)  # mm, range of the deepest press
-    vision: Share = 0.7  # share of recordings with a photograph
-    text: Share = 0.7  # share of recordings with a caption
-    # Share of test objects, held out by whole (primitive, texture) pairs. Half this share of the
-    # rest is for val, if enough objects are left. With fewer than 12 objects all are for training.
-    held_out: Below1 = 0.25
-    fields: tuple[str, ...] = ()  # of FIELDS, written next to the images
-    size: int = 224  # pixels of the short side; 0 is each sensor's own resolution
-    # "each" draws a sensor unit for every recording. "one" uses one unit of each sensor, mounted
-    # straight, as on the paper's calibrated platform.
-    units: Literal["each", "one"] = "each"
-    first: NotNegative[int] = 0  # number of the first touch
-
     def __post_init__(self) -> None:
+        kinds = self._checked_sensors()
+        self._check_depth(kinds)
+        if self.size and not 16 <= self.size <= _MAX_SIZE:
+            raise UserError(
+                f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not "
+                f"{self.size}"
+            )
+        check(self)
+
+    def _checked_sensors(self) -> list[Sensor]:
+        """Return the sensors, after a check of their names and of those of the fields."""
         for name in self.fields:
             if name not in FIELDS:
                 raise UserError(
@@ -82,23 +73,23 @@ class Scenes:
                 raise UserError(f"name each {what} once, not {', '.join(names)}")
         if not self.sensors:
             raise UserError("name at least one sensor")
-        check(self)
-        if self.size and not 16 <= self.size <= _MAX_SIZE:
-            raise UserError(
-                f"size is 16 to {_MAX_SIZE} pixels, or 0 for each sensor's own resolution, not "
-                f"{self.size}"
-            )
         if self.fields and all(one.kind == "field" for one in kinds):
             raise UserError(
                 "fields are written next to images, and no sensor has a camera: omit --fields"
             )
+        return kinds
+
+    def _check_depth(self, kinds: Sequence[Sensor]) -> None:
+        """Raise UserError for a range of depths that is none, or that goes through a gel."""
         low, high = self.depth
         if not 0 <= low <= high < math.inf:
             raise UserError(
                 f"depth is a range of mm from 0 on, lowest first, not {low:g} to {high:g}"
             )
         thin = min(kinds, key=lambda one: one.gel.thickness)
-        thinnest = thin.gel.thickness * (THINNEST if self.units == "each" else 1.0)
+        thinnest = thin.gel.thickness
+        if self.units == "each":
+            thinnest = thinnest * THINNEST
         if high >= thinnest:
             raise UserError(
                 f"depth {high:g} mm may go through the gel of {thin.name}: stay below {thinnest:g} "
@@ -106,61 +97,51 @@ class Scenes:
             )
 
 
+def training_scenes(simulated: SimulatedConfig) -> Scenes:
+    """Return the scenes whose objects and splits training on simulated touches has."""
+    return Scenes(objects=simulated.objects, seed=simulated.seed, depth=simulated.depth)
+
+
 class Touch(NamedTuple):
-    """A place to touch: the object's number, its split, place (2,) mm and `yaw` rad of the sensor,
-    and the motion.
-    """
+    """A place to touch on an object, and the motion there."""
 
     number: int
-    object: int
+    object: int  # number of the object
     split: str
-    place: Array
-    yaw: float
+    place: Array  # (2,) mm in the object's frame
+    yaw: float  # rad of the sensor
     gesture: Gesture
 
 
 class Gesture(NamedTuple):
-    """A motion of the sensor: deepest `depth` mm, total `slide` (2,) mm and `twist` rad.
+    """A motion of the sensor. Times are in parts of the whole gesture, 0 to 1."""
 
-    `motion` numbers MOTIONS.
-
-    `phases` (7,) are the shares of lift, press, pause, move, pause, release and lift. A clip shows
-    `shown` of the gesture around `middle`. At `lift` the sensor is off for a moment and comes back
-    moved by `regrasp` (3,).
-    """
-
-    depth: Any
-    motion: Any
-    slide: Any
-    twist: Any
-    phases: Any
-    shown: Any
-    middle: Any
-    lift: Any
-    regrasp: Any
+    depth: Any  # mm, deepest
+    motion: Any  # a number of MOTIONS
+    slide: Any  # (2,) mm in total
+    twist: Any  # rad in total
+    phases: Any  # (7,) durations of lift, press, pause, move, pause, release and lift
+    shown: Any  # duration of the clip
+    middle: Any  # time in the middle of the clip
+    lift: Any  # time at which the sensor is off for a moment, -1 for never
+    regrasp: Any  # (3,) mm, mm, rad by which it comes back moved
 
 
 class Recording(NamedTuple):
-    """One sensor's clip of a touch, by one sensor unit.
-
-    `start` (3,) mm, mm, rad is the touched place in the gel's frame and the object's turn. `motion`
-    (T, 3) mm, mm, rad moves it from there, about the middle of the gel. `depth` (T,) is in mm,
-    negative without contact. `tilt` (2,) is in rise per mm. `drift` (T, 3, 3) is that of the light,
-    `seed` that of the image noise.
-    """
+    """One sensor's clip of a touch with T frames, by one sensor unit."""
 
     touch: Touch
     sensor: str
     unit: Unit
-    start: Array
-    motion: Array
-    depth: Array
-    tilt: Array
+    start: Array  # (3,) mm, mm, rad: the touched place in the gel's frame, and the object's turn
+    motion: Array  # (T, 3) mm, mm, rad from there, about the middle of the gel
+    depth: Array  # (T,) mm, negative without contact
+    tilt: Array  # (2,) rise per mm
     gesture: Gesture
-    drift: Array
+    drift: Leaf  # (T, 3, 3) of the light
     has_photo: bool
     has_text: bool
-    seed: int
+    seed: int  # of the image noise
 
 
 def objects_and_splits(scenes: Scenes) -> tuple[tuple[Object, ...], tuple[str, ...]]:
@@ -178,12 +159,10 @@ def objects_and_splits(scenes: Scenes) -> tuple[tuple[Object, ...], tuple[str, .
             f"--objects {scenes.objects} and --held-out {scenes.held_out:g}: {error}"
         ) from None
     split = {thing.name: "test" for thing in test}
-    # too few remain for a validation set
+    # Too few may remain for a validation set. Then there is none.
     with contextlib.suppress(UserError):
-        split |= {
-            thing.name: "val"
-            for thing in hold_out(training, scenes.held_out / 2, scenes.seed + 1)[1]
-        }
+        _, validation = hold_out(training, scenes.held_out / 2, scenes.seed + 1)
+        split |= {thing.name: "val" for thing in validation}
     return objects, tuple(split.get(thing.name, "train") for thing in objects)
 
 
@@ -193,10 +172,9 @@ def draw_touch(scenes: Scenes, number: int, splits: Sequence[str]) -> Touch:
     Objects take turns in a seeded order. Places are within 3 mm of the middle.
     """
     rng = np.random.default_rng([scenes.seed, _TOUCH, number])
-    turn, place = divmod(number, len(splits))
-    thing = int(
-        np.random.default_rng([scenes.seed, _OBJECTS, turn]).permutation(len(splits))[place]
-    )
+    turn, place_in_turn = divmod(number, len(splits))
+    order = np.random.default_rng([scenes.seed, _OBJECTS, turn]).permutation(len(splits))
+    thing = int(order[place_in_turn])
     place, yaw = draw_place(rng)
     return Touch(number, thing, splits[thing], place, yaw, draw_gesture(scenes.depth, rng))
 
@@ -205,6 +183,7 @@ def draw_place(rng: Rng) -> tuple[Any, Any]:
     """Return a place (2,) mm within 3 mm of an object's middle, and the yaw of the sensor there."""
     xp = namespace_of(rng)
     angle = rng.uniform(0, 2 * math.pi)
+    # The root makes places as dense at the rim of the disc as in its middle.
     away = 3.0 * xp.sqrt(rng.uniform())
     return xp.stack([xp.cos(angle), xp.sin(angle)]) * away, rng.uniform(-math.pi, math.pi)
 
@@ -212,12 +191,11 @@ def draw_place(rng: Rng) -> tuple[Any, Any]:
 def draw_gesture(depths: tuple[float, float], rng: Rng, like: Gesture | None = None) -> Gesture:
     """Return a gesture. With `like`, its depth is similar and its speed and motion are drawn."""
     xp = namespace_of(rng)
-    (low, high) = depths
-    depth = (
-        rng.uniform(low, high)
-        if like is None
-        else xp.clip(like.depth * rng.uniform(0.7, 1.3), low, high)
-    )
+    low, high = depths
+    if like is None:
+        depth = rng.uniform(low, high)
+    else:
+        depth = xp.clip(like.depth * rng.uniform(0.7, 1.3), low, high)
     motion = rng.integers(len(MOTIONS))
     angle = rng.uniform(0, 2 * math.pi)
     length = rng.uniform(0.4, 2.5)
@@ -226,6 +204,7 @@ def draw_gesture(depths: tuple[float, float], rng: Rng, like: Gesture | None = N
     slide = xp.stack([xp.cos(angle), xp.sin(angle)]) * length * slides
     phases = rng.uniform([0, 0.1, 0, 0.25, 0, 0.08, 0], [0.15, 0.35, 0.15, 0.5, 0.2, 0.2, 0.1])
     phases = phases / phases.sum()
+    # A clip's middle and a regrasp lie between the end of the press and the start of the release.
     first = phases[:2].sum() * 0.8
     last = 1 - phases[5:].sum()
     shown = xp.exp(rng.uniform(math.log(0.35), math.log(1.2)))
@@ -238,33 +217,30 @@ def draw_gesture(depths: tuple[float, float], rng: Rng, like: Gesture | None = N
 def draw_by_hand(
     depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: Any
 ) -> tuple[Gesture, Any, Any, Any]:
-    """Return another sensor's gesture, yaw, offset (2,) mm and tilt (2,) at a touch of grade
-    coarse.
+    """Return another sensor's gesture, yaw, offset and tilt at a touch of grade coarse.
+
+    The offset is (2,) mm, the tilt (2,) in rise per mm.
     """
     gesture = draw_gesture(depths, rng, gesture)
     yaw = yaw + math.radians(12) * rng.standard_normal()
-    return (
-        gesture,
-        yaw,
-        0.8 * rng.standard_normal(2),
-        math.tan(math.radians(2.5)) * rng.standard_normal(2),
-    )
+    offset = 0.8 * rng.standard_normal(2)
+    tilt = math.tan(math.radians(2.5)) * rng.standard_normal(2)
+    return gesture, yaw, offset, tilt
 
 
 def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     """Return the clip of `touch` by `sensor`. Draws do not depend on the other sensors."""
     kind = find_sensor(sensor)
     rng = np.random.default_rng([scenes.seed, _RECORDING, touch.number, sensor_number(kind)])
+    # It is drawn with units "one" too, so that the rest of the recording is the same.
     unit = draw_unit(kind, rng)
-    if scenes.units == "one":  # not mirrored, not rotated, not moved
-        unit = draw_unit(kind, np.random.default_rng([scenes.seed, _UNIT, sensor_number(kind)]))
-        none = np.zeros(2)
-        unit = unit._replace(
-            mirror=np.float32(none + 1), rotation=np.float32(0), offset=np.float32(none)
-        )
+    if scenes.units == "one":
+        unit = _mounted_straight(scenes, kind)
     if kind.kind == "field":  # it has no camera
         unit = unit._replace(
-            mirror=np.ones(2, np.float32), window=np.zeros(2, np.float32), zoom=np.float32(1)
+            mirror=np.ones(2, np.float32),
+            window=np.zeros(2, np.float32),
+            zoom=np.ones((), np.float32),
         )
     gesture = touch.gesture
     yaw = touch.yaw
@@ -282,6 +258,16 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
     )
 
 
+def _mounted_straight(scenes: Scenes, kind: Sensor) -> Unit:
+    """Return the one unit of a sensor: not mirrored, not rotated, not moved."""
+    unit = draw_unit(kind, np.random.default_rng([scenes.seed, _UNIT, sensor_number(kind)]))
+    return unit._replace(
+        mirror=np.ones(2, np.float32),
+        rotation=np.zeros((), np.float32),
+        offset=np.zeros(2, np.float32),
+    )
+
+
 def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
     """Return motion (T, 3) since the touch, and depth (T,), negative without contact.
 
@@ -290,7 +276,9 @@ def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
     if frames == 1:
         return np.zeros((1, 3)), np.array([gesture.depth])
     times = gesture.middle + gesture.shown * np.linspace(-0.5, 0.5, frames)
-    return moved(gesture, times, max(0.04, gesture.shown / (frames - 1) / 2), np)
+    # A lift shorter than a frame would not be seen.
+    gap = max(0.04, gesture.shown / (frames - 1) / 2)
+    return moved(gesture, times, gap, np)
 
 
 def moved(gesture: Gesture, times: Any, gap: Any, xp: ModuleType) -> tuple[Any, Any]:
@@ -301,6 +289,7 @@ def moved(gesture: Gesture, times: Any, gap: Any, xp: ModuleType) -> tuple[Any, 
     ends = xp.cumsum(gesture.phases)
 
     def smooth(phase: int) -> Any:
+        """Return how much of a phase is over, 0 to 1, with no jump of the speed at its ends."""
         x = xp.clip((times - ends[phase - 1]) / gesture.phases[phase], 0, 1)
         return x**2 * (3 - 2 * x)
 
@@ -316,13 +305,16 @@ MOVES = (0.1, math.radians(1))  # mm and rad that the gel must be moved to be la
 
 
 def directions(recording: Recording) -> dict[str, str]:
-    """Return labels of the motion in contact as the image shows it: `label.motion`, `label.twist`
-    and `label.slide`.
+    """Return labels of the motion in contact as the image shows it.
+
+    They are `label.motion`, `label.twist` and `label.slide`. A regrasp is not in contact, so the
+    motion is that of the gesture without its lift.
     """
     unit = recording.unit
     touching = recording.depth > 0
     steps = np.diff(trajectory(len(touching), recording.gesture._replace(lift=-1.0))[0], axis=0)
     *slid, turn = steps[touching[1:] & touching[:-1]].sum(0)
+    # A mirror image turns the other way, and one mirrored twice does not.
     turn *= float(unit.mirror[0] * unit.mirror[1])
     motion = "hold"
     twist = "none"

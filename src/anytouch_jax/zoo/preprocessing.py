@@ -121,10 +121,10 @@ def _add_statistics(
         scale = 255.0 * factor
     else:
         ignored.append(f"rescale_factor {str(factor)[:40]}")
-    given = {"mean": stated.get("image_mean"), "std": stated.get("image_std")}
+    stored = {"mean": stated.get("image_mean"), "std": stated.get("image_std")}
     if not does["do_normalize"]:
-        given = {"mean": [0.0] * 3, "std": [1.0] * 3}
-    given = {name: value for name, value in given.items() if value is not None}
+        stored = {"mean": [0.0] * 3, "std": [1.0] * 3}
+    given: dict[str, Any] = {name: value for name, value in stored.items() if value is not None}
     is_scaled = abs(scale - 1) > 1e-6
     if is_scaled and len(given) == 2 and all(_numbers(value) for value in given.values()):
         given = {name: [number / scale for number in value] for name, value in given.items()}

@@ -2,6 +2,7 @@
 are not saved.
 """
 
+import signal
 from itertools import count
 from types import SimpleNamespace
 
@@ -16,9 +17,10 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import CheckError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.sim.endless import SimulatedTouches
-from anytouch_jax.sim.fitting import tokens
+from anytouch_jax.sim.fitting import contrast, tokens
 from anytouch_jax.sim.sensing.own import OwnSensor, write_sensor
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
+from anytouch_jax.train import pace
 from anytouch_jax.weights import checkpoint
 from anytouch_jax.weights.tree import flatten
 
@@ -27,15 +29,15 @@ def felt(key, world, *, size):
     """Touches of random patterns. Your sensor shows their negative."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     seen = (
-        rng.integers(80, 176, (tokens.COUNT, 1, 1, 4, 4, 3))
+        rng.integers(80, 176, (contrast.COUNT, 1, 1, 4, 4, 3))
         .repeat(size // 4, 3)
         .repeat(size // 4, 4)
     )
     clip = np.concatenate([seen, 255 - seen], 1).astype(np.uint8)
-    sensor = np.stack([1 + np.arange(tokens.COUNT) % 2, np.zeros(tokens.COUNT, int)], 1).astype(
+    sensor = np.stack([1 + np.arange(contrast.COUNT) % 2, np.zeros(contrast.COUNT, int)], 1).astype(
         np.int32
     )
-    none = np.zeros(tokens.COUNT, np.int32)
+    none = np.zeros(contrast.COUNT, np.int32)
     return SimulatedTouches(
         clip, np.full_like(clip[:, :, 0], 128), sensor, none, none, None, None, None, None, {}
     )
@@ -58,7 +60,7 @@ def run(tmp_path, monkeypatch):
     monkeypatch.setattr(tokens, "own_world", lambda *_: None)
     ticks = count()
     # a step takes 0.1 s
-    monkeypatch.setattr(tokens, "time", SimpleNamespace(monotonic=lambda: 0.1 * next(ticks)))
+    monkeypatch.setattr(pace, "time", SimpleNamespace(monotonic=lambda: 0.1 * next(ticks)))
     config = run_config(tmp_path / "none.csv").with_settings({"data.background": "subtract"})
     params = build(config.model).init(jax.random.key(0))
     params["touch"]["sensor_tokens"] = params["touch"]["sensor_tokens"] * 20
@@ -74,20 +76,16 @@ def run(tmp_path, monkeypatch):
 
 
 def stopping(monkeypatch, steps):
-    """Let the training be interrupted after some steps."""
-    real = tokens._train
+    """Let Ctrl-C arrive while the batch of a step is made."""
+    real = tokens.felt_batches
 
-    def train(kept, step, *rest):
-        number = count(1)
+    def batches(start, stop, **options):
+        for step, batch, info in real(start, stop, **options):
+            if step == steps - 1:
+                signal.raise_signal(signal.SIGINT)
+            yield step, batch, info
 
-        def counted(*words):
-            if next(number) > steps:
-                raise KeyboardInterrupt
-            return step(*words)
-
-        return real(kept, counted, *rest)
-
-    monkeypatch.setattr(tokens, "_train", train)
+    monkeypatch.setattr(tokens, "felt_batches", batches)
 
 
 @pytest.mark.parametrize("deep", [False, True])
@@ -109,12 +107,12 @@ def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_
     with monkeypatch.context() as stopped:
         stopping(stopped, 18)
         assert app.main(words) == 130
-    state = tmp_path / "out.part.npz"
-    assert state.is_file() and not (tmp_path / "out").exists()
+    state = tmp_path / "out.part"
+    assert state.is_dir() and not (tmp_path / "out").exists()
     scores = iter((0.2, 0.4) * 2)
     monkeypatch.setattr(tokens, "_found", lambda *_: next(scores))
     assert app.main(words) == 0 and not state.exists()
-    assert "continued after 18 steps of 30" in capsys.readouterr().err
+    assert "continuing from the checkpoint of step 18 of 30" in capsys.readouterr().err
     assert app.main([*words[: -1 - deep], str(tmp_path / "undisturbed"), *["--deep"] * deep]) == 0
     resumed, undisturbed = (
         flatten(checkpoint.load_params(tmp_path / name)[0]) for name in ("out", "undisturbed")
@@ -143,7 +141,7 @@ def test_tokens_that_find_fewer_touches_are_not_saved(run, mine, tmp_path, monke
 
 def test_training_finds_touches_that_the_universal_tokens_do_not(run, mine, monkeypatch):
     monkeypatch.setattr(tokens, "BATCHES", 2)
-    monkeypatch.setattr(tokens, "DEEP_RATE", 3e-3)
+    monkeypatch.setattr(contrast, "DEEP_RATE", 3e-3)
     adapted = tokens.adapt_by_simulation(run, mine, minutes=0.25, deep=True)
     assert len(adapted.losses) == 150 and adapted.after > adapted.before
 

@@ -10,16 +10,16 @@ import numpy.typing as npt
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.manifest.schema import shown
 from anytouch_jax.errors import UserError
+from anytouch_jax.sensors import RECORDS
 
 # Score above which a frame is contact. Measured on real frames for gelsight_mini (with and without
 # dots), gelslim and gelsight. The one of 9dtact is below its one light press. The default of the
 # other sensors is untested.
 DEFAULT_THRESHOLD = 6.5
 THRESHOLDS: Mapping[str, float] = {
-    "gelsight_mini": 6.5,
-    "gelslim": 6.5,
-    "gelsight": 6.5,
-    "9dtact": 4.0,
+    name: record.contact_threshold
+    for name, record in RECORDS.items()
+    if record.contact_threshold is not None
 }
 # Columns that report contact, in order of preference, and the value above which they do.
 REFERENCES: Mapping[str, float] = {

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.evaluate.tasks import TaskRows
 
+FEWEST = (
+    9  # recordings from which a set of names, or a novel touch, can be told: COVERAGE takes them
+)
 _FRAMES = 20  # frames of a recording that are fitted on, evenly spread
 
 
@@ -98,11 +101,13 @@ def fit_head(
     if several:
         # A fold that lacks a name is not counted, so recordings that stand alone cost some.
         count = max(1, several - once * math.ceil(len(recorded) / splits.FOLDS))
-        # What so few recordings can promise: a fraction of 0.9 takes nine.
-        coverage = min(COVERAGE, math.floor(100 * count / (count + 1)) / 100)
-        false_alarms = max(FALSE_ALARMS, math.ceil(100 / (count + 1)) / 100)
+        # Under nine recordings nothing can be promised: sets hold every name, and nothing is novel.
+        # From nine on, false alarms are as rare as so many recordings allow.
+        false_alarms = FALSE_ALARMS
+        if count >= FEWEST:
+            false_alarms = max(FALSE_ALARMS, math.ceil(100 / (count + 1)) / 100)
         head = probing.calibrated(
-            head, x, rows, penalty, log, coverage=coverage, false_alarms=false_alarms
+            head, x, rows, penalty, log, coverage=COVERAGE, false_alarms=false_alarms
         )
     return TaughtHead(head, x, ids, rows, names[times > 1], once)
 

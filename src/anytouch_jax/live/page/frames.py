@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.background.rule import RunningGel, other_unit, same_unit
 from anytouch_jax.encoder.arrays import Array
+from anytouch_jax.live.page.layers import LAYERS, touch_layer
 from anytouch_jax.live.page.setup import Setup, make_setup, measure_last
 
 if TYPE_CHECKING:
@@ -72,6 +73,10 @@ class FrameReader:
         if not kept or kept[-1].number != number:
             return []
         return kept
+
+    def score(self, one: Kept) -> float:
+        """Return the contact score of a frame, NaN if its background is not known."""
+        return touch_layer(one.turned, one.setup.small, self.threshold, LAYERS[0])[1]
 
     def warm_up(self, row: int) -> None:
         """Compile what measures sensor `row`, and forget what it saw of an empty picture."""

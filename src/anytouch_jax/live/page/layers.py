@@ -102,14 +102,18 @@ def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
 def field_numbers(measured: Fields) -> dict[str, Any]:
     """Return what the page writes of a frame.
 
-    `high` is the depth of a white place of the surface, in widths of the picture.
+    `scale` is the depth of the lightest colour, in the unit of the depth. `high` is the same in
+    widths of the picture.
     """
     from anytouch_jax.fields.measure import depth_levels
 
     about = measured.summary()
     unit = "widths" if measured.width_mm is None else "mm"
     curves = {"force, N": about["force_z"], f"depth, {unit}": about["depth"]}
-    curves["slip"] = about["slip"] if measured.area[0] > 0 else 0.0
+    slip = about["slip"]
+    if measured.area[0] > 0 and slip is not None:
+        # Where nothing touches, nothing slips, and there is no number.
+        curves["slip, %"] = 100 * slip
     _, high = depth_levels(measured.depth[0], measured.width_mm)
     return {
         "curves": {name: round(value, 4) for name, value in curves.items() if value is not None},
@@ -121,5 +125,6 @@ def field_numbers(measured: Fields) -> dict[str, Any]:
         "area": about["area"],
         "unit": unit,
         "faults": measured.faults,
+        "scale": high,
         "high": high / (measured.width_mm or 1.0),
     }

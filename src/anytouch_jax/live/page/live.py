@@ -14,13 +14,13 @@ import numpy as np
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedFilm, open_source
+from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
 from anytouch_jax.live.page.frames import FrameReader
-from anytouch_jax.live.page.layers import LAYERS, MEASURED, field_numbers, touch_layer
 from anytouch_jax.live.page.naming import NearestTouches, name_touch
-from anytouch_jax.live.page.packet import Shown, packet
+from anytouch_jax.live.page.packet import Shown, describe_touch, layers_of, packet
 from anytouch_jax.live.page.recorder import LiveRecorder
 from anytouch_jax.live.page.teach import Teacher
-from anytouch_jax.live.stream import Embedded, StreamSettings, stream_with
+from anytouch_jax.live.stream import Embedded, Source, StreamSettings, stream_with
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
@@ -90,15 +90,19 @@ class Live:
             "head": self._head and self._head.label,
             "source": self.source,
             "table": self._space and self._space.table,
-            "layers": list(LAYERS if self._encoder.measures else LAYERS[: -len(MEASURED)]),
+            "layers": layers_of(self._encoder.measures),
         }
 
     def start(self) -> None:
         """Open the source and begin. Raises UserError if it cannot be opened."""
-        source, live = open_source(self.source, self._camera, self._log)
-        if not live and Path(self.source).is_file():
-            source.release()
-            source = LoopedFilm(Path(self.source))
+        source: Source
+        if self.source == EXAMPLE:
+            source = ExampleCamera()
+        else:
+            source, live = open_source(self.source, self._camera, self._log)
+            if not live and Path(self.source).is_file():
+                source.release()
+                source = LoopedFilm(Path(self.source))
         self._thread = threading.Thread(target=self._run, args=(source,), daemon=True)
         self._thread.start()
 
@@ -156,34 +160,26 @@ class Live:
             return
         picture = kept[-1].turned
         setup = kept[-1].setup
-        threshold = self.frames.threshold
-        score = touch_layer(picture, setup.small, threshold, LAYERS[0])[1]
-        is_known = score == score  # NaN: the background is not known yet
-        fields = self.frames.measured(kept, self._row) if is_known else None
-        measured = None if fields is None else field_numbers(fields)
-        curves = {}
-        if is_known:
-            curves["contact"] = round(score, 2)
-        if measured is not None:
-            curves |= measured["curves"]
+        score = self.frames.score(kept[-1])
+        fields = None
+        if score == score:  # NaN: the background is not known yet
+            fields = self.frames.measured(kept, self._row)
         self.recorder.add(picture, score, frame.values)
+        self.teacher.look()
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
         about: dict[str, Any] = {
             "frame": frame.number,
             "grabbed": 1e3 * (frame.started + frame.at),
             "picture": frame.picture,
-            "contact": bool(score > threshold) if is_known else None,
-            "threshold": threshold,
             "gel": "captured" if setup.running is None else "estimated",
-            "curves": curves,
-            "fields": measured,
             "encoder": encoder.round(2).tolist(),
             "age": age.round(2).tolist(),
             "missed": frame.missed,
             "recording": self.recorder.state(),
             "taught": self.teacher.version,
         }
+        about |= describe_touch(score, self.frames.threshold, fields)
         about |= name_touch(self._head_in_use(), frame.values)
         spaces = {"near": self._space, "recorded": self.teacher.space}
         about |= self._nearest(frame.values, spaces)

@@ -6,6 +6,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from anytouch_jax.encoder.arrays import Array, unit_rows
+from anytouch_jax.encoder.calibration import support
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.linear_head import LinearHead
@@ -15,7 +16,11 @@ _SEARCH = 0.5  # seconds between searches for the nearest touches
 
 
 def name_touch(head: LinearHead | None, values: Array) -> dict[str, Any]:
-    """Return the name of features (E,), and whether to believe it."""
+    """Return the name of features (E,), and whether to believe it.
+
+    `p` is never more than the recordings of the head support. Without a `limit` there are too few
+    of them to tell anything new.
+    """
     if head is None:
         return {}
     if head.calibration is None:
@@ -25,7 +30,9 @@ def name_touch(head: LinearHead | None, values: Array) -> dict[str, Any]:
     limit = head.calibration.novelty_limit
     return {
         "label": str(one.label[0]),
-        "p": round(float(one.p.max()), 3),
+        # A touch far from all others is far from the borders between classes, too.
+        "p": round(min(float(one.p.max()), support(head.calibration.recordings)), 3),
+        "recordings": head.calibration.recordings,
         "novel": bool(one.novel[0]),
         "set": head.classes[one.in_set[0]].tolist(),
         "novelty": round(float(one.novelty[0]), 3),

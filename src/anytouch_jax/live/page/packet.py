@@ -13,7 +13,13 @@ import cv2
 from anytouch_jax.data.background.estimate import UntouchedGel
 from anytouch_jax.data.images import encode
 from anytouch_jax.encoder.arrays import Array
-from anytouch_jax.live.page.layers import LAYERS, MEASURED, measured_layer, touch_layer
+from anytouch_jax.live.page.layers import (
+    LAYERS,
+    MEASURED,
+    field_numbers,
+    measured_layer,
+    touch_layer,
+)
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.measured import Fields
@@ -37,6 +43,35 @@ class Shown(NamedTuple):
     picture: Array | None = None
     gel: tuple[Array, UntouchedGel] | None = None
     fields: Fields | None = None
+
+
+def layers_of(measures: bool) -> list[str]:
+    """Return the layers of live touch, by an encoder that measures or does not."""
+    return [name for name in LAYERS if measures or name not in MEASURED]
+
+
+def describe_touch(score: float, threshold: float, fields: Fields | None) -> dict[str, Any]:
+    """Return contact, its curve, and what was measured of a frame.
+
+    Args:
+        score: contact score, NaN if the background is not known.
+        threshold: above it there is contact.
+        fields: what was measured.
+    """
+    is_known = score == score
+    curves = {}
+    if is_known:
+        curves["contact"] = round(score, 2)
+    measured = None
+    if fields is not None:
+        measured = field_numbers(fields)
+        curves |= measured["curves"]
+    return {
+        "contact": bool(score > threshold) if is_known else None,
+        "threshold": threshold,
+        "curves": curves,
+        "fields": measured,
+    }
 
 
 def packet(shown: Shown, layer: str) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import re
 import shutil
@@ -12,14 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
-import pyarrow as pa
 
 from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.data.images import encode
-from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import EMPTY
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
+from anytouch_jax.live.page.shared import SharedManifest
 
 SCORE = "label.contact_score"
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
@@ -44,7 +44,8 @@ class LiveRecorder:
         self.out = out.expanduser().resolve()
         self.named = out
         self.sensor = sensor or UNIVERSAL
-        self.file = self.out / "manifest.parquet"
+        self.manifest = SharedManifest(self.out)
+        self.file = self.manifest.file
         # of recorded frames, by their path in the manifest
         self.features: dict[str, Array] = {}
         self._queue: queue.Queue[_Recorded | None] | None = None
@@ -75,7 +76,7 @@ class LiveRecorder:
         if self._queue is not None:
             raise UserError("A recording is on already. Stop it first.")
         self._join()
-        target = self._new_folder(name)
+        part, target = self._new_folders(name)
         self._written = 0
         self._lost = 0
         self._name = name
@@ -83,7 +84,7 @@ class LiveRecorder:
         waiting: queue.Queue[_Recorded | None] = queue.Queue()
         # A second Ctrl-C must not end it, so it is no daemon.
         self._thread = threading.Thread(
-            target=self._write, args=(waiting, target, gel), daemon=False
+            target=self._write, args=(waiting, part, target, gel), daemon=False
         )
         self._thread.start()
         self._queue = waiting
@@ -110,26 +111,39 @@ class LiveRecorder:
             waiting.put(None)
         self._join()
 
-    def _new_folder(self, name: str) -> Path:
-        """Return the folder of a new recording of `name`, which is not there yet."""
+    def _new_folders(self, name: str) -> tuple[Path, Path]:
+        """Make the hidden folder of a new recording of `name`, and return it and its later name.
+
+        Raises UserError if it cannot be made.
+        """
         stem = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:40] or "touch"
         begun = f"{time.strftime('%Y%m%d_%H%M%S')}_{stem}"
-        names = (begun, *(f"{begun}_{number}" for number in range(2, 100)))
-        return next(self.out / each for each in names if not (self.out / each).exists())
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+            for target in (begun, *(f"{begun}_{number}" for number in range(2, 100))):
+                part = self.out / f".{target}"
+                # Another page may begin a recording of this name in the same second. Of two that
+                # make a folder, one fails.
+                with contextlib.suppress(FileExistsError):
+                    part.mkdir()
+                    if not (self.out / target).exists():
+                        return part, self.out / target
+                    part.rmdir()
+        except OSError as error:
+            raise UserError(f"The recording cannot begin: {error}") from None
+        raise UserError(f"{self.out} has too many recordings of {begun}.")
 
     def _join(self) -> None:
         if self._thread is not None:
             self._thread.join()
 
     def _write(
-        self, waiting: queue.Queue[_Recorded | None], target: Path, gel: Array | None
+        self, waiting: queue.Queue[_Recorded | None], part: Path, target: Path, gel: Array | None
     ) -> None:
-        """Write what waits, up to None, into `target`: the recorder's thread."""
-        part = target.with_name(f".{target.name}")
+        """Write what waits, up to None, into `part`, and rename it: the recorder's thread."""
         scores = list[float | None]()
         features = list[Array]()
         try:
-            part.mkdir(parents=True)
             if gel is not None:
                 (part / "background.png").write_bytes(encode(gel, ".png", *_QUICK))
             while (frame := waiting.get()) is not None:
@@ -172,13 +186,7 @@ class LiveRecorder:
             SCORE: scores,
             "background_path": [f"{folder}/background.png" if has_background else None] * count,
         }
-        new = manifests.from_columns(columns, self.file)
-        if self.file.exists():
-            tables = [manifests.read(self.file).table, new.table]
-            new = manifests.from_columns(
-                pa.concat_tables(tables, promote_options="permissive").to_pydict(), self.file
-            )
-        manifests.write(new, self.file)
+        self.manifest.append(columns)
 
 
 def _plain(name: str) -> str:

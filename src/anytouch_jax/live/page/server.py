@@ -35,6 +35,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import list_cameras
+from anytouch_jax.live.examples import EXAMPLE
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.layers import LAYERS, SIDE, field_numbers, scale_down
 from anytouch_jax.live.page.runs import Run
@@ -78,12 +79,9 @@ class StartPage:
         self.open_camera = open_camera
 
     def about(self) -> dict[str, Any]:
-        """Return the cameras that are connected now."""
-        return {
-            "cameras": {
-                str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()
-            }
-        }
+        """Return the cameras that are connected now, and the name of the built-in recording."""
+        cameras = {str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()}
+        return {"cameras": cameras, "example": EXAMPLE}
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
@@ -234,14 +232,24 @@ def _asset(request: Request) -> Response:
 
 def _touch(request: Request, table: Table) -> Response:
     """Answer with a touch by its place, or by one of its rows."""
-    filters = parse_json(request.query_params.get("filters", "{}"))
-    if not isinstance(filters, dict) or not all(isinstance(one, str) for one in filters.values()):
-        raise UserError("Filters are texts by the name of their column.")
+    filters = _filters(request)
     if request.query_params.get("row") is None:
         place = _number(request, "place")
     else:
         place = table.place_of(_number(request, "row"))
     return _json(table.touch(place, filters))
+
+
+def _touches(request: Request, table: Table) -> Response:
+    """Answer with a page of touches."""
+    return _json(table.touches(_number(request, "start"), _filters(request)))
+
+
+def _filters(request: Request) -> dict[str, str]:
+    filters = parse_json(request.query_params.get("filters", "{}"))
+    if not isinstance(filters, dict) or not all(isinstance(one, str) for one in filters.values()):
+        raise UserError("Filters are texts by the name of their column.")
+    return filters
 
 
 def _frame(request: Request, table: Table) -> Response:
@@ -308,7 +316,12 @@ def _download(request: Request, live: Live) -> Response:
 
 # What the kinds of sources answer, by the end of the address.
 _ANSWERS: dict[str, dict[str, Callable[[Request, Any], Response]]] = {
-    "table": {"touch": _touch, "frame/{row:int}": _frame, "photo/{row:int}": _photo},
+    "table": {
+        "touch": _touch,
+        "touches": _touches,
+        "frame/{row:int}": _frame,
+        "photo/{row:int}": _photo,
+    },
     "space": {"map": _map, "colours": _colours, "neighbours": _neighbours},
     "run": {"losses": _losses, "figure/{name:str}": _figure},
     "live": {
@@ -390,7 +403,8 @@ def _open(start: StartPage, order: Any, sources: list[Source]) -> int:
     Raises UserError.
     """
     camera = order.get("camera") if isinstance(order, dict) else None
-    if not isinstance(camera, str) or camera not in start.about()["cameras"]:
+    about = start.about()
+    if not isinstance(camera, str) or camera not in (*about["cameras"], about["example"]):
         raise UserError("There is no such camera. Plug it in, and look again.")
     for one in _live(sources):
         if one.source == camera:

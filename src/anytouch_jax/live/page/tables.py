@@ -49,6 +49,7 @@ EXAMPLES = Path(encoder.__file__).with_name("examples")
 _MOST_ROWS = 5000
 _MOST_CLIPS = 12
 _MOST_CHOICES = 500
+_MOST_TILES = 48  # touches of a page of thumbnails
 _CLIP = 3  # frames on which a touch is measured
 _FILTERS = ("sensor", "object", "split", "dataset", "unit")
 _ONE_BY_ONE = threading.Lock()  # the encoder is opened and compiled by one request
@@ -76,8 +77,7 @@ class Table:
 
         Raises UserError.
         """
-        if unknown := sorted(filters.keys() - self._filters.keys()):
-            raise UserError(f"{unknown[0][:50]} is no filter of this table.")
+        self._check_filters(filters)
         chosen = tuple(sorted(filters.items()))
         touches = self._touches(chosen)
         if not len(touches):
@@ -89,6 +89,34 @@ class Table:
         name = name or clips[0].get("sequence", self.name)
         more = max(0, len(recordings) - _MOST_CLIPS)
         return {"count": len(touches), "place": place, "name": name, "clips": clips, "more": more}
+
+    def touches(self, start: int, filters: dict[str, str]) -> dict[str, Any]:
+        """Return a page of the touches that pass `filters`, from place `start`, and their number.
+
+        Each has its place, its name, its sensors, and the row in the middle of its first recording.
+        Raises UserError.
+        """
+        self._check_filters(filters)
+        chosen = tuple(sorted(filters.items()))
+        touches = self._touches(chosen)
+        passes = self._chosen(chosen)
+        found = []
+        for place in range(start, min(start + _MOST_TILES, len(touches))):
+            recordings = np.flatnonzero((self._touch_of == touches[place]) & passes)
+            rows = self._rows(int(recordings[0]))
+            row = int(rows[len(rows) // 2])
+            several = recordings[:_MOST_CLIPS].tolist()
+            sensors = [self.manifest.value(int(self._rows(one)[0]), "sensor") for one in several]
+            name = self.manifest.value(row, "object") or self.manifest.value(row, "sequence")
+            found.append(
+                {
+                    "place": place,
+                    "row": row,
+                    "name": str(name or self.name),
+                    "sensors": [one for one in dict.fromkeys(sensors) if one != UNKNOWN],
+                }
+            )
+        return {"count": len(touches), "touches": found}
 
     def place_of(self, row: int) -> int:
         """Return the place of the touch of a row, without filters."""
@@ -155,6 +183,12 @@ class Table:
         chosen = range(0, count, -(-count // FRAMES))
         of_film = made(recording_gel(map(self._film.read, chosen))[0])
         return lambda _: of_film
+
+    def _check_filters(self, filters: dict[str, str]) -> None:
+        """Raise UserError for a filter that the table does not have."""
+        unknown = sorted(filters.keys() - self._filters.keys())
+        if unknown:
+            raise UserError(f"{unknown[0][:50]} is no filter of this table.")
 
     def _check(self, row: int) -> None:
         if not 0 <= row < len(self.manifest):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import zipfile
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +13,6 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.encoder.embed import Features, embed_rows, save_npz
 from anytouch_jax.encoder.linear_head import load_head, save_head
@@ -21,6 +21,7 @@ from anytouch_jax.live.page.accuracy import RESULT, measure_head
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.fitting import fit_head
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
+from anytouch_jax.live.page.shared import Stamp
 from anytouch_jax.live.page.tables import Table
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.linear_head import LinearHead
 
+_LOOK = 1.0  # seconds between looks for the recordings of other pages
 _BATCH = 4  # frames embedded at once: live touch waits for them
 
 
@@ -53,7 +55,10 @@ class Teacher:
         self.head: LinearHead | None = None
         self.space: FeatureMap | None = None
         self.table: Table | None = None
-        self.version = 0  # rises with every recording and every head
+        self.version = 0  # rises with every recording and every head, also of other pages
+        self._stamp: Stamp = None  # of the manifest that `table` was read from
+        self._noticed: Stamp = None  # of a manifest that was not read yet
+        self._looked = 0.0
         self._training = threading.Lock()
         self._fault = ""
         self.reload()
@@ -65,12 +70,30 @@ class Teacher:
 
     def reload(self) -> None:
         """Read the manifest again, after a recording. Raises UserError."""
-        if self._recorder.file.is_file():
-            self.table = Table(manifests.read(self._recorder.file), self._recorder.out.name)
+        manifest = self._recorder.manifest
+        # The stamp is taken first: a change that comes while it is read is noticed the next time.
+        self._stamp = manifest.stamp()
+        if self._stamp is not None:
+            self.table = Table(manifest.read(), self._recorder.out.name)
         self.version += 1
+
+    def look(self) -> None:
+        """Raise the version if another page has changed the manifest.
+
+        It costs nothing, so that every live frame may ask for it.
+        """
+        now = time.monotonic()
+        if now - self._looked > _LOOK:
+            self._looked = now
+            stamp = self._recorder.manifest.stamp()
+            if stamp not in (self._stamp, self._noticed):
+                self._noticed = stamp
+                self.version += 1
 
     def about(self) -> dict[str, Any]:
         """Return the names with their recordings, what is known of the head, and what it lacks."""
+        if self._recorder.manifest.stamp() != self._stamp:
+            self.reload()
         names = {} if self.table is None else self._names(self.table.manifest)
         missing = "" if len(names) > 1 else "Record two names or more to train."
         result = {} if self.space is None else self.space.index.about
@@ -116,16 +139,7 @@ class Teacher:
 
     def leave_out(self, sequence: str) -> None:
         """Mark a recording as unused. Its frames stay. Raises UserError."""
-        if self.table is None:
-            raise UserError("There is no such recording.")
-        manifest = self.table.manifest
-        is_it = manifest.text_column("sequence") == sequence
-        if not is_it.any():
-            raise UserError("There is no such recording.")
-        split = np.where(is_it, "unused", manifest.text_column("split"))
-        manifests.write(
-            manifests.replace_column(manifest, "split", split.tolist()), self._recorder.file
-        )
+        self._recorder.manifest.leave_out(sequence)
         self.reload()
 
     def archive(self) -> IO[bytes]:
@@ -151,7 +165,7 @@ class Teacher:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
         try:
             self._fault = ""
-            self._fit(manifests.read(self._recorder.file))
+            self._fit(self._recorder.manifest.read())
         except (UserError, OSError, ValueError) as error:
             self._fault = str(error)
         finally:
@@ -181,8 +195,10 @@ class Teacher:
             "pooling": self._pooling,
             "frames": "1",
         }
-        save_npz(self._features, features, about)
-        save_head(self.head_file, fitted.head)
+        # The two files belong together: another page must not write one of them between.
+        with self._recorder.manifest.locked():
+            save_npz(self._features, features, about)
+            save_head(self.head_file, fitted.head)
         self._use(fitted.head)
         if len(fitted.repeated):
             # It takes longer than the fit, and live touch has its names meanwhile.

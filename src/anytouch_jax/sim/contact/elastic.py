@@ -1,9 +1,13 @@
-"""Elastic half-spaces and bonded layers: influence coefficients of a surface load, and their
-convolution.
+"""Elastic half-spaces and bonded layers: influence coefficients of a load, and their convolution.
 
 Lengths are in pixels and stresses in units of the composite modulus E*. A stress p on one pixel
 moves the surface at an offset of (i, j) pixels by `p / E* * pitch * coefficient(i, j)`.
-Coefficients are listed at offsets >= 0.
+Coefficients are listed at offsets >= 0, because they are even or odd in both.
+
+A gel is a layer bonded to a rigid plate. Its coefficients are those of the half-space, which have
+closed forms but are singular at the load, minus a difference that is smooth and has none. The
+difference is a table over the distance (`layer_tables`), in units of the layer's thickness, so one
+table serves gels of every thickness.
 """
 
 from __future__ import annotations
@@ -21,7 +25,8 @@ from jax import Array
 
 Host = npt.NDArray[np.float64]
 
-# thicknesses of the layer; the motion of a bonded layer decays exponentially and is zero beyond
+# Thicknesses of the layer. The motion of a bonded layer decays exponentially with the distance, and
+# is zero beyond.
 FAR = 12.0
 DISTANCE: Host = np.linspace(0, FAR, 513)
 # Up to this side length four matrix products are faster than two FFTs (twice as fast at 112, on two
@@ -31,12 +36,11 @@ MATMUL_LIMIT = 144
 
 @dataclass(frozen=True)
 class Plan:
-    """Fourier transforms of (rows, columns) fields, padded so that a convolution does not wrap
-    around.
+    """Fourier transforms of (rows, columns) fields, padded so that convolutions do not wrap around.
 
     A transform is complex, or for small sizes a real (2, 2, KH, KW) array. The latter holds the
     cosine and sine sums of the parts that are even and odd about the centre in x and in y. A
-    symmetric kernel does not mix them.
+    symmetric kernel does not mix them, so its convolution is a product in either form.
     """
 
     rows: int
@@ -44,6 +48,7 @@ class Plan:
 
     @property
     def padded(self) -> tuple[int, int]:
+        """Rows and columns of the padded field."""
         rows = 2 * self.rows
         columns = 2 * self.columns
         if self.matmul:
@@ -53,9 +58,11 @@ class Plan:
 
     @property
     def matmul(self) -> bool:
+        """Whether transforms are matrix products, and not FFTs."""
         return max(self.rows, self.columns) <= MATMUL_LIMIT
 
     def forward(self, field: Array) -> Array:
+        """Return the transform of a field (rows, columns)."""
         if not self.matmul:
             return jnp.fft.rfft2(field, self.padded)
         y, x = (_waves(size, field.dtype) for size in self.padded)
@@ -63,6 +70,7 @@ class Plan:
         return _einsum("xlj,xykj->xykl", x, _einsum("yki,xyij->xykj", y, parts))
 
     def inverse(self, transform: Array) -> Array:
+        """Return the field (rows, columns) of a transform, without its padding."""
         if not self.matmul:
             return jnp.fft.irfft2(transform, self.padded)[: self.rows, : self.columns]
         y, x = (_waves(size, transform.dtype) for size in self.padded)
@@ -70,25 +78,25 @@ class Plan:
         return _join(_join(parts, 2), 0)[: self.rows, : self.columns]
 
     def even(self, transform: Array, spectrum: Array) -> Array:
-        """Return the transform of a field's convolution with a kernel that is even in x and in
-        y.
-        """
-        return transform * (
-            spectrum[None, None] if self.matmul else _unfold(spectrum, self.padded[0], 1)
-        )
+        """Return the transform of a field's convolution with a kernel even in x and in y."""
+        if self.matmul:
+            return transform * spectrum[None, None]
+        return transform * _unfold(spectrum, self.padded[0], 1)
 
     def odd(self, transform: Array, spectrum: Array) -> Array:
-        """Return the transform of a field's convolution with a kernel that is odd in x and in y."""
+        """Return the transform of a field's convolution with a kernel odd in x and in y."""
         if not self.matmul:
             return transform * _unfold(spectrum, self.padded[0], -1)
-        # sin(a - b), twice, and i squared
+        # An odd kernel exchanges even and odd parts: sin(a - b) = sin a cos b - cos a sin b, once
+        # for x and once for y, and i squared is -1.
         sign = jnp.array([[-1, 1], [1, -1]], transform.dtype)[:, :, None, None]
         return sign * transform[::-1, ::-1] * spectrum[None, None]
 
     def spectrum(self, quadrant: Any, parity: int = 1) -> Any:
         """Return the spectrum of a kernel from its (rows, columns) coefficients at offsets >= 0.
 
-        Products with two small tables are cheaper than a transform of the unfolded kernel.
+        Products with two small tables are cheaper than a transform of the unfolded kernel. numpy
+        coefficients, which are known before the program runs, give a numpy spectrum in float64.
         """
         sizes = zip((self.rows, self.columns), self.padded, strict=True)
         y, x = (_kernel_table(size, padded, parity, self.matmul) for size, padded in sizes)
@@ -120,13 +128,18 @@ def _wave_table(padded: int) -> Host:
 
 @functools.lru_cache(maxsize=64)
 def _kernel_table(size: int, padded: int, parity: int, weighted: bool) -> Host:
-    """Return the sums (padded / 2 + 1, size) of a kernel that is even or odd, weighted as
-    `Plan.inverse` needs it.
+    """Return the table (padded / 2 + 1, size) that sums a kernel, even or odd, to its spectrum.
+
+    `weighted` includes the factors that the matrix form of `Plan.inverse` leaves out.
     """
     wave = np.arange(padded // 2 + 1)
     offset = np.arange(size)
     angle = 2 * np.pi / padded * np.outer(wave, offset)
-    table = np.cos(angle) * np.where(offset > 0, 2, 1) if parity > 0 else 2 * np.sin(angle)
+    # An offset above 0 stands for itself and for its negative.
+    if parity > 0:
+        table = np.cos(angle) * np.where(offset > 0, 2, 1)
+    else:
+        table = 2 * np.sin(angle)
     if weighted:
         table *= np.where(wave % (padded // 2) > 0, 2, 1)[:, None] / padded
     return table
@@ -137,14 +150,12 @@ def _waves(padded: int, dtype: Any) -> Array:
 
 
 def _einsum(formula: str, a: Array, b: Array) -> Array:
-    # accelerators would cut float32 to 10 bits
+    # Accelerators would cut float32 to 10 bits, and the solver would not converge.
     return jnp.einsum(formula, a, b, precision=jax.lax.Precision.HIGHEST)
 
 
 def _split(field: Array, axis: int) -> Array:
-    """Return the parts even and odd about the centre of `axis`, by distance from it, stacked in
-    front.
-    """
+    """Return the parts even and odd about the centre of `axis`, by distance, stacked in front."""
     left, right = jnp.split(field, 2, axis)
     left = jnp.flip(left, axis)
     return jnp.stack([right + left, right - left])
@@ -163,23 +174,21 @@ def _unfold(half: Array, size: int, parity: int) -> Array:
 
 
 def normal_coefficients(rows: int, columns: int) -> Host:
-    """Return the normal displacement by a unit pressure on a pixel.
+    """Return the normal displacement by a unit pressure on a pixel, at offsets >= 0.
 
-    Boussinesq's load over a square (Love 1929; Johnson, Contact Mechanics, 3.25).
+    Boussinesq's point load moves the surface at a distance r by P / (pi E* r). Its integral over a
+    square has a closed form (Love 1929; Johnson, Contact Mechanics, 3.25), finite at the load.
     """
     return (_over_pixel(_xx, rows, columns) + _over_pixel(_yy, rows, columns)) / np.pi
 
 
 def tangential_coefficients(rows: int, columns: int, poisson: float) -> tuple[Host, Host, Host]:
-    """Return the tangential displacement by a unit traction on a pixel: x by x, x by y (odd in x
-    and in y), y by y.
+    """Return the tangential displacement by a unit traction on a pixel, at offsets >= 0.
 
-    Cerruti's load (Johnson, Contact Mechanics, 3.75) over a square, in units of the normal modulus
-    E*.
+    They are of x by x, of x by y (odd in x and in y), and of y by y: Cerruti's load (Johnson,
+    Contact Mechanics, 3.75) over a square, in units of the normal modulus E*.
     """
-    xx, yy, xy = (
-        _over_pixel(f, rows, columns) / np.pi for f in (_xx, _yy, lambda x, y: -np.hypot(x, y))
-    )
+    xx, yy, xy = (_over_pixel(integral, rows, columns) / np.pi for integral in (_xx, _yy, _xy))
     ratio = poisson / (1 - poisson)
     return xx + yy + ratio * xx, ratio * xy, xx + yy + ratio * yy
 
@@ -193,10 +202,17 @@ def _xx(x: Host, y: Host) -> Host:
 
 
 def _yy(x: Host, y: Host) -> Host:
+    """Return the double integral of y^2 / r^3."""
     return x * np.arcsinh(y / np.abs(x))
 
 
+def _xy(x: Host, y: Host) -> Host:
+    """Return the double integral of x y / r^3."""
+    return -np.hypot(x, y)
+
+
 def _over_pixel(integral: Callable[[Host, Host], Host], rows: int, columns: int) -> Host:
+    """Return a double integral between the borders of each pixel (rows, columns)."""
     y, x = np.meshgrid(
         np.arange(rows, dtype=np.float64), np.arange(columns, dtype=np.float64), indexing="ij"
     )
@@ -208,11 +224,11 @@ def _over_pixel(integral: Callable[[Host, Host], Host], rows: int, columns: int)
 
 
 def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
-    """Return a bonded layer's compliance over the half-space's at `wave` = wave number times
-    thickness.
+    """Return a bonded layer's compliance over the half-space's, for loads that are waves.
 
     The loads are normal, tangential along the wave, and tangential across it (Sneddon 1951; Johnson
-    5.8).
+    5.8). `wave` is the wave number times the thickness. Short waves do not feel the plate, so the
+    ratios go to 1; long ones are held by it.
     """
     k = 3 - 4 * poisson
     # divided by exp(2 wave), so nothing overflows
@@ -223,28 +239,30 @@ def layer_symbols(wave: Host, poisson: float) -> tuple[Host, Host, Host]:
 
 
 def sideways_symbol(wave: Host, poisson: float) -> Host:
-    """Return a bonded layer's tangential motion toward the load's crests over a half-space's normal
-    motion.
+    """Return a bonded layer's tangential motion under a normal load that is a wave.
 
-    `wave` and the derivation are as in `layer_symbols`. It is negative where the layer is squeezed
-    out.
+    It is the motion toward the load's crests over a half-space's normal motion. `wave` and the
+    derivation are as in `layer_symbols`. It is negative where the layer is squeezed out.
     """
     k = 3 - 4 * poisson
     decay = np.exp(-2 * wave)
     below = k * (1 + decay**2) + (1 + k**2 + 4 * wave**2) * decay
-    return (
-        (k * (1 - 2 * poisson) / 2 * (1 - decay) ** 2 - 2 * wave**2 * decay) / (1 - poisson) / below
-    )
+    drawn = k * (1 - 2 * poisson) / 2 * (1 - decay) ** 2
+    squeezed = 2 * wave**2 * decay
+    return (drawn - squeezed) / (1 - poisson) / below
 
 
 @functools.lru_cache(maxsize=1)
 def _hankel() -> tuple[Host, Host, Host, Host]:
-    """Return waves, quadrature weights, and J0 and J2 of `DISTANCE` times wave (distances,
-    waves).
+    """Return what Hankel transforms to `DISTANCE` need.
+
+    These are waves, quadrature weights, and the Bessel functions J0 and J2 of distance times wave
+    (distances, waves). Above a wave of 14 the symbols of a layer are those of a half-space.
     """
     nodes, weights = np.polynomial.legendre.leggauss(128)
     wave = 7.0 * (nodes + 1)
     weights = 7.0 * weights
+    # J_n(x) is the mean of cos(n t - x sin t) over t from 0 to pi.
     turn = (np.arange(200) + 0.5) * np.pi / 200
     phase = np.outer(DISTANCE, wave)[..., None] * np.sin(turn)
     return wave, weights, np.cos(phase).mean(-1), np.cos(2 * turn - phase).mean(-1)
@@ -252,11 +270,11 @@ def _hankel() -> tuple[Host, Host, Host, Host]:
 
 @functools.lru_cache(maxsize=8)
 def layer_tables(poisson: float) -> tuple[Host, Host, Host]:
-    """Return the motions of a half-space minus those of a layer by a point load at `DISTANCE`
-    thicknesses.
+    """Return the motions of a half-space minus those of a layer by a point load, at `DISTANCE`.
 
     The motions are normal, tangential (mean over directions) and tangential (amplitude of cos 2
-    phi), in units of P / (pi E* thickness).
+    phi), in units of P / (pi E* thickness). The difference is smooth: near the load, where both
+    diverge, they are the same.
     """
     wave, weights, bessel0, bessel2 = _hankel()
     normal, along, across = (1 - symbol for symbol in layer_symbols(wave, poisson))
@@ -276,19 +294,22 @@ def sideways_table(poisson: float) -> tuple[Host, float]:
     asinh(2 / d).
     """
     wave, weights, bessel0, _ = _hankel()
-    # of a half-space: the integral of (1 - exp(-2 w)) J0(w d) / w
+    # Short waves move a half-space sideways too, unless it is incompressible. That part has no
+    # smooth table, but a closed form: asinh(2 / d) is the integral of (1 - exp(-2 w)) J0(w d) / w.
     rest = (1 - 2 * poisson) / (2 * (1 - poisson))
     smooth = (sideways_symbol(wave, poisson) + rest * np.expm1(-2 * wave)) / wave
     return bessel0 @ (weights * smooth), rest
 
 
 def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Array:
-    """Return the potential (H, W) at offsets >= 0, in units of P / (pi E*).
+    """Return the potential of the sideways motion of a layer's surface by a load on a pixel.
 
-    Its gradient is the sideways motion of a layer's surface by a load on a pixel.
+    Its gradient is that motion. It is (H, W) at offsets >= 0, in units of P / (pi E*). A load pulls
+    or pushes along the line to it, so the motion has no curl, and one potential replaces two
+    kernels.
     """
     table, rest = sideways_table(poisson)
-    # at 0 the mean of log r over a pixel
+    # Near the load the potential goes as -log r. At 0 this is the mean of log r over a pixel.
     radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))
     far = jnp.asarray(radius, dtype) * jnp.asarray(pitch / thickness, dtype)
     return jnp.where(far < FAR, _between(far, table) + rest * jnp.arcsinh(2 / far), 0)
@@ -303,15 +324,25 @@ def _between(far: Array, table: Host) -> Array:
 
 
 def _looked_up(far: Array, table: Host, limit: float) -> Array:
+    """Return a difference between half-space and layer at any distance.
+
+    Beyond FAR the layer does not move, so the difference is the half-space's motion, `limit` / far.
+    """
     return jnp.where(far < FAR, _between(far, table), limit / jnp.maximum(far, FAR))
 
 
 def normal_spectrum(
     plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
 ) -> Array:
-    """Return the spectrum of the normal coefficients.
+    """Return the spectrum (KH, KW) of the normal coefficients.
 
-    `share` (E* over the gel's modulus) is the layer's motion.
+    Args:
+        plan: The transform of the grid.
+        pitch: mm between pixels.
+        poisson: Poisson's ratio of the gel.
+        thickness: mm of the gel; infinite for a half-space.
+        share: E* over the gel's plane modulus: the part of the motion that is the layer's.
+        dtype: Of the spectrum.
     """
     deep = jnp.asarray(_normal_host(plan), dtype)
     if is_infinite(thickness):
@@ -325,9 +356,9 @@ def normal_spectrum(
 def tangential_spectra(
     plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
 ) -> Array:
-    """Return (3, KH, KW) spectra of the tangential coefficients xx, xy, yy.
+    """Return the spectra (3, KH, KW) of the tangential coefficients xx, xy, yy.
 
-    `share` is as in `normal_spectrum`.
+    Arguments are those of `normal_spectrum`.
     """
     deep = jnp.asarray(_tangential_host(plan, poisson), dtype)
     if is_infinite(thickness):
@@ -339,6 +370,7 @@ def tangential_spectra(
     mean_at = share * scale / np.pi * _looked_up(radius, mean, 1 + ratio / 2)
     twofold_at = share * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
     cosine, sine = (jnp.asarray(table, dtype) for table in _twice_the_angle(plan))
+    # A motion along x by a load along x varies as cos 2 phi about its mean over directions.
     parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)
     return deep - jnp.stack(
         [plan.spectrum(part, p) for part, p in zip(parts, (1, -1, 1), strict=True)]
@@ -357,10 +389,12 @@ def _tangential_host(plan: Plan, poisson: float) -> Host:
 
 
 def _radius(plan: Plan) -> Host:
+    """Return the distance in pixels of offsets >= 0, (rows, columns)."""
     return np.hypot(np.arange(plan.rows)[:, None], np.arange(plan.columns)[None, :])
 
 
 def _twice_the_angle(plan: Plan) -> tuple[Host, Host]:
+    """Return cosine and sine of twice the direction of offsets >= 0, each (rows, columns)."""
     y = np.arange(plan.rows)[:, None]
     x = np.arange(plan.columns)[None, :]
     squared = np.maximum(x**2 + y**2, 1)

@@ -1,10 +1,13 @@
-"""Normal contact of a gel with an object pressed to a depth: pressure, displacement, force, without
-friction.
+"""Normal contact of a gel with an object pressed to a depth: pressure, displacement, force.
 
 Units are mm, kPa and N. The gel is a linear elastic half-space, or, with a finite thickness, a
 layer bonded to a rigid plate. Friction does not change the pressure, which is exact for an
 incompressible half-space under a rigid object. `sideways` is the tangential motion by pressing
 before friction resists it (`shear`).
+
+In the program all lengths are in units of the deepest penetration and pressures in the unit that
+makes the compliance of one pixel about one. So one tolerance and one number of iterations serve a
+soft gel under a light touch and a stiff one under a deep press.
 """
 
 from __future__ import annotations
@@ -40,9 +43,7 @@ COARSEST = 24  # pixels; a coarser grid saves no time
 class Gel:
     """A gel: Young's modulus in kPa, Poisson's ratio, thickness in mm.
 
-    An infinite thickness is a half-space.
-
-    `modulus` and `thickness` may be traced arrays.
+    An infinite thickness is a half-space. `modulus` and `thickness` may be traced arrays.
     """
 
     modulus: Any = 150.0
@@ -59,20 +60,16 @@ jax.tree_util.register_dataclass(Gel, data_fields=["modulus", "thickness"], meta
 
 
 class PressResult(NamedTuple):
-    """The result of a press: pressure (H, W) kPa, displacement (H, W) mm of the gel's surface,
-    force N.
+    """The result of a press on a grid (H, W)."""
 
-    A displacement is positive away from the object, and negative where a bonded layer bulges around
-    the contact. `residual` is the largest gap in contact, or overlap outside of it, over the
-    largest penetration. `converged` is whether it is below the tolerance.
-    """
-
-    pressure: Array
+    pressure: Array  # (H, W) kPa
+    # (H, W) mm of the gel's surface, positive away from the object, and negative where a bonded
+    # layer bulges around the contact
     displacement: Array
-    force: Array
-    converged: Array
+    force: Array  # N
+    converged: Array  # whether `residual` is below the tolerance
     iterations: Array
-    residual: Array
+    residual: Array  # largest gap in contact, or overlap outside, over the largest penetration
 
 
 def press(
@@ -86,16 +83,26 @@ def press(
     tolerance: float = 1e-4,
     iterations: int | None = None,
 ) -> PressResult:
-    """Press an object with `surface` (H, W) mm, its highest nominal point at 0, `depth` mm into the
-    flat gel.
+    """Press an object into the flat gel. Use `jax.vmap` for a batch.
 
-    `pitch` is mm per pixel. `modulus_object` kPa is E / (1 - nu^2) of the object. A surface of -inf
-    is no object. With "exact", conjugate gradients on the contact set (Polonsky and Keer 1999)
-    reach `tolerance` in at most `iterations` (300). With "fast", `iterations` (2) projected
-    gradients on this grid follow twice and four times as many on coarser grids. Where the gel still
-    cuts the object, it takes the object's surface, as in Taxim (Si and Yuan 2022). Use `jax.vmap`
-    for a batch. Raises UserError for untraced values that make no sense, such as a negative depth
-    or a modulus of 0, and for a gel thinner than a pixel ("fast": 1.5 pixels of the coarsest grid).
+    With "exact", conjugate gradients on the contact set (Polonsky and Keer 1999) reach `tolerance`
+    in at most `iterations` (300). With "fast", `iterations` (2) projected gradients on this grid
+    follow twice and four times as many on coarser grids. Where the gel still cuts the object, it
+    takes the object's surface, as in Taxim (Si and Yuan 2022).
+
+    Args:
+        surface: Heights (H, W) mm of the object, its highest nominal point at 0. -inf is no object.
+        depth: mm by which the point at 0 is pressed in.
+        gel: The gel.
+        pitch: mm between pixels.
+        fidelity: "exact" or "fast".
+        modulus_object: E / (1 - nu^2) of the object, kPa.
+        tolerance: Of the residual (`PressResult`).
+        iterations: At most so many, by default those above.
+
+    Raises:
+        UserError: For untraced values that make no sense, such as a negative depth or a modulus of
+            0, and for a gel thinner than a pixel ("fast": 1.5 pixels of the coarsest grid).
     """
     _check(surface, depth, pitch, fidelity)
     _check_elastic(np.shape(surface), gel, pitch, fidelity, modulus_object)
@@ -106,7 +113,8 @@ def press(
     depth = jnp.asarray(depth, dtype)
     pitch = jnp.asarray(pitch, dtype)
     plane = jnp.asarray(gel.plane, dtype)
-    # E* over the gel's own plane modulus
+    # The composite modulus E*, of 1 / E* = 1 / E_gel + 1 / E_object, over the gel's own. It is the
+    # part of the approach by which the gel gives way, and not the object.
     share = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))
     cut = jnp.where(jnp.isfinite(surface), surface + depth, -jnp.ones((), dtype))
     scale = jnp.max(cut)
@@ -117,10 +125,11 @@ def press(
     compliances = [
         _compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)
     ]
-    solve, most = (_fast, 2) if fidelity == "fast" else (_exact, 300)
-    solution, load, moved = solve(
-        compliances, cut, tolerance, most if iterations is None else iterations
-    )
+    if fidelity == "fast":
+        solution, load, moved = _fast(compliances, cut, 2 if iterations is None else iterations)
+    else:
+        most = 300 if iterations is None else iterations
+        solution, load, moved = _exact(compliances, cut, tolerance, most)
     # both move: the gel's part is the rest
     moved = moved - _of_object(plans[0], load, share, modulus_object)
     pressure = solution.x * (scale * plane * share / pitch)
@@ -139,13 +148,14 @@ def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
             f"press takes one surface of (rows, columns), not {np.shape(surface)}; use jax.vmap "
             "for more"
         )
-    for name, value, least in (("depth", depth, 0.0), ("pitch", pitch, 1e-12)):
-        if not isinstance(value, jax.core.Tracer) and not np.all(
-            (np.asarray(value) >= least) & np.isfinite(value)
-        ):
-            raise UserError(
-                f"{name} must be {'at least 0' if least == 0 else 'above 0'} mm, not {value}"
-            )
+    for name, value, least, words in (
+        ("depth", depth, 0.0, "at least 0"),
+        ("pitch", pitch, 1e-12, "above 0"),
+    ):
+        if isinstance(value, jax.core.Tracer):
+            continue
+        if not np.all((np.asarray(value) >= least) & np.isfinite(value)):
+            raise UserError(f"{name} must be {words} mm, not {value}")
     if not isinstance(surface, jax.core.Tracer):
         values = np.asarray(surface)
         if np.isnan(values).any() or np.isposinf(values).any():
@@ -167,9 +177,10 @@ def _check_elastic(
         if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
             raise UserError(f"{name} must be above 0, not {value}")
     if not any(isinstance(value, jax.core.Tracer) for value in (pitch, gel.thickness)):
-        least = np.asarray(pitch) * (
-            1.5 * 2 ** (len(grids(shape)) - 1) if fidelity == "fast" else 1
-        )
+        # The tables of a layer are smooth over its thickness. They are read at the middles of
+        # pixels, which must be finer than that.
+        pixels = 1.5 * 2 ** (len(grids(shape)) - 1) if fidelity == "fast" else 1
+        least = np.asarray(pitch) * pixels
         if np.any(np.asarray(gel.thickness) < least):
             raise UserError(
                 f"a gel of {gel.thickness} mm is too thin for this grid: {least:g} mm is the least"
@@ -205,7 +216,7 @@ def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -
 def _exact(
     compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
 ) -> tuple[Solution, Array, Array]:
-    """Return the solution, the pressure that moves the surface, and that displacement."""
+    """Return the solution to `tolerance`, its pressure, and the displacement by it."""
     (apply,) = compliances
     start = jnp.maximum(cut, 0)
     start = start * scaled(start, apply(start), cut)
@@ -214,10 +225,13 @@ def _exact(
 
 
 def _fast(
-    compliances: list[Compliance], cut: Array, tolerance: float, iterations: int
+    compliances: list[Compliance], cut: Array, iterations: int
 ) -> tuple[Solution, Array, Array]:
-    """Solve from coarse to fine, with `iterations` on the finest grid and twice as many on each
-    coarser one.
+    """Solve from coarse to fine, with twice as many iterations on each coarser grid.
+
+    Long waves, which converge slowly, are solved where they are cheap. Returns the solution, the
+    pressure that moves the surface, and that displacement. The number of iterations is fixed, so a
+    batch takes the time of one, and gradients pass.
     """
     cuts = [cut]
     for _ in compliances[1:]:
@@ -226,25 +240,30 @@ def _fast(
     for level in range(len(cuts) - 1, -1, -1):
         apply = compliances[level]
         here = cuts[level]
-        # a flat gel never bulges to touch what is above it
+        # A flat gel never bulges to touch what is above it. Without this the interpolated pressure
+        # of the coarser grid would press beside the contact.
         pressure = jnp.where(here > 0, pressure, 0)
         solution = _descended(apply, here, pressure, iterations * 2**level)
         pressure = doubled(solution.x) if level else solution.x
+    # Taxim's rule: where the gel still cuts the object, it takes the object's surface.
     moved = jnp.maximum(solution.excess, 0) + cut
     return solution._replace(x=_sharpened(solution)), solution.x, moved
 
 
 def _sharpened(solution: Solution) -> Array:
-    """Take one local step without a convolution and with the same load, which removes pressure from
-    gaps.
+    """Take one local step with the same load and without a convolution.
+
+    It removes pressure from gaps, which a few projected gradients leave there.
     """
     local = jnp.maximum(solution.x - solution.excess / OWN, 0)
     return local * ratio(jnp.sum(solution.x), jnp.sum(local), 0.0)
 
 
 def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) -> Solution:
-    """Run projected gradients from `pressure` at its best scale, and scale the result to its
-    best.
+    """Run projected gradients from `pressure` at its best scale, and scale the result likewise.
+
+    The scale is the one of least energy. It repairs at once what gradients mend last: a first guess
+    that is too strong or too weak all over.
     """
     moved = apply(pressure)
     factor = scaled(pressure, moved, cut)
@@ -259,29 +278,40 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
 def sideways(
     pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False
 ) -> Array:
-    """Return the motion (H, W, 2) mm along x and y of a bonded layer's surface by `pressure` (H, W)
-    kPa alone.
+    """Return the tangential motion of a bonded layer's surface by a pressure alone.
 
     A nearly incompressible layer moves sideways, by up to a fifth of the dent of a ball and by more
     under a wide block. A compressible one is also drawn toward the load. Friction reduces the
-    motion (`shear_step`). With "fast" it is computed on the coarsest grid, and stays there if
-    `coarse`. Raises UserError for a gel without a thickness.
+    motion (`shear_step`).
+
+    Args:
+        pressure: (H, W) kPa.
+        gel: The gel.
+        pitch: mm between pixels.
+        fidelity: With "fast" the motion is computed on the coarsest grid, because it is smooth.
+        coarse: Leave it there.
+
+    Returns:
+        Motion (H, W, 2) mm along x and y.
+
+    Raises:
+        UserError: For a gel without a thickness: an incompressible half-space does not move so.
     """
     if is_infinite(gel.thickness):
         raise UserError("sideways motion needs a bonded layer: set the thickness of the gel")
     shape = pressure.shape
     pitch = jnp.asarray(pitch, pressure.dtype)
-    for _ in grids(pressure.shape)[1:] if fidelity == "fast" else ():
-        pressure = halved(pressure)
-        pitch = 2 * pitch
+    if fidelity == "fast":
+        for _ in grids(shape)[1:]:
+            pressure = halved(pressure)
+            pitch = 2 * pitch
     plan = Plan(*pressure.shape)
     spectrum = plan.spectrum(
         sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype)
     )
-    # mm
-    potential = (
-        plan.inverse(plan.even(plan.forward(pressure), spectrum)) * pitch / (jnp.pi * gel.plane)
-    )
+    summed = plan.inverse(plan.even(plan.forward(pressure), spectrum))
+    # Its differences from pixel to pixel are mm.
+    potential = summed * pitch / (jnp.pi * gel.plane)
     y, x = jnp.gradient(potential)
     motion = jnp.stack([x, y], -1)
     if coarse:
@@ -290,9 +320,7 @@ def sideways(
 
 
 def enlarged(motion: Array, shape: tuple[int, ...]) -> Array:
-    """Return a motion (h, w, 2) of a coarser grid on the grid of `shape`, by cubic
-    interpolation.
-    """
+    """Return a motion (h, w, 2) of a coarser grid on the grid of `shape`, by a cubic spline."""
     if motion.shape[:2] == shape:
         return motion
     return jax.image.resize(motion, (*shape, 2), "cubic")
@@ -310,9 +338,7 @@ def doubled(field: Array) -> Array:
 
 
 def positions(shape: tuple[int, int], pitch: Any) -> tuple[Array, Array]:
-    """Return x (to the right) and y (down) of the pixels of `shape` in mm from the field's centre,
-    each (H, W).
-    """
+    """Return x (right) and y (down) of the pixels of a grid, mm from its centre, each (H, W)."""
     pitch = jnp.asarray(pitch)
     y, x = (pitch * (jnp.arange(n, dtype=pitch.dtype) - (n - 1) / 2) for n in shape)
     return jnp.broadcast_to(x[None, :], shape), jnp.broadcast_to(y[:, None], shape)
@@ -324,8 +350,9 @@ def area(pressure: Array, pitch: Any) -> Array:
 
 
 def centroid(pressure: Array, pitch: Any) -> Array:
-    """Return the centre of a pressure (H, W), (x, y) in mm from the field's centre, (0, 0) without
-    contact.
+    """Return the centre (x, y) of a pressure (H, W), mm from the field's centre.
+
+    It is (0, 0) without contact.
     """
     x, y = positions((pressure.shape[0], pressure.shape[1]), jnp.asarray(pitch, pressure.dtype))
     total = jnp.sum(pressure)

@@ -1,5 +1,8 @@
-"""Tangential contact: Coulomb friction under sliding and twist, with its history (stick, partial
-slip, full slip).
+"""Tangential contact: Coulomb friction under sliding and twist, with its history.
+
+A contact sticks, slips in part, and slips as a whole. Where it sticks the gel moves with the
+object; where it slips the traction is at the friction limit, friction times pressure, against the
+slip. Which part does which depends on all motion before, so a contact is computed frame by frame.
 
 Friction does not change the pressure. The sideways motion by pressing alone is an optional input.
 It is zero on an incompressible half-space, and Cattaneo's and Mindlin's solutions omit it. A bonded
@@ -58,6 +61,23 @@ def at_rest(shape: tuple[int, int], dtype: Any = jnp.float32) -> Shear:
     )
 
 
+class Interface(NamedTuple):
+    """A gel and an object, and how their tangential contact is solved: equal in all frames."""
+
+    gel: Gel
+    pitch: Any  # mm between pixels
+    friction: Any  # Coulomb's coefficient
+    # With "exact", projected gradients with all tangential coefficients on the grid of the pressure
+    # reach `tolerance` in at most `iterations` (400). With "fast", an elastic predictor and the
+    # return to the friction cone are followed by `iterations` (6) corrections on a coarser grid.
+    fidelity: Fidelity = "exact"
+    modulus_object: Any = float("inf")  # E / (1 - nu^2) of the object, kPa
+    centre: Any = (0.0, 0.0)  # (2,) mm, about which the object turns
+    coarse: bool = False  # leave `squeezed` and the displacement on the coarser grid of "fast"
+    tolerance: float = 1e-3
+    iterations: int | None = None
+
+
 def shear_step(
     state: Shear | None,
     contact: PressResult,
@@ -66,35 +86,47 @@ def shear_step(
     pitch: Any,
     friction: Any,
     *,
-    fidelity: Fidelity = "exact",
-    modulus_object: Any = float("inf"),
-    centre: Any = (0.0, 0.0),
     squeezed: Array | None = None,
-    coarse: bool = False,
-    tolerance: float = 1e-3,
-    iterations: int | None = None,
+    **options: Any,
 ) -> Shear:
-    """Move the object by `motion` (dx mm, dy mm, dtheta rad about `centre` mm) under the pressure
-    of `contact`.
+    """Return `slide` for an `Interface` of these values; `options` are the rest of its fields."""
+    return slide(state, contact, motion, Interface(gel, pitch, friction, **options), squeezed)
 
-    `state` is that of the previous frame, or None at rest. The traction starts from it, so a
-    reversed motion leaves a locked-in shear. `friction` is Coulomb's coefficient. With "exact",
-    projected gradients with all tangential coefficients on the grid of the pressure reach
-    `tolerance` in at most `iterations` (400). With "fast", an elastic predictor and the return to
-    the friction cone are followed by `iterations` (6) corrections on a coarser grid. `squeezed` (H,
-    W, 2) mm is the sideways motion by this step's change of pressure (from `mechanics.sideways`).
-    The traction then also resists it, and `displacement` is that of the traction alone. Both are on
-    the coarser grid of "fast" if `coarse`. Use `jax.vmap` for a batch. Raises UserError for a
-    negative untraced friction.
+
+def slide(
+    state: Shear | None,
+    contact: PressResult,
+    motion: Any,
+    interface: Interface,
+    squeezed: Array | None = None,
+) -> Shear:
+    """Move the object over the gel under the pressure of a contact. Use `jax.vmap` for a batch.
+
+    Args:
+        state: The state of the previous frame, or None at rest. The traction starts from it, so a
+            reversed motion leaves a locked-in shear.
+        contact: The press of this frame, with a pressure (H, W).
+        motion: (dx mm, dy mm, dtheta rad) of the object since the previous frame.
+        interface: What is equal in all frames.
+        squeezed: Sideways motion (H, W, 2) mm by this step's change of pressure, from
+            `mechanics.sideways`. The traction then also resists it, and `displacement` is that of
+            the traction alone.
+
+    Raises:
+        UserError: For a negative friction that is not traced.
     """
-    _check(contact, pitch, friction, fidelity)
+    gel = interface.gel
+    fidelity = interface.fidelity
+    _check(contact, interface.pitch, interface.friction, fidelity)
     pressure = contact.pressure
     dtype = pressure.dtype
-    state = at_rest((pressure.shape[0], pressure.shape[1]), dtype) if state is None else state
-    pitch = jnp.asarray(pitch, dtype)
-    friction = jnp.asarray(friction, dtype)
-    share = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(modulus_object, dtype))
-    # kPa of traction per mm
+    if state is None:
+        state = at_rest((pressure.shape[0], pressure.shape[1]), dtype)
+    pitch = jnp.asarray(interface.pitch, dtype)
+    friction = jnp.asarray(interface.friction, dtype)
+    # E* over the gel's plane modulus, as in `mechanics.press`
+    share = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(interface.modulus_object, dtype))
+    # kPa of traction per mm. Tractions are divided by it, so everything below is in mm.
     unit = jnp.asarray(gel.plane, dtype) * share / pitch
     plan = grids(pressure.shape)[-1] if fidelity == "fast" else Plan(*pressure.shape)
     times = pressure.shape[0] // plan.rows
@@ -103,34 +135,40 @@ def shear_step(
     spectra = tangential_spectra(plan, pitch * times, gel.poisson, gel.thickness, share, dtype)
     apply = _compliance(plan, spectra)
     limit = jnp.where(load > 0, friction * load, 0) / unit * times
-    moved = _rigid(plan, pitch * times, jnp.asarray(motion, dtype), jnp.asarray(centre, dtype))
+    moved = _rigid(
+        plan, pitch * times, jnp.asarray(motion, dtype), jnp.asarray(interface.centre, dtype)
+    )
     if squeezed is not None:
-        moved = moved - (squeezed if coarse else _pooled(squeezed, times))
+        moved = moved - (squeezed if interface.coarse else _pooled(squeezed, times))
 
     def within(step: Array) -> Array:
+        """Return the nearest change of the traction that stays within Coulomb's limit."""
         return _returned(before + step, limit) - before
 
+    # The elastic predictor: all of the contact sticks, and is as stiff as a circle of its area.
     start = within(_stiffness(load > 0, gel.poisson) * moved)
+    # Motion that the residual is compared with: the object's, or that by tractions which a smaller
+    # pressure no longer holds.
     scale = jnp.max(jnp.abs(moved)) + jnp.max(jnp.abs(within(jnp.zeros_like(moved))))
     scale = jnp.where(scale > 0, scale, 1)
-    most = iterations or (6 if fidelity == "fast" else 400)
     # Solved for the step, not the total: rounding of a large traction would lose a small step.
-    solution = descent(
-        apply,
-        within,
-        moved,
-        start,
-        most,
-        tolerance=None if fidelity == "fast" else tolerance * scale,
-    )
+    if fidelity == "fast":
+        solution = descent(apply, within, moved, start, interface.iterations or 6)
+    else:
+        most = interface.iterations or 400
+        tolerance = interface.tolerance * scale
+        solution = descent(apply, within, moved, start, most, tolerance=tolerance)
     # exactly zero without pressure
     total = jnp.where((limit > 0)[..., None], before + solution.x, 0)
     displacement = apply(total)
-    if not is_infinite(modulus_object):  # minus the object's part
+    # The compliance is that of gel and object together. The object's part is a half-space's.
+    if not is_infinite(interface.modulus_object):
         deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
         displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
-    if not coarse:
+    if not interface.coarse:
         displacement = enlarged(displacement, pressure.shape)
+    # A traction is smooth relative to the pressure, which falls to zero at the rim. So the ratio is
+    # repeated on the fine grid, and not the traction, which would have steps and reach outside.
     per_pressure = ratio(total * unit / times, load[..., None], 0.0)
     traction = _repeated(per_pressure, times) * pressure[..., None]
     sliding = _length(total) >= SLIPPING * limit
@@ -144,7 +182,7 @@ def shear_step(
         fraction,
         force,
         torque,
-        residual <= tolerance,
+        residual <= interface.tolerance,
         solution.iterations,
         residual,
     )
@@ -165,6 +203,7 @@ def _check(contact: PressResult, pitch: Any, friction: Any, fidelity: str) -> No
 
 
 def _compliance(plan: Plan, spectra: Array) -> Compliance:
+    """Return the surface's motion (H, W, 2) by a traction (H, W, 2), as a function."""
     xx, xy, yy = spectra
 
     def apply(traction: Array) -> Array:
@@ -185,6 +224,7 @@ def _rigid(plan: Plan, pitch: Array, motion: Array, centre: Array) -> Array:
 
 
 def _length(field: Array) -> Array:
+    """Return the lengths (H, W) of vectors (H, W, 2)."""
     squared = jnp.sum(field * field, -1)
     tiny = squared < 1e-24  # of a length whose gradient would overflow
     return jnp.where(tiny, 0, jnp.sqrt(jnp.where(tiny, 1, squared)))
@@ -193,14 +233,14 @@ def _length(field: Array) -> Array:
 def _returned(traction: Array, limit: Array) -> Array:
     """Return the nearest traction within Coulomb's limit (radial return)."""
     length = _length(traction)
-    return (
-        traction * jnp.where(length > limit, limit / jnp.where(length > 0, length, 1), 1)[..., None]
-    )
+    factor = jnp.where(length > limit, limit / jnp.where(length > 0, length, 1), 1)
+    return traction * factor[..., None]
 
 
 def _stiffness(touching: Array, poisson: float) -> Array:
-    """Return the mean traction per rigid motion of a sticking circle of the same area (Mindlin
-    1949), dimensionless.
+    """Return the mean traction per rigid motion of a sticking circle of the same area.
+
+    It is dimensionless (Mindlin 1949).
     """
     radius = jnp.sqrt(jnp.maximum(jnp.sum(touching), 1) / jnp.pi)
     return 4 * (1 - poisson) / (2 - poisson) / (jnp.pi * radius)
@@ -213,6 +253,7 @@ def _pooled(field: Array, times: int) -> Array:
 
 
 def _repeated(field: Array, times: int) -> Array:
+    """Return (H, W, ...) with every pixel repeated `times` x `times`, which undoes `_pooled`."""
     if times == 1:
         return field
     return jnp.repeat(jnp.repeat(field, times, 0), times, 1)
@@ -221,8 +262,9 @@ def _repeated(field: Array, times: int) -> Array:
 def _totals(
     traction: Array, slipping: Array, pressure: Array, pitch: Array
 ) -> tuple[Array, Array, Array]:
-    """Return force (2,) N, torque N mm about the centre of pressure, and the slipping share of the
-    contact's area.
+    """Return force, torque about the centre of pressure, and the slipping part of the contact.
+
+    They are (2,) N, N mm, and a share of the contact's area.
     """
     x, y = positions((pressure.shape[0], pressure.shape[1]), pitch)
     middle = centroid(pressure, pitch)

@@ -1,9 +1,11 @@
-"""Quadratic programs of contact: least energy with pressure >= 0, or with a traction within the
-friction limit.
+"""Quadratic programs of contact: least energy with pressure >= 0, or within the friction limit.
 
 Both minimise `x . K x / 2 - x . target` for a compliance K, which is a function. Everything is
 dimensionless or in one length unit. `excess` is K x - target: the gap for pressures, minus the slip
 for tractions.
+
+For a pressure the minimum is the complementarity of contact: where it presses the gap is zero,
+where there is a gap it does not press, and neither is ever negative (Signorini's conditions).
 """
 
 from __future__ import annotations
@@ -23,22 +25,22 @@ OWN = 1.122
 
 
 class Solution(NamedTuple):
-    """A load `x`, its `excess` K x - target, the residual in units of target, and the number of
-    iterations.
-    """
+    """The result of a quadratic program."""
 
-    x: Array
-    excess: Array
-    residual: Array
+    x: Array  # the load
+    excess: Array  # K x - target
+    residual: Array  # in units of the target
     iterations: Array
 
 
 class _Conjugate(NamedTuple):
+    """State of `conjugate_gradients`."""
+
     pressure: Array
     excess: Array
     direction: Array
-    squared: Array
-    free: Array
+    squared: Array  # sum of the squared gaps of the contact set, one round ago
+    free: Array  # whether the contact set did not grow, so the direction may be conjugate
     residual: Array
     iterations: Array
 
@@ -46,10 +48,10 @@ class _Conjugate(NamedTuple):
 def conjugate_gradients(
     apply: Compliance, target: Array, start: Array, tolerance: float | Array, iterations: int
 ) -> Solution:
-    """Solve for pressures >= 0 by conjugate gradients on the contact set (Polonsky and Keer, Wear
-    231, 1999).
+    """Solve for pressures >= 0 by conjugate gradients on the contact set.
 
-    It stops after `iterations`, or if no gap in contact and no overlap outside exceeds `tolerance`.
+    The method is Polonsky and Keer's (Wear 231, 1999). It stops after `iterations`, or if no gap in
+    contact and no overlap outside exceeds `tolerance`.
     """
     excess = apply(start) - target
     zero = jnp.zeros((), target.dtype)
@@ -76,13 +78,16 @@ def complementarity(pressure: Array, excess: Array) -> Array:
 
 
 def _round(apply: Compliance, target: Array, state: _Conjugate) -> _Conjugate:
+    """Return the state after one round: a step on the contact set, then a new contact set."""
     touching = state.pressure > 0
     gap = jnp.where(touching, state.excess, 0)
     squared = jnp.sum(gap * gap)
+    # A contact set that grew has another quadratic form, so the search starts again downhill.
     factor = jnp.where(state.free, ratio(squared, state.squared, 0.0), 0)
     direction = jnp.where(touching, gap + factor * state.direction, 0)
     step = ratio(jnp.sum(gap * direction), jnp.sum(direction * apply(direction)), 1 / OWN)
     step = jnp.maximum(step, 0)
+    # Pixels that would pull leave the contact, and those that overlap without pressure enter it.
     pressure = jnp.maximum(jnp.where(touching, state.pressure - step * direction, 0), 0)
     overlap = (pressure <= 0) & (state.excess < 0)
     pressure = jnp.where(overlap, -step * state.excess, pressure)
@@ -94,6 +99,8 @@ def _round(apply: Compliance, target: Array, state: _Conjugate) -> _Conjugate:
 
 
 class _Descent(NamedTuple):
+    """State of `descent`."""
+
     x: Array
     excess: Array
     step: Array
@@ -111,11 +118,21 @@ def descent(
     tolerance: float | Array | None = None,
     moved: Array | None = None,
 ) -> Solution:
-    """Solve for loads in a convex set by projected gradients with Barzilai-Borwein steps (Birgin et
-    al. 2000).
+    """Solve for loads in a convex set by spectral projected gradients.
 
-    Energy never rises. There is one product with K an iteration. It stops after `iterations`, or at
-    a projected gradient below `tolerance`. `moved` is K of `start`, if known.
+    Steps have Barzilai and Borwein's length (Birgin, Martinez and Raydan 2000), and a line search
+    that is exact, because the energy is quadratic. So energy never rises, and there is one product
+    with K an iteration.
+
+    Args:
+        apply: The compliance K.
+        project: The nearest load of the convex set.
+        target: What K of the load should be.
+        start: The first load, in the set.
+        iterations: At most so many; exactly so many without a tolerance.
+        tolerance: Of the projected gradient. Without one the number of iterations is fixed, so the
+            result can be differentiated in reverse.
+        moved: K of `start`, if known, which saves a product.
     """
 
     def residual(x: Array, excess: Array) -> Array:
@@ -123,6 +140,7 @@ def descent(
 
     def advance(s: _Descent) -> _Descent:
         way = project(s.x - s.step * s.excess) - s.x
+        # Along `way` the energy is a parabola. Its lowest point is at most the whole way off.
         bent_by = apply(way)
         bent = jnp.sum(way * bent_by)
         share = jnp.clip(ratio(-jnp.sum(s.excess * way), bent, 0.0), 0, 1)

@@ -1,3 +1,1 @@
-"""Your own sensor: the fit of its look from a few pictures, and tokens trained on simulated touches
-of it.
-"""
+"""Your own sensor: its look, fitted to a few pictures, and tokens from simulated touches."""

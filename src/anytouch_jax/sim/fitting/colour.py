@@ -1,9 +1,11 @@
-"""The colour change of a gel by its slope: from presses of a ball of known size, or from any
-presses.
+"""Colour change of a gel by its slope, fitted to presses of a ball of known size or to any presses.
 
 A ball's slopes are known up to its place and depth, and these are found together with the colours:
-linear least squares and a search take turns. Without a ball three things are known. The slopes of
-one surface fit together (no curl), gels are touched from all sides, and dents are dents.
+linear least squares and a search take turns.
+
+Without a ball three things are known. The slopes of one surface fit together (no curl), gels are
+touched from all sides, and dents are dents. They determine the slopes up to one factor, which is
+set to a usual one.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from anytouch_jax.sim.contact.mechanics import Gel, press
 from anytouch_jax.sim.sensing.sensors import POWERS, Photometry
 
 Array = np.ndarray
-_Found = tuple[float, Array]  # a loss, and what has it
+_Loss = tuple[float, Array]  # a loss, and what has it
+_Key = tuple[float, float, int]  # mm of the gel, mm of the halo, number of the _LIMITS
 # powers of (u, v) that a coefficient drifts by
 PLACES = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 # Largest tilt, and largest features of the halo, that change a colour: of open light, and of paint
@@ -55,30 +58,26 @@ UNSURE = (
 
 
 class Colour(NamedTuple):
-    """A fitted look with mm of its halo and gel, the share of the change that it explains, and how
-    it was found.
-    """
+    """A fitted photometry."""
 
     look: Photometry
-    halo: float
-    explained: float
-    source: str
-    thickness: float = 3.0
+    halo: float  # mm
+    explained: float  # fraction of the squared change that it explains
+    source: str  # how it was found, in words
+    thickness: float = 3.0  # mm of the gel
 
 
 class Grid(NamedTuple):
-    """Places of the pixels of a colour change (H, W): mm from the middle, and -1..1."""
+    """Places of the pixels of a colour change (H, W), or of some of them (N,)."""
 
-    x: Array
+    x: Array  # mm from the middle
     y: Array
-    u: Array
+    u: Array  # -1..1
     v: Array
 
 
 def grid_of(shape: tuple[int, int], width_mm: float) -> Grid:
-    """Return the places of the pixels (H, W) of a picture that shows `width_mm`, with square
-    pixels.
-    """
+    """Return the places of square pixels (H, W) of a picture that shows `width_mm`."""
     height, width = shape
     pixel = width_mm / width
     x, y = np.meshgrid(
@@ -88,22 +87,22 @@ def grid_of(shape: tuple[int, int], width_mm: float) -> Grid:
 
 
 class _Profiles(NamedTuple):
-    """Dents of a ball by depth (K,) and distance (R,) mm: slope, and depth and slope of the blurred
-    dent (K, R).
+    """Dents of a ball at K depths (`DEPTHS`) and R distances from its middle."""
 
-    `steepest` and `widest` are those of `Photometry`.
-    """
-
-    away: Array
-    slope: Array
-    soft: Array
-    soft_slope: Array
-    steepest: float
+    away: Array  # (R,) mm
+    slope: Array  # (K, R)
+    soft: Array  # (K, R) mm, depth of the blurred dent
+    soft_slope: Array  # (K, R), its slope
+    steepest: float  # as in `Photometry`
     widest: Array
 
 
-def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
-    """Return the dents of a ball by thickness of the gel, halo, and number of the _LIMITS."""
+def _profiles(ball_mm: float) -> dict[_Key, _Profiles]:
+    """Return the dents of a ball by thickness of the gel, halo, and number of the _LIMITS.
+
+    A dent is round, so a line from its middle is all of it. It is solved once, and not in the
+    search, which looks it up.
+    """
     line = (np.arange(_GRID) - (_GRID - 1) / 2) * _SIDE / _GRID
     away = np.hypot(*np.meshgrid(line, line))
     radius = ball_mm / 2
@@ -120,35 +119,35 @@ def _profiles(ball_mm: float) -> dict[tuple[float, float, int], _Profiles]:
             lambda depth: press(height, depth, gel, pitch, fidelity="fast").displacement
         )(depths)
 
-    found = dict[tuple[float, float, int], _Profiles]()
+    def lines(dents: Array, width: float) -> tuple[Array, Array]:
+        """Return depth and slope (K, R) of dents (K, H, W) blurred by `width` mm."""
+        blurred = [cv2.GaussianBlur(dent, (0, 0), width / pitch) for dent in dents]
+        depth = np.stack([one[middle, middle:] for one in blurred])
+        return depth, np.gradient(depth, pitch, axis=1)
+
+    found = dict[_Key, _Profiles]()
     for thickness in THICKNESSES:
-        dents = np.asarray(
-            solve(DEPTHS.astype(np.float32), Gel(150.0, thickness=np.float32(thickness)))
-        )
-
-        def rows(width: float, dents: Array = dents) -> tuple[Array, Array]:
-            blurred = [cv2.GaussianBlur(dent, (0, 0), width / pitch) for dent in dents]
-            lines = np.stack([one[middle, middle:] for one in blurred])
-            return lines, np.gradient(lines, pitch, axis=1)
-
-        sharp = rows(SKIN)[1]
-        for halo, (number, (steepest, widest)) in product(HALOS, enumerate(_LIMITS)):
-            found[thickness, halo, number] = _Profiles(
-                line[middle:], sharp, *rows(halo), steepest, np.array(widest)
-            )
+        gel = Gel(150.0, thickness=np.float32(thickness))
+        dents = np.asarray(solve(DEPTHS.astype(np.float32), gel))
+        _, slope = lines(dents, SKIN)
+        for halo in HALOS:
+            soft, soft_slope = lines(dents, halo)
+            for number, (steepest, widest) in enumerate(_LIMITS):
+                found[thickness, halo, number] = _Profiles(
+                    line[middle:], slope, soft, soft_slope, steepest, np.array(widest)
+                )
     return found
 
 
 def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]:
-    """Return the arguments of `design` for a ball at `pose` x, y, depth mm and the places (N,) of a
-    grid.
-    """
+    """Return the arguments of `design` for a ball at `pose` (x, y, depth mm), at N places."""
     dx = grid.x - pose[0]
     dy = grid.y - pose[1]
     away = np.hypot(dx, dy)
     k = float(np.clip(np.interp(pose[2], DEPTHS, np.arange(len(DEPTHS))), 0, len(DEPTHS) - 1.001))
     low = int(k)
-    share = k - int(k)
+    share = k - low
+    # Between two depths, and between two distances, the profiles are interpolated linearly.
     slope, soft, wide = (
         np.interp(away, profiles.away, (1 - share) * table[low] + share * table[low + 1], right=0.0)
         for table in profiles[1:4]
@@ -162,8 +161,21 @@ def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]
 
 
 def design(nx: Array, ny: Array, u: Array, v: Array, halo: Array, *, plain: bool = False) -> Array:
-    """Return the rows (N, 129) of the least squares problem of a `Photometry`; `plain` ones are (N,
-    22).
+    """Return the rows of the linear least squares problem of a `Photometry`.
+
+    The change of a pixel is linear in the coefficients: powers of the normal times powers of the
+    place (`optics.colour_change`), and the halo times a drift.
+
+    Args:
+        nx: (N,) sines of the tilt.
+        ny: (N,)
+        u: (N,) places in -1..1.
+        v: (N,)
+        halo: (N, 3) slopes and depth of the blurred dent.
+        plain: Fewer terms, with which poses are searched.
+
+    Returns:
+        (N, 129), or (N, 22) plain ones.
     """
     normal = np.stack([nx**i * ny**j for i, j in (POWERS[:PLAIN] if plain else POWERS)], 1)
     if plain:
@@ -177,6 +189,7 @@ def design(nx: Array, ny: Array, u: Array, v: Array, halo: Array, *, plain: bool
 
 
 def _ridge(gram: Array, target: Array, penalties: Array) -> Array:
+    """Return the ridge solution of normal equations, with penalties relative to each column."""
     scale = np.sqrt(np.diag(gram)) + 1e-12
     scaled = gram / scale[:, None] / scale[None, :] + np.diag(penalties)
     return np.asarray(np.linalg.solve(scaled, target / scale[:, None]) / scale[:, None])
@@ -213,7 +226,7 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
     """
     part = Grid(*(values.ravel() for values in grid_of(change.shape[1:3], width_mm)))
     known = _profiles(ball_mm)
-    # A pixel that is not clear has change 0 and features 0.
+    # A pixel that is not clear has change 0 and features 0, so it has no say.
     flat = change.reshape(len(change), -1, 3).astype(np.float64)
     seen = clear.reshape(len(clear), -1, 1)
     flat = flat * seen
@@ -251,34 +264,34 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
 
 def _placed(
     flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, rounds: Any
-) -> _Found:
-    """Return the loss of `_colours`, and better poses (N, 3): the colours and the poses are found
-    in turn.
+) -> _Loss:
+    """Return the loss of `_colours`, and better poses (N, 3).
+
+    The colours and the poses are found in turn, in smaller and smaller steps.
     """
     for step, deep in rounds:
         # Deeper dents with fainter colours look nearly alike, so all depths are also tried
         # together.
         tries = [poses * (1, 1, factor) for factor in (0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.25)]
-        losses, solutions = zip(
-            *(_colours(flat, seen, part, profiles, one) for one in tries), strict=True
-        )
-        best = int(np.argmin(losses))
-        poses = np.stack(
-            [
-                _search(
-                    one, weight, part, profiles, pose, solutions[best], np.array([step, step, deep])
-                )
-                for one, weight, pose in zip(flat, seen, tries[best], strict=True)
-            ]
-        )
+        results = [_colours(flat, seen, part, profiles, one) for one in tries]
+        best = int(np.argmin([loss for loss, _ in results]))
+        colours = results[best][1]
+        steps = np.array([step, step, deep])
+        better = [
+            _search(one, weight, part, profiles, pose, colours, steps)
+            for one, weight, pose in zip(flat, seen, tries[best], strict=True)
+        ]
+        poses = np.stack(better)
     return _colours(flat, seen, part, profiles, poses, plain=False)[0], poses
 
 
 def _colours(
     flat: Array, seen: Array, part: Grid, profiles: _Profiles, poses: Array, plain: bool = True
-) -> _Found:
-    """Return minus the squares of the change that the best colours explain, and these colours (22
-    or 129, 3).
+) -> _Loss:
+    """Return the best colours (22 or 129, 3) for these poses, after their loss.
+
+    The loss is minus the squares of the change that they explain: of least squares with normal
+    matrix G and right side b, the solution c explains 2 b . c - c . G c.
     """
     rows = [
         w * design(*_features(part, profiles, pose), plain=plain)
@@ -291,9 +304,7 @@ def _colours(
 
 
 def _first_pose(change: Array, grid: Grid, profiles: _Profiles) -> Array:
-    """Return a first place and depth: the middle of the strongest changes, and the depth whose
-    slopes reach as far.
-    """
+    """Return a first pose: the middle of the strongest changes, and a depth that reaches as far."""
     strength = np.abs(change).max(1)
     strong = strength > 0.4 * np.percentile(strength, 99.5)
     x = float(np.median(grid.x[strong]))
@@ -334,8 +345,12 @@ def _search(
 
 
 def fit_presses(change: Array, clear: Array) -> Colour:
-    """Fit colour changes f32 (N, H, W, 3) of presses of unknown objects: their slopes without a
-    curl, see above.
+    """Fit colour changes f32 (N, H, W, 3) of presses of unknown objects.
+
+    A colour change is taken as linear in two slopes. Gels are touched from all sides, so the slopes
+    have one variance and no correlation. The two strongest colours, scaled to one variance, are
+    therefore the slopes up to a rotation and a mirror image. The rotation is the one of least curl,
+    because the slopes of a surface have none, and the sign is the one that makes dents.
     """
     smooth = np.stack([cv2.GaussianBlur(one, (0, 0), 1.0) for one in change])
     grid = grid_of(change.shape[1:3], 2.0)
@@ -344,12 +359,11 @@ def fit_presses(change: Array, clear: Array) -> Colour:
     values, axes = np.linalg.eigh(np.cov(smooth.reshape(-1, 3).T, ddof=0))
     main = smooth[touched] @ axes[:, -1]
     coefficients = np.zeros((FEATURES + 9, 3))
-    if (
-        values[1] < 0.03 * values[2] and main.mean() ** 2 > 0.1 * main.var()
-    ):  # one colour, of one sign: no slope
-        coefficients[FEATURES + 6] = (
-            axes[:, -1] * np.sign(main.mean()) * np.sqrt((main**2).mean()) / USUAL_DEPTH
-        )
+    # One colour, of one sign: such a gel darkens by depth, and slopes cannot be seen.
+    by_depth = values[1] < 0.03 * values[2] and main.mean() ** 2 > 0.1 * main.var()
+    if by_depth:
+        strength = np.sqrt((main**2).mean())
+        coefficients[FEATURES + 6] = axes[:, -1] * np.sign(main.mean()) * strength / USUAL_DEPTH
         source = (
             f"{len(change)} presses of unknown objects, of a gel that changes by depth. "
             f"{UNSURE.format('30 %')}"
@@ -358,15 +372,7 @@ def fit_presses(change: Array, clear: Array) -> Colour:
     values, axes = np.linalg.eigh(np.cov(smooth[clear].T, ddof=0))
     # (N, H, W, 2), uncorrelated: slopes up to a turn
     white = (smooth @ axes[:, 1:]) / np.sqrt(values[1:])
-    down, across = (np.gradient(white, axis=axis)[clear] for axis in (1, 2))
-    best = (np.inf, np.eye(2))
-    for mirror, angle in product((1, -1), np.linspace(0, np.pi, 180, endpoint=False)):
-        turn = np.array(
-            [[np.cos(angle), np.sin(angle)], [-mirror * np.sin(angle), mirror * np.cos(angle)]]
-        )
-        curl = down @ turn[0] - across @ turn[1]
-        best = min(best, (float((curl**2).sum()), turn), key=lambda one: one[0])
-    slopes = white @ best[1].T
+    slopes = white @ _least_curl(white, clear).T
     if _depth_of(slopes)[touched].mean() < 0:
         slopes = -slopes
     # The colours drift over the picture: those of the nearest surface, and the slopes by these
@@ -377,22 +383,54 @@ def fit_presses(change: Array, clear: Array) -> Colour:
         square = (fitting**2).sum(-1)
         fitting *= USUAL_TILT / np.sqrt((square**2).sum() / square.sum())
         rows = (fitting[..., None] * place[:, :, None]).reshape(*smooth.shape[:3], 6)[clear]
-        linear = _ridge(
-            rows.T @ rows, rows.T @ smooth[clear], np.array([0, 0.05, 0.05] * 2)
-        ).reshape(2, 3, 3)
-        colours = np.einsum("hwp,dpc->hwdc", place, linear)
-        square = colours @ colours.swapaxes(2, 3)
-        square += 0.01 * np.trace(square.mean((0, 1))) * np.eye(2)
-        slopes = np.einsum("hwde,hwec,nhwc->nhwd", np.linalg.inv(square), colours, smooth)
-    coefficients[:3], coefficients[len(PLACES) : len(PLACES) + 3] = linear
+        penalties = np.array([0, 0.05, 0.05] * 2)
+        linear = _ridge(rows.T @ rows, rows.T @ smooth[clear], penalties).reshape(2, 3, 3)
+        slopes = _slopes_by(np.einsum("hwp,dpc->hwdc", place, linear), smooth)
+    # The powers 1, 0 and 0, 1 of the normal are the first two; the rest stays zero.
+    coefficients[:3] = linear[0]
+    coefficients[len(PLACES) : len(PLACES) + 3] = linear[1]
     left = ((smooth[clear] - rows @ linear.reshape(6, 3)) ** 2).sum() / (smooth[clear] ** 2).sum()
     source = f"{len(change)} presses of unknown objects. {UNSURE.format('20 %')}"
     return Colour(assemble(coefficients), 1.0, 1 - float(left), source)
 
 
+def _least_curl(white: Array, clear: Array) -> Array:
+    """Return the rotation (2, 2), perhaps with a mirror image, that leaves two maps least curl.
+
+    The maps are `white` (N, H, W, 2), of which places `clear` (N, H, W) count.
+    """
+    down, across = (np.gradient(white, axis=axis)[clear] for axis in (1, 2))
+    least = np.inf
+    best = np.eye(2)
+    # Half a turn is enough: the other half has the other sign, which is found later.
+    for mirror, angle in product((1, -1), np.linspace(0, np.pi, 180, endpoint=False)):
+        c = np.cos(angle)
+        s = np.sin(angle)
+        turn = np.array([[c, s], [-mirror * s, mirror * c]])
+        # of slopes (p, q): dp/dy - dq/dx
+        curl = down @ turn[0] - across @ turn[1]
+        total = float((curl**2).sum())
+        if total < least:
+            least = total
+            best = turn
+    return best
+
+
+def _slopes_by(colours: Array, change: Array) -> Array:
+    """Return slopes (N, H, W, 2) of a change (N, H, W, 3), by their colours (H, W, 2, 3).
+
+    They are least squares at each pixel, with a ridge where the two colours are alike.
+    """
+    square = colours @ colours.swapaxes(2, 3)
+    square += 0.01 * np.trace(square.mean((0, 1))) * np.eye(2)
+    return np.asarray(np.einsum("hwde,hwec,nhwc->nhwd", np.linalg.inv(square), colours, change))
+
+
 def _depth_of(slopes: Array) -> Array:
-    """Return the surface (N, H, W) whose slopes (N, H, W, 2) along x and y are nearest, 0 on
-    average at the border.
+    """Return the surface (N, H, W) whose slopes (N, H, W, 2) along x and y are nearest.
+
+    It is 0 on average at the border. In Fourier space, where k is a wave, the nearest surface is
+    (k . slopes) / (2 pi i k^2). The padding keeps opposite sides apart.
     """
     height, width = slopes.shape[1:3]
     ky, kx = np.meshgrid(np.fft.fftfreq(2 * height), np.fft.fftfreq(2 * width), indexing="ij")

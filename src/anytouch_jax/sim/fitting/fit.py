@@ -1,7 +1,8 @@
-"""From a few pictures of a sensor to a folder NAME.sensor that the simulator takes.
+"""Fit of your own sensor: from a few pictures to a folder NAME.sensor for the simulator.
 
 `see` finds what the pictures show by themselves: the untouched gel, presses, dots and noise.
-`fit_sensor` adds the colours by slope, and writes the folder. Lengths of pictures are in pixels.
+`fit_sensor` adds the colours by slope (`colour`), and writes the folder. Lengths of pictures are in
+pixels.
 """
 
 from __future__ import annotations
@@ -24,34 +25,30 @@ from anytouch_jax.data.background.estimate import (
 )
 from anytouch_jax.data.background.rule import FEWEST, TINT, median, reduced
 from anytouch_jax.errors import UserError
+from anytouch_jax.sensors import RECORDS, Markers
 from anytouch_jax.sim.fitting import colour
 from anytouch_jax.sim.fitting.colour import Colour
 from anytouch_jax.sim.sensing import own
 from anytouch_jax.sim.sensing.own import MM, OwnSensor
-from anytouch_jax.sim.sensing.sensors import Markers
 
 Array = np.ndarray
 WORK = 96  # pixels of the long side on which the colour change is fitted
 BASE = 40  # pixels of the long side of a stored untouched gel
 ANOTHER = 0.15  # share of the pictures that shows another unit
 DARK = 14  # grey levels: the corners of a round picture
-# keeps the deviation of white noise
+# A filter that removes surfaces and keeps the deviation of white noise: its squares sum to one.
 _CURVED = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
-NOT_FLAT = ("allsight", "tactip", "taclink", "digit360", "digit_360", "omnitact", "insight")
+NOT_FLAT = tuple(name for name, record in RECORDS.items() if not record.is_flat)
 
 
 class Seen(NamedTuple):
-    """Pictures of one unit u8 (N, h, w, 3), its untouched gel, and the colour change f32 (N, H, W,
-    3) of the presses.
+    """What N pictures of one unit show, P of them presses."""
 
-    `clear` bool (N, H, W) is where no dots hide the change, and no colour is at its limit.
-    """
-
-    frames: Array
-    gel: Array
+    frames: Array  # u8 (N, h, w, 3)
+    gel: Array  # u8 (h, w, 3), untouched
     pressed: Array  # bool (N,)
-    change: Array
-    clear: Array
+    change: Array  # f32 (P, H, W, 3) colour change of the presses, 0..1
+    clear: Array  # bool (P, H, W), where no dots hide it, and no colour is at its limit
     dots: Dots | None
     noise: float
     noise_spread: float  # relative, from picture to picture
@@ -69,24 +66,18 @@ def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
             f"{len(frames)} pictures are too few to fit a sensor; take {FEWEST} or more, 20 are "
             "good"
         )
-    if len(shapes := {frame.shape for frame in frames}) > 1:
+    shapes = {frame.shape for frame in frames}
+    if len(shapes) > 1:
         raise UserError(
             f"the pictures have {len(shapes)} sizes; give those of one camera and one setting"
         )
     _check_one_unit(frames)
-    small = [scale_picture(frame) for frame in frames]
     if background is None:
         gel = median(frames)
         source = f"median of {len(frames)} pictures"
     else:
-        gel = reduced(background)
+        gel = _given(background, frames[0])
         source = "given"
-        if abs(gel.shape[1] / gel.shape[0] / (frames[0].shape[1] / frames[0].shape[0]) - 1) > 0.02:
-            raise UserError(
-                "the background has other proportions than the pictures; take it with the same "
-                "camera"
-            )
-        gel = cv2.resize(gel, frames[0].shape[1::-1], interpolation=cv2.INTER_AREA)
     _check_flat(gel)
     untouched = UntouchedGel(gel)
     pressed = np.array([untouched.score(frame) >= DIFFERENT for frame in frames])
@@ -94,7 +85,8 @@ def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
         raise UserError(
             "no picture shows a press; press objects of all kinds into the gel, at changing places"
         )
-    if background is None and median_gel(small) is None:
+    # A median of presses at one place would hold the press.
+    if background is None and median_gel([scale_picture(frame) for frame in frames]) is None:
         raise UserError(
             "every picture shows a press at the same place; name the untouched gel with "
             "--background"
@@ -105,16 +97,28 @@ def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
     return Seen(np.stack(frames), gel, pressed, change, clear, dots, noise, spread, source)
 
 
-def _check_one_unit(frames: Sequence[Array]) -> None:
-    """Raise UserError if a part of the pictures differs from the rest in most places, and not from
-    each other.
+def _given(background: Array, frame: Array) -> Array:
+    """Return the background that the user names, in the size of a frame.
+
+    Raises UserError for one of other proportions.
     """
-    small = np.stack(
-        [
-            cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
-            for one in frames
-        ]
-    )
+    gel = reduced(background)
+    height, width = frame.shape[:2]
+    if abs(gel.shape[1] / gel.shape[0] / (width / height) - 1) > 0.02:
+        raise UserError(
+            "the background has other proportions than the pictures; take it with the same camera"
+        )
+    return cv2.resize(gel, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _check_one_unit(frames: Sequence[Array]) -> None:
+    """Raise UserError if the pictures are of two units.
+
+    Then a part of them differs from the rest in most places, and its pictures not from each other.
+    """
+    thumbs = [cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA) for one in frames]
+    small = np.stack(thumbs).astype(np.float32)
+    # A press changes a part of a picture, so the median over the places is that of the gels.
     apart = np.array([np.median(np.abs(small - one), axis=(1, 2)).max(1) for one in small])
     near = apart <= TINT
     rest = np.flatnonzero(~near[np.argmax(near.sum(1))])
@@ -122,8 +126,7 @@ def _check_one_unit(frames: Sequence[Array]) -> None:
     if enough and near[np.ix_(rest, rest)].sum(1).max() >= max(2, 0.5 * len(rest)):
         raise UserError(
             f"{len(rest)} of {len(frames)} pictures differ from the others in most places, as if "
-            "taken with another "
-            "unit or in other light; fit each unit by itself"
+            "taken with another unit or in other light; fit each unit by itself"
         )
 
 
@@ -135,11 +138,9 @@ def _check_flat(gel: Array) -> None:
         for rows in (slice(height), slice(-height, None))
         for columns in (slice(width), slice(-width, None))
     ]
-    if (
-        max(float(corner.max(-1).mean()) for corner in corners)
-        < DARK
-        < gel[3 * height : -3 * height].mean() / 3
-    ):
+    brightest = max(float(corner.max(-1).mean()) for corner in corners)
+    middle = gel[3 * height : -3 * height].mean()
+    if brightest < DARK < middle / 3:
         raise UserError(
             "the picture is round, so the sensor is not flat; a flat gel that fills the picture "
             "can be fitted"
@@ -156,9 +157,7 @@ class Fitted(NamedTuple):
 
 
 def check_name(name: str) -> None:
-    """Raise UserError for a name that another sensor has, or that belongs to a sensor which cannot
-    be fitted.
-    """
+    """Raise UserError for the name of another sensor, or of one that cannot be fitted."""
     word = name.lower().replace("-", "_").replace(" ", "_")
     if word in FIELD_SENSORS:
         raise UserError(
@@ -184,11 +183,19 @@ def fit_sensor(
     background: np.ndarray | None = None,
     ball_mm: float | None = None,
 ) -> Fitted:
-    """Fit pictures RGB u8 (h, w, 3) of one unit, whose width shows `width_mm`, and write the folder
-    `out`.
+    """Fit a sensor to pictures of one unit, and write its folder.
 
-    All presses are of a ball of `ball_mm`, if that is given. Raises UserError for pictures that
-    cannot be fitted.
+    Args:
+        pictures: RGB u8 (h, w, 3).
+        name: Of the sensor.
+        width_mm: Width of the gel that a picture shows.
+        out: The folder, NAME.sensor.
+        background: The untouched gel; without it, the median of the pictures.
+        ball_mm: Diameter of the ball, if all presses are of one. Its slopes are known, so the
+            strength of the colours and the thickness of the gel are found too.
+
+    Raises:
+        UserError: For pictures that cannot be fitted.
     """
     check_name(name)
     if Path(out).suffix != OWN_SENSOR:
@@ -198,8 +205,8 @@ def fit_sensor(
     if not all(MM.low <= side <= MM.high for side in (width_mm, height_mm)):
         raise UserError(
             f"a picture of {width} x {height} pixels that is {width_mm:g} mm wide shows "
-            f"{width_mm:g} x {height_mm:.3g} "
-            f"mm; the sides of a gel are {MM.words}. Check --width-mm."
+            f"{width_mm:g} x {height_mm:.3g} mm; the sides of a gel are {MM.words}. Check "
+            "--width-mm."
         )
     if ball_mm is not None and not 1 <= ball_mm <= 40:
         raise UserError(f"a ball of {ball_mm:g} mm cannot be used; take one of 3 to 12 mm")
@@ -209,44 +216,56 @@ def fit_sensor(
     else:
         found = colour.fit_balls(seen.change, seen.clear, width_mm, ball_mm)
     pixel = width_mm / seen.gel.shape[1]
-    dots = seen.dots
-    markers = None
-    if dots is not None:
-        ink: Any = tuple(round(float(value), 3) for value in dots.ink)
-        step = round(dots.pitch * pixel, 4)
-        radius = round(dots.radius * pixel, 4)
-        markers = Markers(step, radius, round(dots.aspect, 3), 1.0, ink, round(dots.bend, 4))
-    sure = {
-        "pictures": f"{len(pictures)}, of which {int(seen.pressed.sum())} show a press",
-        "untouched gel": f"{seen.source}; its lights and vignette are in it",
-        "dots": "none seen"
-        if dots is None
-        else f"steps from dot to dot {dots.spread:.1%} around the lattice",
-        "noise": f"{seen.noise_spread:.0%} from picture to picture",
-        "colour": f"explains {found.explained:.0%} of the change, from {found.source}",
-        "size": "as given",
-        "thickness_mm, halo_mm": "not seen" if ball_mm is None else "the best of a few",
-        "modulus_kpa, skin_mm": "not seen in pictures: usual values, edit what you know",
-    }
     numbers = OwnSensor(
         name,
         float(width_mm),
         round(height_mm, 4),
         (height, width),
         round(seen.noise, 3),
-        markers,
+        None if seen.dots is None else _markers(seen.dots, pixel),
         thickness_mm=found.thickness,
         halo_mm=found.halo,
-        sure=sure,
+        sure=_sure(seen, found, with_ball=ball_mm is not None),
     )
-    return Fitted(
-        own.write_sensor(out, numbers, without_dots(seen)[None], found.look), numbers, seen, found
+    folder = own.write_sensor(out, numbers, without_dots(seen)[None], found.look)
+    return Fitted(folder, numbers, seen, found)
+
+
+def _markers(dots: Dots, pixel: float) -> Markers:
+    """Return dots in mm, with `pixel` mm a pixel."""
+    red, green, blue = (round(float(value), 3) for value in dots.ink)
+    return Markers(
+        pitch=round(dots.pitch * pixel, 4),
+        radius=round(dots.radius * pixel, 4),
+        aspect=round(dots.aspect, 3),
+        share=1.0,
+        ink=(red, green, blue),
+        bend=round(dots.bend, 4),
     )
+
+
+def _sure(seen: Seen, found: Colour, *, with_ball: bool) -> dict[str, str]:
+    """Return how each part of a sensor was found, and how sure it is, in words."""
+    if seen.dots is None:
+        dots = "none seen"
+    else:
+        dots = f"steps from dot to dot {seen.dots.spread:.1%} around the lattice"
+    return {
+        "pictures": f"{len(seen.frames)}, of which {int(seen.pressed.sum())} show a press",
+        "untouched gel": f"{seen.source}; its lights and vignette are in it",
+        "dots": dots,
+        "noise": f"{seen.noise_spread:.0%} from picture to picture",
+        "colour": f"explains {found.explained:.0%} of the change, from {found.source}",
+        "size": "as given",
+        "thickness_mm, halo_mm": "the best of a few" if with_ball else "not seen",
+        "modulus_kpa, skin_mm": "not seen in pictures: usual values, edit what you know",
+    }
 
 
 def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
-    """Return the deviation of a pixel from picture to picture where nothing presses, and its
-    relative spread.
+    """Return the standard deviation of a pixel where nothing presses, and its relative spread.
+
+    Both are from picture to picture.
     """
     fine = []
     calm = []
@@ -257,25 +276,28 @@ def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
         fine.append(cv2.filter2D(frame.astype(np.float32), -1, _CURVED))
     weight = np.stack(calm)[..., None].astype(np.float32)
     count = weight.sum(0)
-    left = (np.stack(fine) - (np.stack(fine) * weight).sum(0) / np.maximum(count, 1)) * np.sqrt(
-        count / np.maximum(count - 1, 1)
-    )
+    # The fixed pattern of camera and gel is no noise. It is the mean over the calm pictures, which
+    # takes a part of the noise with it: hence the factor of an unbiased variance.
+    mean = (np.stack(fine) * weight).sum(0) / np.maximum(count, 1)
+    left = (np.stack(fine) - mean) * np.sqrt(count / np.maximum(count - 1, 1))
     found = []
     for one, quiet in zip(left, np.stack(calm) & (count[..., 0] > 2), strict=True):
         if quiet.sum() > 100:
             values = one[quiet]
+            # Three deviations, by the median: specks and edges are no noise.
             most = 3 * max(1.4826 * float(np.median(np.abs(values))), 0.3)
             found.append(float(np.mean(np.clip(values, -most, most) ** 2)))
     if not found:
         return 1.0, 1.0
-    # of rounding
+    # Rounding to whole grey levels adds a variance of 1/12.
     deviations = np.sqrt(np.maximum(np.array(found) - 1 / 12, 0.01))
     return float(np.median(deviations)), float(np.std(deviations) / np.median(deviations))
 
 
 def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Array, Array]:
-    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, without light and dots, and
-    where they show.
+    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, and where they show.
+
+    A change of the light, which is a plane for each colour, is removed, and so are the dots.
     """
     height, width = gel.shape[:2]
     size = (round(width * WORK / max(height, width)), round(height * WORK / max(height, width)))
@@ -285,6 +307,7 @@ def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Ar
         weight = np.ones((height, width), np.float32)
         if dots is not None:
             weight[hidden(frame, dots)] = 0
+        # Averages over the pixels that no dot hides.
         share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
         change = frame.astype(np.float32) - gel
         change -= change_of_light(change)
@@ -303,9 +326,7 @@ def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Ar
 
 
 def without_dots(seen: Seen) -> Array:
-    """Return the untouched gel u8 (h, w, 3) of at most BASE pixels a side, with paint in the place
-    of dots.
-    """
+    """Return the untouched gel u8 (h, w, 3) of at most BASE pixels a side, without its dots."""
     gel: Any = seen.gel
     if seen.dots is not None:
         gel = cv2.inpaint(gel, seen.dots.mask.astype(np.uint8), 3, cv2.INPAINT_TELEA)

@@ -1,6 +1,4 @@
-"""Simulated touches of your own sensor next to the known ones: for its picture, and for its
-tokens.
-"""
+"""Simulated touches of your own sensor and of known ones: for its picture, and for its tokens."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from anytouch_jax.files import atomic_write
 from anytouch_jax.sim import endless
 from anytouch_jax.sim.endless import CAMERAS, Sampling, SimulatedTouches, World
 from anytouch_jax.sim.recorder import RELIEF, ball
-from anytouch_jax.sim.scene import Scenes
+from anytouch_jax.sim.scene import training_scenes
 
 Array = np.ndarray
 OBJECTS = 160  # of a world
@@ -37,16 +35,16 @@ def own_world(
     known: Sequence[str] = CAMERAS,
     ball_mm: float | None = None,
 ) -> World:
-    """Return the world of your sensor (family 0) and the `known` ones, with objects of a split of
-    training.
+    """Return the world of your sensor (family 0) and of the `known` ones.
 
-    All objects are balls of `ball_mm`, if that is given.
+    Its objects are those of a split of the usual training, so the encoder of the package has seen
+    no object of split test. All objects are balls of `ball_mm`, if that is given.
     """
-    usual = SimulatedConfig()
-    scenes = Scenes(objects=usual.objects, seed=usual.seed, depth=usual.depth)
+    scenes = training_scenes(SimulatedConfig())
     things = endless.objects_of(scenes, split, variants=2)[:OBJECTS]
     world = endless.make_world(things, (str(sensor), *known))
     if ball_mm is not None:
+        # Around the ball there is a floor at the height of its middle.
         edge = RELIEF // 4
         one = np.pad(ball(ball_mm, RELIEF - 2 * edge), edge, constant_values=-ball_mm / 2)
         world = world._replace(relief=np.broadcast_to(one.astype(np.float16), world.relief.shape))
@@ -67,11 +65,19 @@ def compare(
     ball_mm: float | None = None,
     seed: int = 0,
 ) -> float:
-    """Write a picture of real frames u8 (N, h, w, 3) above simulated ones, and return what a
-    classifier still sees.
+    """Write a picture of real frames above simulated ones, and measure how different they are.
 
-    Both are presses of a ball of `ball_mm`, if that is given. The result is the share of held-out
-    pictures that a linear classifier names rightly as real or simulated: 0.5 is chance.
+    Args:
+        frames: Real frames u8 (N, h, w, 3) of presses.
+        gel: Their background u8 (h, w, 3).
+        sensor: The folder NAME.sensor.
+        out: The picture to write.
+        ball_mm: Diameter of the ball, if all presses are of one.
+        seed: Of the simulated touches and of the classifier's folds.
+
+    Returns:
+        The fraction of held-out pictures that a linear classifier names rightly as real or
+        simulated: 0.5 is chance.
     """
     world = own_world(sensor, "train", ball_mm=ball_mm)
     count = min(len(frames), 2 * COUNT)
@@ -83,13 +89,14 @@ def compare(
     made = np.concatenate([part.clip[:, 1, -1] for part in parts])[: len(real)]
     behind = np.concatenate([part.background[:, 1] for part in parts])[: len(real)]
     atomic_write(out, encode(_picture(real, made)))
-    small = [_small(frame) - _small(gel) for frame in real]
-    return separable(
-        small, [a.astype(np.float32) - b for a, b in zip(made, behind, strict=True)], seed
-    )
+    # Changes are compared, and not pictures: the backgrounds of units differ more than their dents.
+    real_changes = [_small(frame) - _small(gel) for frame in real]
+    made_changes = [a.astype(np.float32) - b for a, b in zip(made, behind, strict=True)]
+    return separable(real_changes, made_changes, seed)
 
 
 def _small(picture: Array) -> Array:
+    """Return a picture f32 in the size of the simulated ones."""
     return cv2.resize(picture, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
@@ -106,8 +113,9 @@ def _picture(real: Array, made: Array) -> Array:
 
 
 def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
-    """Return the share of held-out differences f32 (h, w, 3) that a ridge classifier on statistics
-    gets right.
+    """Return the fraction of changes f32 (h, w, 3) that a classifier names rightly, held out.
+
+    It is a ridge classifier on a few statistics of each, in FOLDS folds.
     """
     rows = np.stack([_statistics(one) for one in (*real, *made)])
     kind = np.repeat([1.0, -1.0], [len(real), len(made)])
@@ -120,6 +128,7 @@ def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
         scale = rows[train].std(0) + 1e-6
         x = (rows[train] - middle) / scale
         y = kind[train]
+        # There are about as many pictures as statistics, so the penalty is a strong one.
         weights = np.linalg.solve(x.T @ x + 10.0 * np.eye(x.shape[1]), x.T @ (y - y.mean()))
         guess = ((rows[test] - middle) / scale) @ weights + y.mean()
         right.append(np.sign(guess) == kind[test])
@@ -127,16 +136,14 @@ def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
 
 
 def _statistics(change: Array) -> Array:
-    """Return means, deviations, tails and detail at three scales of a difference f32 (h, w, 3), and
-    its colours.
-    """
-    parts: list[Any] = [change.mean((0, 1)), *np.percentile(change, (2, 10, 90, 98), axis=(0, 1))]
+    """Return means, tails and detail at three scales of a change f32 (h, w, 3), and its colours."""
+    parts: list[Array] = [change.mean((0, 1)), *np.percentile(change, (2, 10, 90, 98), axis=(0, 1))]
     for blur in (0.0, 1.5, 4.0):
         one = cv2.GaussianBlur(change, (0, 0), blur) if blur else change
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=0)).mean((0, 1))))
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=1)).mean((0, 1))))
+    # Correlations of the colours. The unit on the diagonal keeps those of a flat picture finite.
     colours = np.cov(change.reshape(-1, 3).T) + np.eye(3)
-    parts.append(
-        (colours / np.sqrt(np.outer(np.diag(colours), np.diag(colours))))[np.triu_indices(3, 1)]
-    )
+    deviation = np.sqrt(np.outer(np.diag(colours), np.diag(colours)))
+    parts.append((colours / deviation)[np.triu_indices(3, 1)])
     return np.concatenate(parts)

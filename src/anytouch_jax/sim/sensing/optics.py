@@ -1,9 +1,12 @@
 """Renderer of tactile images from the deformation of the skin, and the field that Tac3D measures.
 
 Everything is a product of small matrices along rows and columns, or arithmetic that XLA fuses into
-one pass. So a batch under `vmap` costs little more than its pixels. The steps are: resample and
-differentiate the displacement at the pixels, colour change by normal and place, soft shadow and
-light bleed from the blurred dent, background, markers, noise.
+one pass. So a batch under `vmap` costs little more than its pixels. The steps are:
+
+1. Resample and differentiate the displacement at the pixels.
+2. Change the colour by the normal and the place: the photometric model (`sensors.Photometry`).
+3. Add the soft shadow and the light bleed (halo) of the blurred dent.
+4. Add the background image, markers, drift of the light, and noise.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import numpy as np
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import interpolation
 from anytouch_jax.sim.contact.mechanics import KPA_MM2, Gel
+from anytouch_jax.sim.draws import Leaf
 from anytouch_jax.sim.sensing.sensors import (
     DEGREE,
     POWERS,
@@ -35,16 +39,54 @@ Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: val
 
 
 class PictureView(NamedTuple):
-    """Places of the image's columns and rows: `x` (W,), `y` (H,) mm from the field's middle, and
-    `u`, `v` in -1..1.
+    """Places of an image's columns and rows."""
 
-    `u` and `v` are the places that the unit's lights see.
+    x: Array  # (W,) mm from the field's middle
+    y: Array  # (H,)
+    u: Array  # (W,) in -1..1, as the unit's lights see them
+    v: Array  # (H,)
+
+
+class Picture(NamedTuple):
+    """How a unit is shown. It is equal in all frames of a clip."""
+
+    sensor: Sensor
+    unit: Unit
+    resolution: tuple[int, int]  # (height, width) in pixels
+    photometry: Photometry | None = None  # instead of that of the sensor
+    stretched: bool = False  # as in `picture_view`
+
+    @property
+    def view(self) -> PictureView:
+        """The places of its columns and rows."""
+        return picture_view(self.sensor, self.unit, self.resolution, stretched=self.stretched)
+
+
+class Skin(NamedTuple):
+    """A deformed skin on a grid that has the same middle as the field."""
+
+    displacement: Array  # (h, w) mm into the gel; the edge is repeated outside of the grid
+    # (h, w, 2) mm (x, y), on that grid or a coarser one: it moves the markers. None moves none.
+    tangential: Array | None
+    pitch: float | Array  # mm between points of the grid
+
+
+class _Channel(NamedTuple):
+    """What differs between colour channels, each with a leading axis of three outside of the loop.
+
+    The names are in alphabetical order, which is the order of the loop's inputs in the compiled
+    program: another one would compile another program.
     """
 
-    x: Array
-    y: Array
-    u: Array
-    v: Array
+    behind: Array  # (H, W)
+    drift: Array  # (3,)
+    gain: Leaf
+    halo: Array  # (3, 3)
+    ink: Array
+    normal: Array  # (20, 6)
+    shift: Array  # u32, first of the ten random bits
+    tint: Leaf
+    uneven: Leaf  # (5,)
 
 
 def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
@@ -61,11 +103,10 @@ def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
 def picture_view(
     sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False
 ) -> PictureView:
-    """Return the part of the field in an image of (height, width): the largest of its shape, zoomed
-    and mirrored.
+    """Return the part of the field in an image of (height, width), zoomed and mirrored.
 
-    If `stretched`, the whole field fills the image, whose pixels need not be square: what
-    `encoder.preprocess` makes.
+    It is the largest part of the image's shape. If `stretched`, the whole field fills the image,
+    whose pixels need not be square: what `encoder.preprocess` makes.
     """
     height, width = resolution
     tall = sensor.field[0] / height
@@ -95,9 +136,11 @@ def backdrop(
     rows = interpolation.spline((place.v + 1) / 2 * shape[0] - 0.5, shape[0])[0]
     columns = interpolation.spline((place.u + 1) / 2 * shape[1] - 0.5, shape[1])[0]
     image = jnp.einsum("ih,hwc,jw->cij", rows, unit.base, columns)
+    # The fixed pattern of the camera and of the gel: noise that is the same in every frame.
     bits = _pixel_bits(jax.random.key(unit.grain[1].astype(jnp.uint32)), resolution)
     grain = unit.grain[0] / 255 * _noise(bits)
-    # dirt and wear
+    # Dirt and wear: Gaussian spots, which absorb light. They are separable, so all of them are one
+    # product.
     u0, v0, radius, *absorbed = jnp.split(unit.specks, 6, 1)
     across = jnp.exp(-0.5 * ((place.x[None] - u0 * sensor.field[1] / 2) / radius) ** 2)
     along = jnp.exp(-0.5 * ((place.y[None] - v0 * sensor.field[0] / 2) / radius) ** 2)
@@ -106,7 +149,7 @@ def backdrop(
     return image * left * light + grain[None]
 
 
-def _light(uneven: Array, tint: Array, place: PictureView, sensor: Sensor) -> Array:
+def _light(uneven: Leaf, tint: Leaf, place: PictureView, sensor: Sensor) -> Leaf:
     """Return the light (H, W) of one colour, relative to the nominal one.
 
     It falls on dents as on the untouched gel.
@@ -117,7 +160,7 @@ def _light(uneven: Array, tint: Array, place: PictureView, sensor: Sensor) -> Ar
     return tint * relative * (1 - sensor.vignette * (u**2 + v**2) / 2)
 
 
-def render(
+def render(  # noqa: PLR0913 - the call from before `Picture` and `Skin`
     displacement: Array | None,
     tangential: Array | None,
     pitch: float | Array,
@@ -128,91 +171,110 @@ def render(
     resolution: tuple[int, int] | None = None,
     photometry: Photometry | None = None,
     behind: Array | None = None,
-    drift: Array | None = None,
+    drift: Leaf | None = None,
     stretched: bool = False,
 ) -> Array:
-    """Render the image u8 (H, W, 3) RGB of a skin pushed in by `displacement` (h, w) mm on a grid
-    of `pitch` mm.
+    """Render a skin as `show`, from the parts of its `Skin` and `Picture`.
 
-    The grid and the field have the same middle, and the grid's edge is repeated outside of it.
-    `tangential` (h, w, 2) mm (x, y), on that grid or a coarser one, moves the markers. None is an
-    untouched gel. `key` draws the noise, and None omits it. `resolution` is (height, width), by
-    default square pixels with a short side of 224. `photometry` replaces that of the sensor.
-    `sensor` and `resolution` are static under jit. `behind` is the `backdrop` of the same unit and
-    resolution. `drift` (3, 3) changes the light (`sensors.draw_drift`). `stretched` is as in
-    `picture_view`. Raises UserError for a sensor without a camera.
+    A `displacement` of None is an untouched gel. `resolution` is by default square pixels with a
+    short side of 224. Raises UserError for a sensor without a camera.
     """
-    resolution = resolution or picture_size(sensor)
-    place = picture_view(sensor, unit, resolution, stretched=stretched)
-    photometry = look(sensor) if photometry is None else photometry
-    change = (
-        (lambda c: 0.0)
-        if displacement is None
-        else _shading(displacement, pitch, sensor, unit, photometry, place)
-    )
+    picture = Picture(sensor, unit, resolution or picture_size(sensor), photometry, stretched)
+    skin = None if displacement is None else Skin(displacement, tangential, pitch)
+    return show(skin, picture, key, behind=behind, drift=drift)
+
+
+def show(
+    skin: Skin | None,
+    picture: Picture,
+    key: Array | None = None,
+    *,
+    behind: Array | None = None,
+    drift: Leaf | None = None,
+) -> Array:
+    """Render the image of a skin, u8 (H, W, 3) RGB.
+
+    Args:
+        skin: The deformation, or None for an untouched gel.
+        picture: How the unit is shown. Its sensor and resolution are static under jit.
+        key: Draws the noise of the image. None omits it.
+        behind: The `backdrop` of the same unit and resolution, if many frames share it.
+        drift: (3, 3) change of the light since the background image (`sensors.draw_drift`).
+
+    Raises:
+        UserError: For a sensor without a camera.
+    """
+    sensor = picture.sensor
+    unit = picture.unit
+    place = picture.view
+    photometry = look(sensor) if picture.photometry is None else picture.photometry
+    change = _no_change if skin is None else _shading(skin, sensor, unit, photometry, place)
     ink = None
     if sensor.markers is not None:
-        grid = None if displacement is None else displacement.shape
-        ink = unit.marked * _ink(tangential, grid, pitch, place, sensor.markers, sensor, unit)
-    bits = None if key is None else _pixel_bits(key, resolution)
+        ink = unit.marked * _ink(skin, place, sensor.markers, sensor, unit)
+    bits = None if key is None else _pixel_bits(key, picture.resolution)
 
-    def channel(c: dict[str, Array]) -> Array:
-        light = _light(c["uneven"], c["tint"], place, sensor)
-        image = c["behind"] + c["gain"] * change(c) * light
+    def channel(c: _Channel) -> Array:
+        light = _light(c.uneven, c.tint, place, sensor)
+        image = c.behind + c.gain * change(c) * light
         if ink is not None:
-            image = image + ink * (c["ink"] * light - image)
+            image = image + ink * (c.ink * light - image)
         if drift is not None:
             image = image * (
-                1
-                + c["drift"][0]
-                + c["drift"][1] * place.u[None, :]
-                + c["drift"][2] * place.v[:, None]
+                1 + c.drift[0] + c.drift[1] * place.u[None, :] + c.drift[2] * place.v[:, None]
             )
-        noise = 0.0 if bits is None else unit.noise * _noise(bits >> c["shift"])
+        # Each colour takes ten other bits of the pixel's random word.
+        noise = 0.0 if bits is None else unit.noise * _noise(bits >> c.shift)
         return jnp.round(jnp.clip(255 * image + noise, 0, 255)).astype(jnp.uint8)
 
     if behind is None:
-        behind = backdrop(sensor, unit, resolution, stretched=stretched)
+        behind = backdrop(sensor, unit, picture.resolution, stretched=picture.stretched)
     # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU
     # backend cannot fuse the arithmetic into the transpose, whose inner loop over three channels is
     # not vectorised (six times slower).
-    planes = jax.lax.map(channel, _channels(photometry, sensor, unit, behind, drift)).astype(
-        jnp.uint32
-    )
-    # a transposition of bytes would take longer than a channel
+    channels = _channels(photometry, sensor, unit, behind, drift)
+    planes = jax.lax.map(channel, channels).astype(jnp.uint32)
+    # Three bytes in one word: a transposition of bytes would take longer than a channel.
     packed = planes[0] | planes[1] << 8 | planes[2] << 16
     return jax.lax.bitcast_convert_type(packed, jnp.uint8)[..., :3]
 
 
+def _no_change(channel: _Channel) -> float:
+    """Return the change of a channel without a dent."""
+    return 0.0
+
+
 def _shading(
-    displacement: Array,
-    pitch: Any,
-    sensor: Sensor,
-    unit: Unit,
-    photometry: Photometry,
-    place: PictureView,
-) -> Callable[[dict[str, Array]], Array]:
-    """Return the change (H, W) of one channel by the dent, as a function of the channel's
-    numbers.
-    """
+    skin: Skin, sensor: Sensor, unit: Unit, photometry: Photometry, place: PictureView
+) -> Callable[[_Channel], Array | float]:
+    """Return the change (H, W) of one channel by the dent, as a function of the channel."""
+    displacement = skin.displacement
+    pitch = skin.pitch
     matrices = _resample(displacement.shape, pitch, place)
-    skin = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
-    nx, ny = tilt(*rotated(*_slopes(skin, matrices, pitch), unit.light_angle), photometry.steepest)
+    # The coating and the lens pass no finer detail. A blur of nothing would divide by zero.
+    surface = _blurred(displacement, jnp.maximum(jnp.hypot(sensor.skin, unit.focus) / pitch, 0.05))
+    slopes = rotated(*_slopes(surface, matrices, pitch), unit.light_angle)
+    nx, ny = tilt(*slopes, photometry.steepest)
     if not is_traced(photometry.halo) and not np.any(np.asarray(photometry.halo)):
-        return lambda c: colour_change(c["normal"], nx, ny, place.u, place.v)
+        return lambda c: colour_change(c.normal, nx, ny, place.u, place.v)
+    # The halo is the part of the light that does not depend on the normal alone. Its source is a
+    # dent blurred by the way that light takes in the gel.
     soft = _blurred(displacement, sensor.halo / pitch)
     depth = matrices[0] @ soft @ matrices[2].T
     lit = (*rotated(*_slopes(soft, matrices, pitch), unit.light_angle), depth)
     glow = tuple(jnp.clip(f, -most, most) for f, most in zip(lit, photometry.widest, strict=True))
-    return lambda c: (
-        colour_change(c["normal"], nx, ny, place.u, place.v)
-        + halo_change(c["halo"], glow, place.u, place.v)
-    )
+
+    def change(c: _Channel) -> Array:
+        by_normal = colour_change(c.normal, nx, ny, place.u, place.v)
+        return by_normal + halo_change(c.halo, glow, place.u, place.v)
+
+    return change
 
 
-def tilt(slope_x: Array, slope_y: Array, steepest: float | Array) -> tuple[Array, Array]:
-    """Return slopes (mm/mm) over the length of their normal, which are sines of the tilt, cut to
-    length `steepest`.
+def tilt(slope_x: Array, slope_y: Array, steepest: float | Leaf) -> tuple[Array, Array]:
+    """Return slopes (mm/mm) over the length of their normal, cut to the length `steepest`.
+
+    They are the sines of the tilt: n = (s_x, s_y) / sqrt(1 + s_x^2 + s_y^2).
     """
     square = slope_x**2 + slope_y**2
     scale = jnp.minimum(
@@ -222,12 +284,20 @@ def tilt(slope_x: Array, slope_y: Array, steepest: float | Array) -> tuple[Array
 
 
 def colour_change(normal: Array, nx: Array, ny: Array, u: Array, v: Array) -> Array:
-    """Return the change (H, W) of one colour channel, 0..1, of a surface with `tilt` (nx, ny) (H,
-    W).
+    """Return the change of one colour channel by a tilted surface.
 
-    `normal` (20, 6) is that channel of `Photometry.normal`, and `u` (W,) and `v` (H,) are places in
-    -1..1. It is Horner's scheme in nx over Horner's scheme in ny. Every coefficient is a quadric of
-    the place.
+    It is the sum over powers i + j <= 5 of c_ij(u, v) nx^i ny^j, without a constant, by Horner's
+    scheme in nx over Horner's scheme in ny. Every coefficient c_ij is a quadric of the place.
+
+    Args:
+        normal: (20, 6), that channel of `Photometry.normal`.
+        nx: (H, W) of `tilt`.
+        ny: (H, W) of `tilt`.
+        u: (W,) places in -1..1.
+        v: (H,) places in -1..1.
+
+    Returns:
+        (H, W), 0..1.
     """
     index = {power: k for k, power in enumerate(POWERS)}
     u = u[None, :]
@@ -241,16 +311,17 @@ def colour_change(normal: Array, nx: Array, ny: Array, u: Array, v: Array) -> Ar
     for i in range(DEGREE - 1, -1, -1):
         inner = coefficient(i, DEGREE - i)
         for j in range(DEGREE - i - 1, -1, -1):
+            # A flat surface changes nothing, so there is no constant.
             inner = inner * ny + (coefficient(i, j) if (i, j) != (0, 0) else 0.0)
         total = total * nx + inner
     return total
 
 
 def halo_change(halo: Array, features: tuple[Array, ...], u: Array, v: Array) -> Array:
-    """Return the change (H, W) of one channel from slope x, slope y and depth (each (H, W)) of the
-    blurred dent.
+    """Return the change (H, W) of one channel by the blurred dent.
 
-    `halo` (3, 3) is that channel of `Photometry.halo`.
+    `features` are its slope x, slope y and depth, each (H, W). `halo` (3, 3) is that channel of
+    `Photometry.halo`: a constant and a drift along u and v for each.
     """
     terms = [
         feature * (halo[k, 0] + u[None, :] * halo[k, 1] + v[:, None] * halo[k, 2])
@@ -260,21 +331,27 @@ def halo_change(halo: Array, features: tuple[Array, ...], u: Array, v: Array) ->
 
 
 def _channels(
-    photometry: Photometry, sensor: Sensor, unit: Unit, behind: Array, drift: Array | None
-) -> dict[str, Array]:
+    photometry: Photometry, sensor: Sensor, unit: Unit, behind: Array, drift: Leaf | None
+) -> _Channel:
     """Return the inputs that differ between colour channels, each with a leading axis of three."""
     ink = sensor.markers.ink if sensor.markers else (0.0, 0.0, 0.0)
-    return {
-        "normal": jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0),
-        "behind": behind,
-        "ink": jnp.asarray(ink),
-        "halo": jnp.moveaxis(jnp.asarray(photometry.halo), -1, 0),
-        "gain": unit.gain,
-        "tint": unit.tint,
-        "uneven": unit.uneven.T,
-        "drift": jnp.zeros((3, 3)) if drift is None else drift.T,
-        "shift": jnp.array([0, 10, 20], jnp.uint32),
-    }
+    normal = jnp.moveaxis(jnp.asarray(photometry.normal), -1, 0)
+    inked = jnp.asarray(ink)
+    halo = jnp.moveaxis(jnp.asarray(photometry.halo), -1, 0)
+    uneven = unit.uneven.T
+    drifts = jnp.zeros((3, 3)) if drift is None else jnp.asarray(drift.T)
+    shift = jnp.array([0, 10, 20], jnp.uint32)
+    return _Channel(
+        behind=behind,
+        drift=drifts,
+        gain=unit.gain,
+        halo=halo,
+        ink=inked,
+        normal=normal,
+        shift=shift,
+        tint=unit.tint,
+        uneven=uneven,
+    )
 
 
 def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: Any) -> Array:
@@ -296,11 +373,20 @@ def onto_picture(
     stretched: bool = False,
     grid: tuple[int, int] | None = None,
 ) -> Array:
-    """Resample maps (..., h, w, C) of the solve grid at the pixels of a unit's image of (height,
-    width).
+    """Resample maps of the solve grid at the pixels of a unit's image.
 
-    With `vectors`, the two channels are x and y of a vector, which is mirrored with the image.
-    `grid` is the size of the solve grid if that of the maps is coarser.
+    Args:
+        maps: (..., h, w, C), on the solve grid or a coarser one.
+        pitch: mm between points of the solve grid.
+        sensor: The family of the unit.
+        unit: The unit.
+        resolution: (height, width) of the image.
+        vectors: The two channels are x and y of a vector, which is mirrored with the image.
+        stretched: As in `picture_view`.
+        grid: Size (rows, columns) of the solve grid if that of the maps is coarser.
+
+    Returns:
+        (..., height, width, C).
     """
     place = picture_view(sensor, unit, resolution, stretched=stretched)
     ay, ax = _enlarging(maps.shape[-3:-1], grid, pitch, place)
@@ -319,8 +405,9 @@ def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrice
 def _enlarging(
     shape: tuple[int, ...], grid: Any, pitch: Any, place: PictureView
 ) -> tuple[Array, Array]:
-    """Return the value matrices from a map of `shape`, on a grid of (rows, columns) with `pitch` or
-    a coarser one.
+    """Return the value matrices (rows, columns) from a map of `shape` to the image.
+
+    The map is on a `grid` of (rows, columns) with `pitch` mm, or on a coarser one.
     """
     grid = grid or shape
     ay, _, ax, _ = _resample(grid, pitch, place)
@@ -341,30 +428,24 @@ def _slopes(field: Array, matrices: Matrices, pitch: Any) -> tuple[Array, Array]
 
 
 def _blurred(field: Array, sigma: Any) -> Array:
+    """Return a field (h, w) blurred by a Gaussian of `sigma` points."""
     rows, columns = (interpolation.blur(n, sigma) for n in field.shape)
     return rows @ field @ columns.T
 
 
-def _ink(
-    tangential: Array | None,
-    grid: Any,
-    pitch: Any,
-    place: PictureView,
-    ink: Markers,
-    sensor: Sensor,
-    unit: Unit,
-) -> Array:
-    """Return the share of ink (H, W): the lattice at the undeformed places of the skin at the
-    pixels.
+def _ink(skin: Skin | None, place: PictureView, ink: Markers, sensor: Sensor, unit: Unit) -> Array:
+    """Return the share of ink (H, W): the lattice at the undeformed places of the skin.
+
+    The skin at a pixel came from where it was before it moved, so the motion is subtracted.
     """
-    x, y = (
-        jnp.broadcast_to(a, (len(place.y), len(place.x)))
-        for a in (place.x[None, :], place.y[:, None])
-    )
-    if tangential is not None:
-        ay, ax = _enlarging(tangential.shape, grid, pitch, place)
-        x = x - ay @ tangential[..., 0] @ ax.T
-        y = y - ay @ tangential[..., 1] @ ax.T
+    size = (len(place.y), len(place.x))
+    x = jnp.broadcast_to(place.x[None, :], size)
+    y = jnp.broadcast_to(place.y[:, None], size)
+    if skin is not None and skin.tangential is not None:
+        moved = skin.tangential
+        ay, ax = _enlarging(moved.shape, skin.displacement.shape, skin.pitch, place)
+        x = x - ay @ moved[..., 0] @ ax.T
+        y = y - ay @ moved[..., 1] @ ax.T
     soft = 1.5 * jnp.abs(place.x[1] - place.x[0]) + 2 * unit.focus
     half = jnp.hypot(*sensor.field) / 2
     x = x / unit.marker_pitch
@@ -373,15 +454,25 @@ def _ink(
 
 
 def ink_coverage(
-    markers: Markers, x: Array, y: Array, phase: Array, size: Array, soft: Array, half: Any
+    markers: Markers, x: Array, y: Array, phase: Leaf, size: Leaf, soft: Array, half: Any
 ) -> Array:
-    """Return the share of ink (H, W), 0..1, at places with *undeformed* coordinates `x`, `y` (H, W)
-    mm.
+    """Return the share of ink, 0..1, at places of the skin.
 
-    Spots lie on a lattice and differ a little in size, as printed spots do. `phase` (2,) is in
-    lattice steps, `size` a factor on the radius, `soft` mm the width of a spot's rim, `half` mm
-    half the field's diagonal (for the lens).
+    Spots lie on a lattice and differ a little in size, as printed spots do.
+
+    Args:
+        markers: The lattice. Its numbers may be traced.
+        x: (H, W) mm, *undeformed* coordinates.
+        y: (H, W) mm.
+        phase: (2,) of the lattice, in its steps.
+        size: Factor on the radius.
+        soft: mm of a spot's rim.
+        half: mm, half the field's diagonal, for the lens.
+
+    Returns:
+        (H, W).
     """
+    # Without distortion the program has no lens. A traced number is not known to be 0.
     bends = is_traced(markers.bend) or markers.bend
     grow = 1.0 - markers.bend * (1.0 - (x**2 + y**2) / half**2) if bends else 1.0
     column = x * grow / markers.pitch - phase[0]
@@ -390,7 +481,7 @@ def ink_coverage(
     j = jnp.floor(row + 0.5)
     dx = (column - i) * (markers.pitch / markers.aspect)
     dy = (row - j) * markers.pitch
-    # no visible order (plastic number), and cheaper than a sine
+    # Sizes of neighbours without a visible order (plastic number), cheaper than a sine.
     scatter = 0.754877 * i + 0.569840 * j
     radius = markers.radius * size * (0.88 + 0.24 * (scatter - jnp.floor(scatter)))
     distance = jnp.sqrt(dx**2 + dy**2 + 1e-12)
@@ -407,17 +498,16 @@ def _pixel_bits(key: Array, shape: tuple[int, int]) -> Array:
 
     It is cheaper than `jax.random.bits`, and a picture's noise needs no cryptography.
     """
-    step = jnp.uint32(0x9E3779B9)
+    step = jnp.uint32(0x9E3779B9)  # 2^32 over the golden ratio: odd, and far from small numbers
     first, second = _mixed(jax.random.key_data(key) + step)
-    return _mixed(
-        _mixed(jnp.arange(shape[0] * shape[1], dtype=jnp.uint32).reshape(shape) * step + first)
-        ^ second
-    )
+    number = jnp.arange(shape[0] * shape[1], dtype=jnp.uint32).reshape(shape)
+    return _mixed(_mixed(number * step + first) ^ second)
 
 
 def _mixed(word: Array) -> Array:
-    """Return words in which every bit depends on all bits of `word` u32 (C. Wellons, Hash
-    Prospector, 2018).
+    """Return words u32 in which every bit depends on all bits of `word`.
+
+    The constants are those of C. Wellons (Hash Prospector, 2018).
     """
     word = (word ^ word >> 16) * jnp.uint32(0x21F0AAAD)
     word = (word ^ word >> 15) * jnp.uint32(0x735A2D97)
@@ -425,15 +515,15 @@ def _mixed(word: Array) -> Array:
 
 
 def _noise(bits: Array) -> Array:
-    """Return noise of zero mean and unit variance from the lowest ten bits of each word: ten coin
-    tosses.
+    """Return noise of zero mean and unit variance from the lowest ten bits of each word.
+
+    Ten coin tosses have mean 5 and variance 2.5, and are near enough to normal for a pixel.
     """
-    return (jax.lax.population_count(bits & jnp.uint32(1023)).astype(jnp.float32) - 5) / np.sqrt(
-        2.5
-    )
+    heads = jax.lax.population_count(bits & jnp.uint32(1023))
+    return (heads.astype(jnp.float32) - 5) / np.sqrt(2.5)
 
 
-def measure_field(
+def measure_field(  # noqa: PLR0913 - four maps, which are arguments under vmap
     displacement: Array,
     tangential: Array,
     pressure: Array,
@@ -445,15 +535,28 @@ def measure_field(
     gel: Gel | None = None,
     key: Array | None = None,
 ) -> Array:
-    """Return the measurement of a field sensor, f32 (points, points, 6): displacement x, y, z mm,
-    force x, y, z N.
+    """Return the measurement of a field sensor.
 
-    Inputs on the solve grid are `displacement` (h, w) mm, `tangential` (h, w, 2) mm, `pressure` (h,
-    w) kPa, `traction` (h, w, 2) kPa and `pitch` mm. A point reports the mean displacement and the
-    total force of its cell, so without noise the forces sum to the load. `key` draws noise of
-    `noise` mm in a displacement. The sensor computes forces from displacements, so their noise is
-    the force that moves a cube of `gel` under a cell by it. Raises UserError for maps of different
-    sizes.
+    A point reports the mean displacement and the total force of its cell, so without noise the
+    forces sum to the load. The sensor computes forces from displacements, so their noise is the
+    force that moves a cube of `gel` under a cell by the noise of a displacement.
+
+    Args:
+        displacement: (h, w) mm on the solve grid.
+        tangential: (h, w, 2) mm.
+        pressure: (h, w) kPa.
+        traction: (h, w, 2) kPa.
+        pitch: mm between points of the solve grid.
+        points: Points along a side.
+        noise: Standard deviation of a displacement, mm.
+        gel: The gel, for the noise of forces.
+        key: Draws the noise. None omits it.
+
+    Returns:
+        f32 (points, points, 6): displacement x, y, z mm, force x, y, z N.
+
+    Raises:
+        UserError: For maps of different sizes.
     """
     shape = displacement.shape
     if not shape == pressure.shape == tangential.shape[:2] == traction.shape[:2]:

@@ -1,7 +1,7 @@
-"""A user's own sensor: a folder `NAME.sensor` with readable numbers (sensor.json) and the arrays of
-its look.
+"""Your own sensor: a folder `NAME.sensor` with readable numbers and the arrays of its photometry.
 
-Wherever the simulator takes the name of a sensor, it takes such a folder too.
+The numbers are in sensor.json, the arrays in look.npz. Wherever the simulator takes the name of a
+sensor, it takes such a folder too.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import zlib
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
+import numpy.typing as npt
 
 from anytouch_jax.config import OWN_SENSOR
 from anytouch_jax.config.parsing import (
@@ -28,14 +29,14 @@ from anytouch_jax.config.parsing import (
 )
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, read_arrays
+from anytouch_jax.sensors import Markers
 from anytouch_jax.sim.contact.mechanics import Gel
-from anytouch_jax.sim.sensing.sensors import MOST_BASES, SENSORS, Markers, Photometry, Sensor
+from anytouch_jax.sim.sensing.sensors import MOST_BASES, POISSON, SENSORS, Photometry, Sensor
 
 NUMBERS = "sensor.json"
 ARRAYS = "look.npz"
 MM = Range(4, 40, "4 to 40 mm")
-# 0: any
-SHAPES = {
+SHAPES = {  # of the arrays; 0 is any number
     "bases": (0, 0, 0, 3),
     "normal": (20, 6, 3),
     "halo": (3, 3, 3),
@@ -81,8 +82,7 @@ def find_sensor(word: str) -> Sensor:
         return read_sensor(word)
     raise UserError(
         f"there is no simulated sensor {word!r}; choose among {', '.join(SENSORS)}, or name a "
-        f"folder{OWN_SENSOR} of "
-        "`anytouch sensor fit`"
+        f"folder{OWN_SENSOR} of `anytouch sensor fit`"
     )
 
 
@@ -114,13 +114,15 @@ def read_sensor(folder: str | Path) -> Sensor:
     path = Path(folder).expanduser().resolve()
     one = read_numbers(path)
     file = path / ARRAYS
-    if fault := _fault(file, file.stat().st_mtime_ns if file.is_file() else 0):
+    # The time of the file is part of the question, because the answer is kept.
+    fault = _fault(file, file.stat().st_mtime_ns if file.is_file() else 0)
+    if fault:
         raise UserError(f"{file}: {fault}. Fit the sensor again.")
     return Sensor(
         one.name,
         (one.height_mm, one.width_mm),
         one.pixels,
-        Gel(modulus=one.modulus_kpa, poisson=0.48, thickness=one.thickness_mm),
+        Gel(modulus=one.modulus_kpa, poisson=POISSON, thickness=one.thickness_mm),
         one.dots,
         skin=one.skin_mm,
         contrast=one.contrast,
@@ -134,7 +136,7 @@ def read_sensor(folder: str | Path) -> Sensor:
 
 @lru_cache(maxsize=16)
 def _fault(file: Path, _: int) -> str:
-    """Return what is wrong with the arrays of a look, "" for nothing."""
+    """Return what is wrong with the arrays of a sensor, "" for nothing."""
     try:
         arrays = read_arrays(file)
     except (OSError, ValueError) as error:
@@ -142,7 +144,7 @@ def _fault(file: Path, _: int) -> str:
     for name, shape in SHAPES.items():
         array = arrays.get(name, np.zeros(0))
         fits = array.ndim == len(shape) and all(
-            b in (0, a) for a, b in zip(array.shape, shape, strict=True)
+            wanted in (0, side) for side, wanted in zip(array.shape, shape, strict=True)
         )
         if not fits or not np.isfinite(array).all() or not 0 < array.size < 1 << 20:
             return f"the array {name} is missing, or has another shape than {shape}"
@@ -151,7 +153,9 @@ def _fault(file: Path, _: int) -> str:
     return f"more than {MOST_BASES} untouched gels"
 
 
-def write_sensor(folder: str | Path, numbers: OwnSensor, bases: Any, look: Photometry) -> Path:
+def write_sensor(
+    folder: str | Path, numbers: OwnSensor, bases: npt.ArrayLike, look: Photometry
+) -> Path:
     """Write a folder NAME.sensor, with untouched gels u8 (n, h, w, 3), and return it."""
     path = Path(folder)
     data = io.BytesIO()

@@ -1,5 +1,7 @@
-"""Photographs of the touched place: a shaded height map on a table, with random view, light and
-background.
+"""Photographs of the touched place: a shaded height map, with random view, light and background.
+
+They are RGB images for the vision tower. Everything is a plane of float32, because a data set and
+training make thousands of them.
 """
 
 import math
@@ -40,10 +42,13 @@ def seeded_photograph(job: tuple[Object, Any, Sequence[int]], size: int) -> np.n
 def photograph(
     thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224
 ) -> np.ndarray:
-    """Return an RGB photograph u8 (size, size, 3) of the object around `place_mm` (x, y) mm in its
-    frame.
+    """Return an RGB photograph u8 (size, size, 3) of an object.
 
-    The place is in the middle of 30 to 40 mm. `rng` draws view, light and background.
+    Args:
+        thing: The object.
+        place_mm: (x, y) mm in its frame, which is in the middle of the image.
+        rng: Draws view, light and background. The image shows 30 to 40 mm.
+        size: Pixels of a side.
     """
     place = np.asarray(place_mm, np.float64)
     shape = thing.shape
@@ -62,9 +67,8 @@ def photograph(
     ambient *= 0.55 + 0.45 * normal[2]
     mottle = thing.material.mottle
     blotch = _noise(rng, size, 10)
-    skin = (
-        1 + 0.3 * mottle * (grain - 0.6) + 0.12 * mottle * blotch - 0.08 * (1 - texture)
-    ).astype(np.float32)
+    skin = 1 + 0.3 * mottle * (grain - 0.6) + 0.12 * mottle * blotch - 0.08 * (1 - texture)
+    skin = skin.astype(np.float32)
     sky = rng.uniform(0.25, 0.4)
     sun = rng.uniform(0.5, 0.75)
     lamp = (1.0, rng.uniform(0.88, 1.0), rng.uniform(0.75, 1.05))
@@ -74,12 +78,13 @@ def photograph(
     for i, ground in enumerate(_table(rng, x, y, place)):
         colour = np.where(on_table, ground, skin * np.float32(thing.colour[i]))
         light = sky * ambient + (sun * lamp[i]) * lit
-        # colours are gamma-encoded
+        # Colours are gamma-encoded, and light adds up linearly: hence the square.
         planes.append(colour * colour * light + tint[i] * shine)
     return _develop(planes, rng)
 
 
 def _draw_view(rng: np.random.Generator) -> CameraView:
+    """Draw a camera that looks at the place from above, and a lamp."""
     extent = rng.uniform(*EXTENT)
     turn = rng.uniform(-math.pi, math.pi)
     tilt = math.radians(rng.uniform(0, 38))
@@ -119,8 +124,10 @@ def _dot(a: Planes, b: Any) -> Image:
 def _trace(
     shape: Shape, place: Any, view: CameraView, size: int
 ) -> tuple[Image, Image, Image, Planes]:
-    """Return where the ray of each pixel meets the bare primitive (x, y, z mm in the object's
-    frame), and unit rays.
+    """Return where the ray of each pixel meets the bare primitive, and unit rays.
+
+    The places are x, y, z mm in the object's frame. They are a fixed point: of a height z the ray
+    is at x0 + lean z, where the primitive has the height z.
     """
     axis = ((np.arange(size) + 0.5) / size - 0.5).astype(np.float32)
     focal = float(np.linalg.norm(view.eye)) / view.extent
@@ -148,9 +155,8 @@ def _trace(
     z = np.full(x0[::2, ::2].shape, top, np.float32)
     for _ in range(5):
         z = step(z, 2, 0.6)
-    z = step(
-        np.asarray(cv2.resize(z, (size, size), interpolation=cv2.INTER_LINEAR), np.float32), 1, 0.6
-    )
+    large = cv2.resize(z, (size, size), interpolation=cv2.INTER_LINEAR)
+    z = step(np.asarray(large, np.float32), 1, 0.6)
     x = x0 + lean_x * z
     y = y0 + lean_y * z
     near: Image = 1 / np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
@@ -158,26 +164,30 @@ def _trace(
 
 
 def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tuple[Image, Image]:
-    """Return texture and grain at x, y, and 1 outside of `where`, from a raster of the unrolled
-    surface.
+    """Return texture and grain at x, y, and 1 outside of `where`.
+
+    They are computed on a raster of the unrolled surface and looked up there, because a random
+    texture is a matrix product on a raster and a sum of cosines elsewhere.
     """
     ones = np.ones_like(x)
     plain = shape.texture == "smooth" and shape.grain == "none"
     if plain or not where.any():
         return ones, ones
     u, v = unroll(shape, x, y)
-    finest = min(shape.grain_pitch if shape.grain != "none" else math.inf, shape.texture_pitch)
+    finest = shape.texture_pitch
+    if shape.grain != "none":
+        finest = min(shape.grain_pitch, shape.texture_pitch)
     # mm, about one pixel of a photograph of 224
     step = float(np.clip(finest / 6, 0.15, 0.25))
     axes = []
     places = []
     for at in (u, v):
+        # At a grazing view a ray meets the surface far away. 80 mm are more than any object.
         low, high = (
             max(-80.0, min(80.0, float(end))) for end in (at[where].min(), at[where].max())
         )
-        axes.append(
-            (low - step + step * np.arange(math.ceil((high - low) / step) + 3)).astype(np.float32)
-        )
+        count = math.ceil((high - low) / step) + 3
+        axes.append((low - step + step * np.arange(count)).astype(np.float32))
         places.append((at - np.float32(low - step)) / np.float32(step))
     rows = range(0, len(axes[1]), 32)  # strips fit the cache: twice as fast
     strips = [layers(shape, axes[0][None, :], axes[1][row : row + 32, None]) for row in rows]
@@ -189,6 +199,7 @@ def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tup
 
 
 def _slope(plane: Image, right: int, down: int) -> Image:
+    """Return the derivative of a plane to the right or down."""
     # Replicated borders halve all three components, so the normal keeps its direction there.
     return np.asarray(
         cv2.Scharr(plane, cv2.CV_32F, right, down, borderType=cv2.BORDER_REPLICATE), np.float32
@@ -209,8 +220,10 @@ def _normals(x: Image, y: Image, z: Image) -> Planes:
 
 
 def _shadow(shape: Shape, x: Image, y: Image, z: Image, light: Any) -> Image:
-    """Return 0 in the light to 1 in the shade, by steps toward the lamp over the primitive at half
-    resolution.
+    """Return 0 in the light to 1 in the shade, at half resolution.
+
+    Steps go toward the lamp over the primitive. What rises above the ray by a quarter of the way
+    shades it fully, so shadows are soft, and softer farther away.
     """
     half = [np.ascontiguousarray(a[::2, ::2]) for a in (x, y, z)]
     dark = np.zeros_like(half[0])
@@ -229,9 +242,7 @@ def _noise(rng: np.random.Generator, size: int, cells: int) -> Image:
 
 
 def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -> Image:
-    """Return highlights: those of the lamp, and on glossy objects the bright and dark sides of the
-    room.
-    """
+    """Return highlights: of the lamp, and on glossy objects of the sides of the room."""
     gloss = thing.material.gloss
     metallic = thing.material.metallic
     if gloss < 0.03:
@@ -245,7 +256,11 @@ def _shine(thing: Object, normal: Planes, ray: Planes, light: Any, lit: Image) -
     lamp = np.exp((8 + 80 * gloss) * (np.minimum(_dot(mirrored, light), 1) - 1)) * (lit > 0)
     room = 0.5 + 0.5 * np.sin(4 * mirrored[0] + 2.5 * mirrored[1] + 1)
     grazing = 1 - np.clip(mirrored[2], 0, 1)
-    around = (0.45 * room - 0.1) if metallic else room * (0.05 + 0.35 * grazing * grazing * grazing)
+    # Metal reflects at all angles, and everything else at a grazing one.
+    if metallic:
+        around = 0.45 * room - 0.1
+    else:
+        around = room * (0.05 + 0.35 * grazing * grazing * grazing)
     return np.asarray(gloss * (0.7 * lamp + around), np.float32)
 
 
@@ -261,28 +276,17 @@ def _table(rng: np.random.Generator, x: Image, y: Image, place: Any) -> Planes:
         centre = rng.integers(0, side, 2)
         if rng.random() < 0.5:
             axes = rng.integers(6, 40, 2).tolist()
-            cv2.ellipse(
-                canvas,
-                centre.tolist(),
-                axes,
-                float(rng.uniform(0, 180)),
-                0,
-                360,
-                ink,
-                -1,
-                cv2.LINE_AA,
-            )
+            turn = float(rng.uniform(0, 180))
+            cv2.ellipse(canvas, centre.tolist(), axes, turn, 0, 360, ink, -1, cv2.LINE_AA)
         else:
             end = centre + rng.integers(-90, 90, 2)
-            cv2.line(
-                canvas, centre.tolist(), end.tolist(), ink, int(rng.integers(2, 24)), cv2.LINE_AA
-            )
+            width = int(rng.integers(2, 24))
+            cv2.line(canvas, centre.tolist(), end.tolist(), ink, width, cv2.LINE_AA)
     canvas = _blur(canvas, rng.uniform(0.6, 2.0))
     if rng.random() < 0.5:  # fibres
         cells = int(rng.integers(20, 60))
-        weft = np.asarray(
-            cv2.resize(_noise(rng, side, cells), (6 * side, side))[:, :side], np.float32
-        )
+        stretched = cv2.resize(_noise(rng, side, cells), (6 * side, side))
+        weft = np.asarray(stretched[:, :side], np.float32)
     else:
         weft = _noise(rng, side, 64)
     canvas *= 1 + np.float32(rng.uniform(0, 0.25)) * weft[..., None]
@@ -300,12 +304,11 @@ def _develop(planes: Sequence[Image], rng: np.random.Generator) -> np.ndarray:
     """
     size = planes[0].shape[0]
     axis: Image = np.linspace(-1, 1, size, dtype=np.float32) ** 2
-    exposure = np.float32(rng.uniform(0.85, 1.15)) * (
-        1 - np.float32(rng.uniform(0, 0.12)) * (axis[:, None] + axis)
-    )
-    noise = np.float32(255 * rng.uniform(0.004, 0.012)) * rng.standard_normal(
-        (size, size), dtype=np.float32
-    )
+    brightness = np.float32(rng.uniform(0.85, 1.15))
+    exposure = brightness * (1 - np.float32(rng.uniform(0, 0.12)) * (axis[:, None] + axis))
+    # One plane for all channels: noise of brightness, not of colour.
+    deviation = np.float32(255 * rng.uniform(0.004, 0.012))
+    noise = deviation * rng.standard_normal((size, size), dtype=np.float32)
     channels = []
     for plane in planes:
         light = np.clip(_blur(plane * exposure, max(0.3, 0.6 * size / 224)), 0, None)

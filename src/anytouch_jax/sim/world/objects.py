@@ -1,6 +1,4 @@
-"""Objects to touch: materials, a catalogue drawn from a seed, labels, held-out kinds, and captions
-of their feel.
-"""
+"""Objects to touch: materials, a catalogue from a seed, held-out kinds, labels and captions."""
 
 import math
 import re
@@ -222,23 +220,19 @@ MATERIALS: dict[str, Material] = {
 
 
 class PrimitiveKind(NamedTuple):
-    """The noun of a primitive, its range of sizes in mm (see `Shape`), and the textures that fit
-    it.
-    """
+    """What objects of a primitive are like."""
 
     noun: str
-    size: tuple[float, float]
-    textures: tuple[str, ...] = tuple(TEXTURES)
+    size: tuple[float, float]  # mm, range of sizes (see `Shape`)
+    textures: tuple[str, ...] = tuple(TEXTURES)  # that fit it
 
 
 class TextureKind(NamedTuple):
-    """The adjective of a texture, its range of pitches in mm, and its RMS slope if its depth equals
-    its pitch.
-    """
+    """What objects with a texture are like."""
 
     adjective: str
-    pitch: tuple[float, float]
-    slope: float
+    pitch: tuple[float, float]  # mm, range of pitches
+    slope: float  # RMS, if its depth equals its pitch
 
 
 # Contacts of 0.2 to 1.2 mm fill a good part of a field of 12 to 19 mm. Small contacts and raised
@@ -302,10 +296,8 @@ def combinations() -> list[tuple[str, str, str]]:
 def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
     """Return `count` objects with different names.
 
-    A smaller count returns the first objects of a larger one.
-
-    No combination is repeated, and the least drawn one so far comes next. Raises UserError for a
-    bad count.
+    A smaller count returns the first objects of a larger one. No combination is repeated, and the
+    least drawn one so far comes next. Raises UserError for a bad count.
     """
     left = combinations()
     if not 1 <= count <= len(left):
@@ -313,11 +305,17 @@ def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
     rng = np.random.default_rng([seed, 64])
     left = [left[i] for i in rng.permutation(len(left))]
     used: Counter[object] = Counter()
+
+    def often(one: tuple[str, str, str]) -> int:
+        """Return how often the parts of a combination were drawn."""
+        primitive, texture, material = one
+        # Pairs of primitive and texture weigh most, because they are held out as a whole.
+        pairs = 3 * used[primitive, texture] + used[texture, material]
+        return pairs + sum(used[kind] for kind in one)
+
     objects = []
     for _ in range(count):
-        chosen = min(
-            left, key=lambda c: 3 * used[c[:2]] + used[c[1:]] + sum(used[kind] for kind in c)
-        )
+        chosen = min(left, key=often)
         left.remove(chosen)
         used.update([chosen[:2], chosen[1:], *chosen])
         objects.append(draw_object(*chosen, seed=int(rng.integers(2**31))))
@@ -332,6 +330,7 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
     pitch = float(rng.uniform(*kind.pitch))
     if primitive in ("letters", "cone", "ring"):  # small contacts: finer textures
         pitch = kind.pitch[0] + 0.4 * (pitch - kind.pitch[0])
+    # The depth follows from the slope, so that a gel can follow a fine texture too.
     steepness = float(rng.uniform(*_STEEPNESS))
     depth = min(max(steepness * pitch / max(kind.slope, 1.0), _DEPTHS[0]), _DEPTHS[1])
     if primitive == "letters":  # the stroke must stand out
@@ -363,11 +362,10 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
 def hold_out(
     objects: Sequence[Object], share: float, seed: int
 ) -> tuple[tuple[Object, ...], tuple[Object, ...]]:
-    """Split objects into (training, held out) that share no (primitive, texture) pair, in their
-    order.
+    """Split objects into (training, held out) that share no (primitive, texture) pair.
 
-    At least `share` is held out. Training objects keep every primitive and texture. Raises
-    UserError otherwise.
+    Both keep their order. At least `share` is held out. Training objects keep every primitive and
+    texture, so that a held-out pair is new only as a pair. Raises UserError otherwise.
     """
     if not 0 < share < 1:
         raise UserError(f"the share of objects held out must lie between 0 and 1, not {share}")
@@ -389,8 +387,7 @@ def hold_out(
     if test_objects < share * len(objects):
         raise UserError(
             f"of {len(objects)} objects only {test_objects} can be held out without losing a "
-            "primitive or a texture; "
-            f"ask for less than {share:g} of them or draw more objects"
+            f"primitive or a texture; ask for less than {share:g} of them or draw more objects"
         )
     training = tuple(o for o in objects if o.kind not in test_pairs)
     return training, tuple(o for o in objects if o.kind in test_pairs)

@@ -1,5 +1,4 @@
-"""Surfaces of objects in millimetres: a primitive, a texture on it, and the fine grain of its
-material.
+"""Surfaces of objects in millimetres: a primitive, a texture on it, and the grain of its material.
 
 A texture takes (u, v, pitch, seed) and returns heights from 0 (lowest) to 1 (highest). `u`, `v` are
 mm on the unrolled surface, of equal shape or an open grid of (1, W) and (H, 1). `pitch` mm is the
@@ -37,12 +36,11 @@ def namespace(x: Array) -> ModuleType:
 def gaussian_field(
     u: Array, v: Array, length: tuple[float, float], seed: int, terms: int = 40
 ) -> Array:
-    """Return a random field of mean 0 and deviation 1 with autocorrelation exp(-(du/l_u)^2 -
-    (dv/l_v)^2).
+    """Return a random field of mean 0 and standard deviation 1.
 
-    `u`, `v` and `length` are in mm. The field is a sum of cosines. The radii of their wave vectors
-    are quantiles, so few terms follow the spectrum, and no wave is shorter than 1.6 lengths. An
-    open grid costs one matrix product.
+    Its autocorrelation is exp(-(du / l_u)^2 - (dv / l_v)^2). `u`, `v` and `length` are in mm. The
+    field is a sum of cosines. The radii of their wave vectors are quantiles, so few terms follow
+    the spectrum, and no wave is shorter than 1.6 lengths. An open grid costs one matrix product.
     """
     rng = np.random.default_rng([seed, terms])
     radius = np.sqrt(-2 * np.log1p(-(np.arange(terms) + 0.5) / terms))
@@ -58,22 +56,24 @@ def gaussian_field(
         for a, b, c in zip(ku.tolist(), kv.tolist(), phase.tolist(), strict=True):
             total = total + xp.cos(a * u + (b * v + c))
         return scale * total
-    # (terms, W)
+    # cos(a + b) = cos a cos b - sin a sin b, with a along one axis (terms, W), b along the other.
     across = xp.asarray(ku[:, None], u.dtype) * u + xp.asarray(phase[:, None], u.dtype)
     along = v * xp.asarray(kv[None, :], v.dtype)  # (H, terms)
     return scale * (xp.cos(along) @ xp.cos(across) - xp.sin(along) @ xp.sin(across))
 
 
 def normal_cdf(n: Array) -> Array:
-    """Return the normal distribution function to 3e-4, which makes a Gaussian field uniform in 0 to
-    1.
+    """Return the normal distribution function to 3e-4.
+
+    It makes a Gaussian field uniform in 0 to 1.
     """
     return 0.5 + 0.5 * namespace(n).tanh(0.7978845608 * (n + 0.044715 * n * n * n))
 
 
 def warp(u: Array, v: Array, pitch: float, amount: float, seed: int) -> tuple[Array, Array]:
-    """Displace the places by `amount` pitches (RMS) over some five pitches: no real pattern is
-    quite regular.
+    """Displace the places by `amount` pitches (RMS) over some five pitches.
+
+    No real pattern is quite regular.
     """
     if amount == 0:
         return u, v
@@ -108,11 +108,9 @@ def _smooth(u: Array, v: Array, pitch: float, seed: int) -> Array:
 def _ridges(u: Array, v: Array, pitch: float, seed: int) -> Array:
     """Rounded parallel ridges, one a pitch."""
     s, _ = _shift(u, v, pitch, seed)
-    return (
-        0.5
-        + 0.5 / math.tanh(1.3) * namespace(u).tanh(1.3 * namespace(u).cos(2 * math.pi * s))
-        + 0.0 * v
-    )
+    xp = namespace(u)
+    # The hyperbolic tangent flattens tops and valleys. 0 * v gives the shape of both places.
+    return 0.5 + 0.5 / math.tanh(1.3) * xp.tanh(1.3 * xp.cos(2 * math.pi * s)) + 0.0 * v
 
 
 def _grid(u: Array, v: Array, pitch: float, seed: int) -> Array:
@@ -174,13 +172,20 @@ def _knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
 
 
 def _bark(u: Array, v: Array, pitch: float, seed: int) -> Array:
-    """Bark-like plates along v: RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and
-    v.
+    """Bark-like plates along v.
+
+    RMS 0.31, autocorrelation 1/e at 0.27 and 1.03 pitches along u and v.
     """
     n = gaussian_field(u, v, (0.55 * pitch, 2.2 * pitch), seed + 3, terms=28)
     plate = gaussian_field(u, v, (0.8 * pitch, 1.6 * pitch), seed + 4, terms=16)
     furrow = 1 - namespace(u).exp(-((n / 0.55) ** 2))
     return furrow * (0.65 + 0.35 * normal_cdf(plate))
+
+
+def _sand(u: Array, v: Array, pitch: float, seed: int) -> Array:
+    """Heights uniform in 0 to 1 (RMS 12**-0.5), autocorrelation 1/e at `SAND_LENGTH` pitches."""
+    length = SAND_LENGTH * pitch / _FALL
+    return normal_cdf(gaussian_field(u, v, (length, length), seed + 5))
 
 
 TEXTURES: dict[str, Texture] = {
@@ -191,36 +196,39 @@ TEXTURES: dict[str, Texture] = {
     "grid": _grid,
     "dots": _dots,
     "bark": _bark,
-    # Heights uniform in 0 to 1 (RMS 12**-0.5), autocorrelation 1/e at `SAND_LENGTH` pitches.
-    "sand": lambda u, v, pitch, seed: normal_cdf(
-        gaussian_field(u, v, (SAND_LENGTH * pitch / _FALL,) * 2, seed + 5)
-    ),
+    "sand": _sand,
 }
+
+
+def _streaks(u: Array, v: Array, pitch: float, seed: int) -> Array:
+    """Fine lines along v, as wood's fibres or brushed metal."""
+    return normal_cdf(gaussian_field(u, v, (0.4 * pitch, 6 * pitch), seed + 6, terms=20))
+
+
+def _pores(u: Array, v: Array, pitch: float, seed: int) -> Array:
+    """A level surface with scattered small pits, as cork or foam."""
+    field = gaussian_field(u, v, (0.5 * pitch, 0.5 * pitch), seed + 7, terms=24)
+    return 1 - normal_cdf(2.5 * (field - 0.9))
+
+
+def _pebbles(u: Array, v: Array, pitch: float, seed: int) -> Array:
+    """Small cushions between fine creases, as leather."""
+    field = gaussian_field(u, v, (0.6 * pitch, 0.6 * pitch), seed + 8, terms=24)
+    return 1 - namespace(u).exp(-((field / 0.5) ** 2))
+
+
+def _grit(u: Array, v: Array, pitch: float, seed: int) -> Array:
+    """An even fine roughness, as stone."""
+    return normal_cdf(gaussian_field(u, v, (0.4 * pitch, 0.4 * pitch), seed + 9, terms=24))
 
 
 GRAINS: dict[str, Texture] = {
     "none": _smooth,
     "threads": _weave,
-    "streaks": lambda u, v, pitch, seed: (
-        normal_cdf(  # fine lines along v, as wood's fibres or brushed metal
-            gaussian_field(u, v, (0.4 * pitch, 6 * pitch), seed + 6, terms=20)
-        )
-    ),
-    "pores": lambda u, v, pitch, seed: (
-        1
-        - normal_cdf(  # a level surface with scattered small pits, as cork or foam
-            2.5 * (gaussian_field(u, v, (0.5 * pitch, 0.5 * pitch), seed + 7, terms=24) - 0.9)
-        )
-    ),
-    "pebbles": lambda u, v, pitch, seed: (
-        1
-        - namespace(u).exp(  # small cushions between fine creases, as leather
-            -((gaussian_field(u, v, (0.6 * pitch, 0.6 * pitch), seed + 8, terms=24) / 0.5) ** 2)
-        )
-    ),
-    "grit": lambda u, v, pitch, seed: normal_cdf(  # an even fine roughness, as stone
-        gaussian_field(u, v, (0.4 * pitch, 0.4 * pitch), seed + 9, terms=24)
-    ),
+    "streaks": _streaks,
+    "pores": _pores,
+    "pebbles": _pebbles,
+    "grit": _grit,
 }
 
 PLATE = 5.0  # mm, the thickness of flat parts
@@ -268,8 +276,9 @@ class Shape:
 
 
 def base(shape: Shape, x: Array, y: Array) -> Array:
-    """Return heights in mm of the primitive at `x`, `y` mm, from 0 at its highest place down to the
-    table.
+    """Return heights in mm of the primitive at `x`, `y` mm.
+
+    They are 0 at its highest place, and go down to the table.
     """
     return namespace(x).clip(PRIMITIVES[shape.primitive](shape, x, y), floor(shape), 0)
 
@@ -281,6 +290,7 @@ def unroll(shape: Shape, x: Array, y: Array) -> tuple[Array, Array]:
     if shape.primitive in ("cylinder", "screw"):
         x = r * xp.arcsin(xp.clip(x / r, -1, 1))
     elif shape.primitive == "sphere":
+        # The way over the ball, over the way in the plane, is arcsin(a) / a.
         away = xp.clip(xp.hypot(x, y) / r, 1e-6, 1)
         stretch = xp.arcsin(away) / away
         x = x * stretch
@@ -291,9 +301,7 @@ def unroll(shape: Shape, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
-    """Return texture and grain at the unrolled places `u`, `v` mm, each from 0 (low) to 1
-    (high).
-    """
+    """Return texture and grain at the unrolled places `u`, `v` mm, from 0 (low) to 1 (high)."""
     if shape.texture in ("bark", "sand"):
         # random already
         s = u
@@ -305,10 +313,10 @@ def layers(shape: Shape, u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def height(shape: Shape, x: Array, y: Array) -> Array:
-    """Return heights z mm toward the gel at `x`, `y` mm in the object's frame, numpy or JAX arrays
-    of one shape.
+    """Return heights mm toward the gel at `x`, `y` mm in the object's frame.
 
-    The highest place of the primitive is 0, and texture and grain only lower it.
+    `x` and `y` are numpy or JAX arrays of one shape. The highest place of the primitive is 0, and
+    texture and grain only lower it.
     """
     x = _floating(x)
     y = _floating(y)
@@ -333,31 +341,26 @@ def _floating(x: Array) -> Array:
 
 
 def relief(shape: Shape, pixels: int, pitch: float) -> np.ndarray:
-    """Return heights (pixels, pixels) f32 mm, `pitch` mm apart, the object's origin in the
-    centre.
-    """
+    """Return heights (pixels, pixels) f32 mm, `pitch` mm apart, around the object's origin."""
     axis = ((np.arange(pixels) - (pixels - 1) / 2) * pitch).astype(np.float32)
     x, y = np.meshgrid(axis, axis)
     return np.asarray(height(shape, x, y), np.float32)
 
 
 def _round_rim(t: Array, radius: float) -> Array:
-    """Return the drop over a rim of `radius`: 0 up to t = 0, a quarter circle, then a straight
-    steep side.
-    """
+    """Return the drop over a rim: 0 up to t = 0, a part of a circle, then a straight steep side."""
     xp = namespace(t)
+    # Where the circle has the slope of the side.
     end = radius * _STEEP / math.hypot(1, _STEEP)
     inner = xp.clip(t, 0, end)
-    return (
-        xp.sqrt(radius * radius - inner * inner) - radius - _STEEP * xp.clip(t - end, 0, math.inf)
-    )
+    circle = xp.sqrt(radius * radius - inner * inner)
+    return circle - radius - _STEEP * xp.clip(t - end, 0, math.inf)
 
 
 def _dome(square: Array, radius: float) -> Array:
-    return (
-        namespace(square).sqrt(namespace(square).clip(radius * radius - square, 0, math.inf))
-        - radius
-    )
+    """Return the drop of a ball at a squared distance from its top."""
+    xp = namespace(square)
+    return xp.sqrt(xp.clip(radius * radius - square, 0, math.inf)) - radius
 
 
 def _edge(shape: Shape, x: Array, y: Array) -> Array:
@@ -368,28 +371,25 @@ def _edge(shape: Shape, x: Array, y: Array) -> Array:
 def _corner(shape: Shape, x: Array, y: Array) -> Array:
     """A plate over x < 0, y < 0 whose rims and corner have radius `size`."""
     xp = namespace(x)
-    return _round_rim(
-        xp.hypot(xp.clip(x + shape.size, 0, math.inf), xp.clip(y + shape.size, 0, math.inf)),
-        shape.size,
-    )
+    over_x = xp.clip(x + shape.size, 0, math.inf)
+    over_y = xp.clip(y + shape.size, 0, math.inf)
+    return _round_rim(xp.hypot(over_x, over_y), shape.size)
 
 
 def _cone(shape: Shape, x: Array, y: Array) -> Array:
-    """A tip of 4 mm height over a base of radius `size`; the tip's radius of curvature is a 16th of
-    it.
+    """A tip of 4 mm height over a base of radius `size`.
+
+    The tip's radius of curvature is a 16th of that of the base.
     """
     slope = 4.0 / shape.size
     return -slope * (namespace(x).sqrt(x * x + y * y + TIP * TIP) - TIP)
 
 
 def _flat(shape: Shape, x: Array, y: Array) -> Array:
-    """A round stamp with a flat face of radius `size`, its rim rounded by at most 0.5 mm within
-    it.
-    """
+    """A round stamp with a flat face of radius `size`, whose rim is rounded by at most 0.5 mm."""
+    xp = namespace(x)
     rim = min(0.5, shape.size / 2)
-    return _round_rim(
-        namespace(x).clip(namespace(x).hypot(x, y) - shape.size + rim, 0, math.inf), rim
-    )
+    return _round_rim(xp.clip(xp.hypot(x, y) - shape.size + rim, 0, math.inf), rim)
 
 
 def thread_pitch(size: float) -> float:
@@ -403,9 +403,8 @@ def _screw(shape: Shape, x: Array, y: Array) -> Array:
     pitch = thread_pitch(shape.size)
     turn = xp.arcsin(xp.clip(x / shape.size, -1, 1)) / (2 * math.pi)
     wave = xp.cos(2 * math.pi * (y / pitch - turn))
-    return _dome(x * x + 0.0 * y, shape.size) - 0.5 * pitch * (
-        0.5 - 0.5 / math.tanh(1.0) * xp.tanh(wave)
-    )
+    groove = 0.5 - 0.5 / math.tanh(1.0) * xp.tanh(wave)
+    return _dome(x * x + 0.0 * y, shape.size) - 0.5 * pitch * groove
 
 
 _Point = tuple[float, float]
@@ -454,9 +453,7 @@ STROKES: dict[str, tuple[_Line, ...]] = {
 
 
 def _distance(letter: str, x: Array, y: Array) -> Array:
-    """Return the distance to the nearest stroke of a letter of height 1; `x`, `y` in letter
-    heights.
-    """
+    """Return the distance to the nearest stroke of a letter, all in letter heights."""
     xp = namespace(x)
     nearest = 0.0 * x + 4.0
     for line in STROKES[letter]:
@@ -478,19 +475,31 @@ def _letters(shape: Shape, x: Array, y: Array) -> Array:
     return STROKE_RISE * xp.tanh(side / STROKE_RISE)
 
 
+def _sphere(shape: Shape, x: Array, y: Array) -> Array:
+    """The upper half of a ball."""
+    return _dome(x * x + y * y, shape.size)
+
+
+def _cylinder(shape: Shape, x: Array, y: Array) -> Array:
+    """A lying rod along y, without ends."""
+    return _dome(x * x + 0.0 * y, shape.size)
+
+
+def _ring(shape: Shape, x: Array, y: Array) -> Array:
+    """The upper half of a lying ring.
+
+    `size` is from its centre to the middle of a round bar of radius 0.3 size.
+    """
+    return _dome((namespace(x).hypot(x, y) - shape.size) ** 2, 0.3 * shape.size)
+
+
 PRIMITIVES: dict[str, Callable[[Shape, Array, Array], Array]] = {
-    "sphere": lambda shape, x, y: _dome(x * x + y * y, shape.size),  # the upper half of a ball
-    "cylinder": lambda shape, x, y: _dome(
-        x * x + 0.0 * y, shape.size
-    ),  # a lying rod along y, without ends
+    "sphere": _sphere,
+    "cylinder": _cylinder,
     "edge": _edge,
     "corner": _corner,
     "cone": _cone,
-    # The upper half of a lying ring: `size` from its centre to the middle of a round bar of radius
-    # 0.3 size.
-    "ring": lambda shape, x, y: _dome(
-        (namespace(x).hypot(x, y) - shape.size) ** 2, 0.3 * shape.size
-    ),
+    "ring": _ring,
     "flat": _flat,
     "screw": _screw,
     "letters": _letters,

@@ -293,7 +293,7 @@ def _recording_gel(
         own, count = rule.recording_gel(_some_frames(data))
         what = f"estimated from {count} frames of {data}"
         is_sure = count >= rule.FEWEST
-    counts = rule.known_gel(known, own, is_background=is_sure, untouched=stored is not None, of=of)
+    counts = rule.recognise(known, own, is_background=is_sure, untouched=stored is not None, of=of)
     if counts.warning:
         log(counts.warning)
     if counts.picture is not None:

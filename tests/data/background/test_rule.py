@@ -175,15 +175,15 @@ def test_few_frames_get_the_nearest_picture_and_one_true_line(world):
     gel = gel_frame("coloured", 0)
     known = {"digit a": gel, "digit b": np.full_like(gel, 30)}
     pressed = np.clip(gel.astype(int) + 9, 0, 255).astype(np.uint8)
-    same = gels.known_gel(known, gel, is_background=False, of="the index was made with")
+    same = gels.recognise(known, gel, is_background=False, of="the index was made with")
     assert same == (gel, "the picture that the index was made with", "")
-    found = gels.known_gel(known, pressed, is_background=False, of="the index was made with")
+    found = gels.recognise(known, pressed, is_background=False, of="the index was made with")
     assert found.picture is gel and not found.warning
     assert found.what.startswith("the nearest picture that the index was made with. So few frames")
-    sure = gels.known_gel(known, pressed, is_background=True)
+    sure = gels.recognise(known, pressed, is_background=True)
     assert sure.picture is None and "in tint, by 9 grey levels" in sure.warning
     small = np.zeros((160, 120, 3), np.uint8)
-    assert gels.known_gel(known, small, is_background=False) == (None, "", "")
+    assert gels.recognise(known, small, is_background=False) == (None, "", "")
     # rows that had no untouched gel, and so were left out
     said: list[str] = []
     rule = gels.UnitGels(world(([pressed] * 2, {"unit": "a"})), {"digit a": gel}, said.append)

@@ -1,4 +1,5 @@
 import fcntl
+import json
 import os
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 from weights_world import save_clip
 
+from anytouch_jax import doors
 from anytouch_jax.config import SENSORS, from_json
 from anytouch_jax.data import tokenizer as texts
 from anytouch_jax.data.loading.loader import Loader
@@ -381,3 +383,37 @@ def test_a_run_does_not_resume_on_other_rows(world, tmp_path):
     # the same rows and files at another place
     write_manifest(moved / "other.csv", rows[:-1])
     assert train(run_config(moved / "other.csv"), tmp_path / "r", stop_after=2).step == 2
+
+
+RINGS = ("sim", "fields", "datasets", "live", "zoo", "export")
+TRAINED = """
+import json, sys
+from pathlib import Path
+from runs import run_config, train
+train(run_config(Path(sys.argv[1]), steps=1), Path(sys.argv[2]))
+print(json.dumps([name for name in sys.modules if name.startswith("anytouch_jax.")]))
+"""
+
+
+def test_a_run_on_a_manifest_loads_no_module_of_a_ring(world, tmp_path):
+    paths = (TESTS.parent / "src", TESTS / "support")
+    done = subprocess.run(
+        [sys.executable, "-c", TRAINED, str(world), str(tmp_path / "r")],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))},
+        timeout=900,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = json.loads(done.stdout.splitlines()[-1])
+    assert "anytouch_jax.train.loop" in loaded
+    assert [name for name in loaded if name.split(".")[1] in RINGS] == []
+
+
+def test_every_source_of_batches_has_the_interface_that_training_uses():
+    members = ("steps_per_epoch", "trained_sensors", "examples", "stream")
+    for door in doors.BATCHES.values():
+        kind = doors.enter(door)
+        assert all(hasattr(kind, name) for name in (*members, "train_tokenizer"))
+    assert all(hasattr(Loader, name) for name in members)

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import os
 import pkgutil
@@ -206,29 +207,25 @@ def test_ctrl_c_before_the_first_step_says_how_to_continue(
     assert str(tmp_path / "r") in last and "same command" in last
 
 
-@pytest.fixture
+@contextlib.contextmanager
 def terminal(monkeypatch):
-    """A terminal as the error stream; call it for what was written."""
+    """A terminal as the error stream; gives a list that has what was written, once it is closed."""
     leader, follower = pty.openpty()
     written = []
 
     def read():
         while chunk := _read(leader):
-            written.append(chunk)
-
-    def text():
-        sys.stderr.flush()
-        os.close(follower)
-        reader.join(10)
-        return b"".join(written).decode()
+            written.append(chunk.decode())
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "100")
-    with os.fdopen(os.dup(follower), "w") as stream:
-        monkeypatch.setattr(sys, "stderr", stream)
-        yield lambda: (stream.close(), monkeypatch.undo(), text())[-1]
+    with monkeypatch.context() as patch, os.fdopen(follower, "w") as stream:
+        patch.setenv("TERM", "xterm")
+        patch.setenv("COLUMNS", "100")
+        patch.setattr(sys, "stderr", stream)
+        yield written
+    # The last writer is gone, which ends the reader.
+    reader.join(10)
     os.close(leader)
 
 
@@ -245,18 +242,16 @@ def rows_of_terminal(text: str) -> list[str]:
     return [row.strip() for row in re.split(r"[\r\n]+", plain)]
 
 
-def test_a_sentence_beside_the_bar_has_a_line_of_its_own(terminal):
-    with progress(0, 3, log) as advance:
+def test_a_sentence_beside_the_bar_has_a_line_of_its_own(monkeypatch):
+    with terminal(monkeypatch) as written, progress(0, 3, log) as advance:
         for step in range(3):
             advance({"step": step, "loss": 1.0, "samples_per_second": 5.0, "skipped_batches": 0})
             log(f"sentence {step}")
-    rows = rows_of_terminal(terminal())
+    rows = rows_of_terminal("".join(written))
     assert [row for row in rows if "sentence" in row] == [f"sentence {step}" for step in range(3)]
 
 
-def test_ctrl_c_leaves_the_sentence_that_says_how_to_continue(
-    terminal, tmp_path, world, monkeypatch
-):
+def test_ctrl_c_leaves_the_sentence_that_says_how_to_continue(tmp_path, world, monkeypatch):
     real = Record.write
 
     def write(record, step, numbers):
@@ -266,8 +261,9 @@ def test_ctrl_c_leaves_the_sentence_that_says_how_to_continue(
 
     monkeypatch.setattr(Record, "write", write)
     words = ["train", "--data", world, "--run", tmp_path / "r", "--steps", 9, "--batch", 8, *SMALL]
-    assert main([str(word) for word in words]) == 130
-    rows = [row for row in rows_of_terminal(terminal()) if row]
+    with terminal(monkeypatch) as written:
+        assert main([str(word) for word in words]) == 130
+    rows = [row for row in rows_of_terminal("".join(written)) if row]
     assert rows[-1].startswith("stopped by SIGINT after step 3 and saved in")
     assert rows[-1].endswith("the same command continues from here")
     assert saved_steps(tmp_path / "r") == [3]

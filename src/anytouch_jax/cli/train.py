@@ -274,6 +274,7 @@ def _refuse_unknown(options: TrainOptions, config: Config) -> None:
     What only a look into the data can tell, such as a data set's name, is left to that.
     """
     from anytouch_jax.data.manifest.schema import SPLITS
+    from anytouch_jax.weights.registry import list_encoders
 
     for name in config.model.sensors:
         check_spelling(name)
@@ -303,7 +304,11 @@ def _refuse_unknown(options: TrainOptions, config: Config) -> None:
     for option, path in (("--init", options.init), ("--clip-weights", options.clip_weights)):
         # A run that continues does not read them.
         if path is not None and not continues and not _may_exist(path):
-            raise UserError(f"{option} {path} does not exist")
+            names = ", ".join(list_encoders())
+            raise UserError(
+                f"{option} {path} does not exist; give the path of a run folder or a weights file, "
+                f"or one of {names}"
+            )
 
 
 def _may_exist(weights: Path) -> bool:

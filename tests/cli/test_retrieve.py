@@ -82,7 +82,9 @@ def test_a_mistake_is_one_sentence(touches, mistake, tmp_path, world, monkeypatc
     assert "s1" in mistake("report", *words) and not (tmp_path / "report").exists()
 
 
-def test_stored_touches_are_searched_by_a_frame(anytouch, mistake, tmp_path, tiny_run, world):
+def test_stored_touches_are_searched_by_a_frame(
+    anytouch, mistake, monkeypatch, tmp_path, tiny_run, world
+):
     index = tmp_path / "index.npz"
     assert anytouch("embed", "--model", tiny_run, "--data", world, "--out", index).status == 0
     with np.load(index) as file:
@@ -98,6 +100,10 @@ def test_stored_touches_are_searched_by_a_frame(anytouch, mistake, tmp_path, tin
     assert "text tower" in mistake(*words, "a soft sponge")
     assert "--query" in mistake(*words[:-1])
     assert "--split" in mistake(*words, "x", "--split", "val")
+    monkeypatch.setattr(
+        "anytouch_jax.encoder.encoder.load_encoder", lambda _: pytest.fail("loaded")
+    )
+    assert "did you mean digit" in mistake(*words, world.parent / path, "--sensor", "DIGIT")
 
 
 def test_a_picture_of_the_index_is_no_other_sensor(tmp_path, capfd):

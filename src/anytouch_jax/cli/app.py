@@ -239,7 +239,8 @@ def guarded(program: str, run: Callable[[], int]) -> int:
             try:
                 status = run()
             except Exception as error:
-                if missing := _missing_devices():
+                missing = _missing_devices()
+                if missing is not None:
                     raise missing from error
                 raise
         sys.stdout.flush()

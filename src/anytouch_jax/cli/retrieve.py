@@ -23,7 +23,7 @@ from anytouch_jax.cli.output import (
     print_table,
     refuse_unused,
 )
-from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
+from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.config.parsing import Count, Range, Seed
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
@@ -204,6 +204,8 @@ def _search(options: RetrieveOptions, index_file: Path) -> int:
         )
     if len(options.model) > 1:
         raise UserError(f"A search takes one encoder, not {len(options.model)}. Give one --model.")
+    if options.sensor is not None:
+        check_spelling(options.sensor)  # before the encoder is loaded, which takes seconds
     check_folder(options.out, read=(index_file, *options.model))
     index = load_index(index_file, approximate=options.approximate)
     enable_compilation_cache()

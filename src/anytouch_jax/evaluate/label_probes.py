@@ -11,7 +11,7 @@ from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, sources
 from anytouch_jax.evaluate.label_rows import constant_result, plan_rows, select_rows, task_of
-from anytouch_jax.evaluate.label_scores import features_of, probe_source
+from anytouch_jax.evaluate.label_scores import cost_of, features_of, probe_source
 from anytouch_jax.evaluate.options import LabelProbeOptions, Models, Paths
 from anytouch_jax.evaluate.results import ProbeResult, probe_json
 from anytouch_jax.evaluate.saved_heads import save_probed
@@ -74,6 +74,10 @@ def probe_label(
     results = list[ProbeResult]()
     for source in probed:
         x = features_of(source, rows, options.frames)
+        if not results:
+            note = cost_of(x, plan, options)
+            if note:
+                log(note)
         found = probe_source(source, x, plan, options)
         results += found
         log(f"probed {source.name}")

@@ -133,18 +133,12 @@ def plan_rows(table: Manifest, task: Task, rows: TaskRows, options: LabelProbeOp
             f"The manifest has no split into train and test: every {left_out} is left out in turn, "
             "and scored by a head fitted on the others"
         )
-    if left_out:
-        rows = _with_split(rows, "train")
-        if len(np.unique(rows.groups)) == 1:
-            raise UserError(
-                f"All rows are of one {left_out} ({rows.groups[0]}). Nothing is left to fit on."
-            )
+    if left_out and len(np.unique(rows.groups)) == 1:
+        raise UserError(
+            f"All rows are of one {left_out} ({rows.groups[0]}). Nothing is left to fit on."
+        )
     said = tuple(note for note in notes if note)
     return LabelPlan(task, rows, subsets, left_out, (), said)
-
-
-def _with_split(rows: TaskRows, split: str) -> TaskRows:
-    return rows._replace(split=np.full(len(rows.split), split))
 
 
 def _between_sensors(
@@ -169,7 +163,8 @@ def _between_sensors(
         rows = rows.take(np.flatnonzero(known))
         is_other = is_other[known]
     if not np.any((rows.split == "test") & is_other):
-        rows = _with_split(rows, "test")  # so all rows are dealt to folds
+        # so all rows are dealt to folds
+        rows = rows._replace(split=np.full(len(rows.split), "test"))
     sides = {"train_sensors": (train,), "test_sensors": (test,)}
     roles, _ = splits.assign_roles(task, rows, sides)
     cuts = tuple(splits.seeded_splits(roles, 0, options.protocol))
@@ -223,11 +218,14 @@ def constant_result(plan: LabelPlan) -> ProbeResult | None:
     nothing = np.zeros((len(rows.split), 1))
     if plan.cuts:
         return None
+    split = rows.split
+    if plan.left_out:
+        split = np.full(len(split), "train")
     given, cut, _ = splits.check_rows(
         nothing,
         rows.labels,
         rows.groups,
-        rows.split,
+        split,
         measured=plan.measured,
         tested=not plan.left_out,
     )

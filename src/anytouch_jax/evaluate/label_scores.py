@@ -24,6 +24,27 @@ def features_of(source: FeatureSource, rows: TaskRows, frames: int) -> Array:
     return source.store.get(rows.rows, frames)
 
 
+def cost_of(x: Array, plan: LabelPlan, options: LabelProbeOptions) -> str:
+    """Return what to say on the time of the fits before they begin, "" if it is short."""
+    if plan.measured:
+        return ""
+    names, y = np.unique(plan.rows.labels, return_inverse=True)
+    # A selection by cross-validation has a fit for each fold, and so have the fits around it.
+    fits = 1
+    if plan.left_out:
+        fits = 10 * splits.FOLDS
+    elif plan.cuts:
+        fits = len(plan.cuts)
+    elif not np.any(plan.rows.split == "val"):
+        fits = splits.FOLDS
+    # the fit of the chosen penalty, and those on bootstraps, which start from it
+    fits += 1 + options.seeds // len(heads.PENALTIES)
+    fitted = plan.rows.split != "test"
+    if not fitted.any():
+        fitted = ~fitted
+    return heads.cost_sentence(x[fitted], y[fitted], len(names), fits)
+
+
 def probe_source(
     source: FeatureSource, x: Array, plan: LabelPlan, options: LabelProbeOptions
 ) -> list[ProbeResult]:

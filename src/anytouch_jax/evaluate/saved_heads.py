@@ -40,6 +40,7 @@ def save_probed(
         model, names = result.outcome.fitted
     if model is None:
         # Groups were left out in turn, each for another head: the one to keep has all rows.
+        rows = rows._replace(split=np.full(len(rows.split), "train"))
         model, names, penalty = fit_all(x, rows)
         log("The saved head is fitted on all rows")
     head = heads.linear_head(
@@ -58,12 +59,11 @@ def save_probed(
 
 
 def fit_all(x: Array, rows: TaskRows) -> tuple[heads.LinearModel, Array, float]:
-    """Return a linear head of all rows, the names of its classes, and its penalty.
+    """Return a linear head of all rows, which are of train, the names of its classes, its penalty.
 
     The penalty is chosen by cross-validation over groups.
     """
-    everywhere = np.full(len(rows.split), "train")
-    data, cut, _ = splits.check_rows(x, rows.labels, rows.groups, everywhere, tested=False)
+    data, cut, _ = splits.check_rows(x, rows.labels, rows.groups, rows.split, tested=False)
     penalty = splits.select_option(heads.ProbeHead(), data, cut, "honest").option
     (model,) = data.fit(heads.ProbeHead(options=(penalty,)), cut.fit).models
     return model, data.names, penalty

@@ -72,9 +72,10 @@ def probe_tasks(
     plans, left_out = plan_tasks(table, tasks, options, among, log)
     probed = _sources(table, opened(), plans, options, gels, log)
     runs: Runs = {} if keep is None else keep
-    results = []
+    results: list[dict[str, Any]] = []
     for source in probed:
-        results += score_source(source, plans, options, runs)
+        # the cost is that of every source, so it is told once
+        results += score_source(source, plans, options, runs, log if not results else _silent)
         log(f"probed {source.name}")
     kinds = {plan.task.name: plan.roles.measured for plan in plans}
     report = {
@@ -95,6 +96,10 @@ def probe_tasks(
     if options.out is not None:
         atomic_write(options.out, json.dumps(report, indent=2, allow_nan=False))
     return report
+
+
+def _silent(_: str) -> None:
+    """Log nothing."""
 
 
 def probe_benchmark(

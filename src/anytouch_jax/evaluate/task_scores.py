@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, splits, statistics
 from anytouch_jax.evaluate.feature_cache import FeatureSource
-from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead
+from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead, cost_sentence
 from anytouch_jax.evaluate.logistic import threads
 from anytouch_jax.evaluate.options import TaskProbeOptions
 from anytouch_jax.evaluate.scoring import constant_prediction, predict, score_sums
@@ -24,9 +25,21 @@ from anytouch_jax.progress import tracked
 
 
 def score_source(
-    source: FeatureSource, plans: Sequence[Plan], options: TaskProbeOptions, runs: Runs
+    source: FeatureSource,
+    plans: Sequence[Plan],
+    options: TaskProbeOptions,
+    runs: Runs,
+    log: Log = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Return the results of one source on all tasks, and add its test rows to `runs`."""
+    """Return the results of one source on all tasks.
+
+    Args:
+        source: of the features.
+        plans: of the tasks.
+        options: of the probe.
+        runs: gets the test rows of every seed.
+        log: is called with tasks of which the fits take long.
+    """
     for length in sorted({plan.frames for plan in plans}):
         wanted = [plan.rows.rows.ravel() for plan in plans if plan.frames == length]
         source.store.add(np.concatenate(wanted), length)
@@ -37,6 +50,11 @@ def score_source(
     results = []
     for plan in tracked(plans, f"tasks with {source.name}"):
         labelled = _labelled(source, plan)
+        cuts = len(splits.seeded_splits(plan.roles, 0, options.protocol))
+        if "linear" in options.heads:
+            note = cost_sentence(labelled.x, labelled.y, len(plan.names), cuts * options.seeds)
+            if note:
+                log(f"{plan.task.name}: {note}")
         notes = [*plan.notes, *source.notes(plan.rows.sensors)]
         about = {"frames": plan.frames, "order": options.order}
         if plan.frames == 1:

@@ -167,42 +167,35 @@ class Vit(nnx.Module):
         self.patch = TubePatch(form.tubelet, model, bias=form.patch_bias)
         self.class_token = table(width) if form.class_token else None
         self.registers = table(form.registers, width) if form.registers else None
-        self.sensor_tokens = None
-        if form.sensor_tokens:
-            self.sensor_tokens = table(len(model.sensors), model.sensor_tokens, width)
+        rows = len(model.sensors)
+        # Each attribute is set once: nnx keeps an attribute that was None as a static one.
+        self.sensor_tokens = table(rows, model.sensor_tokens, width) if form.sensor_tokens else None
         self._make_positions(form, width)
         self.pre_norm = LayerNorm(width, eps, model.dtype) if form.pre_norm else None
         self.blocks = stacked_blocks(stack, model, eps, act, kind)
-        self.trunk = None
+        trunk = Stack(width, form.trunk, stack.heads, stack.mlp)
         if form.trunk:
-            trunk = Stack(width, form.trunk, stack.heads, stack.mlp)
             eps = form.trunk_eps
-            self.trunk = stacked_blocks(trunk, model, eps, act, kind)
+        self.trunk = stacked_blocks(trunk, model, eps, act, kind) if form.trunk else None
         self.post_norm = LayerNorm(width, eps, model.dtype)
-        self.projection = None
-        if form.outputs:
-            self.projection = Dense(width, form.outputs, model, bias=form.output_bias)
+        projects = form.outputs > 0
+        self.projection = (
+            Dense(width, form.outputs, model, bias=form.output_bias) if projects else None
+        )
         self.pool = AttentionPool(stack, model, act) if form.pool else None
 
     def _make_positions(self, form: VitConfig, width: int) -> None:
         """Make the parameters that tell one patch from another: stored, computed or rotary."""
-        self.periods = None
-        self.frequency = None
-        self.position = None
-        self.calibration = None
-        self.calibration_position = None
-        if form.rotary:
-            self.periods = table(width // form.model.touch.heads // 4)
-        elif form.grid is None:
-            self.frequency = table(form.axes, -(-width // (2 * form.axes)))
-        places = 0
-        if form.grid is not None:
-            places = int(np.prod(form.grid))
-            self.position = table(places + form.class_token, width)
-        if form.calibration:
-            self.calibration = TubePatch(form.calibration, form.model)
-            if places:
-                self.calibration_position = table(places, width)
+        is_stored = form.grid is not None
+        places = int(np.prod(form.grid)) if form.grid is not None else 0
+        heads = form.model.touch.heads
+        self.periods = table(width // heads // 4) if form.rotary else None
+        is_computed = not form.rotary and not is_stored
+        self.frequency = table(form.axes, -(-width // (2 * form.axes))) if is_computed else None
+        self.position = table(places + form.class_token, width) if is_stored else None
+        has_images = form.calibration > 0
+        self.calibration = TubePatch(form.calibration, form.model) if has_images else None
+        self.calibration_position = table(places, width) if has_images and is_stored else None
 
     def __call__(self, clip: Array, sensor: Array, calibration: Array | None = None) -> VitOutput:
         """Return the tokens of prepared clips (B, T, H, W, 3) of sensor rows (B,).

@@ -128,7 +128,7 @@ function showLive(source, about) {
     // Something new is a state of its own. A bar would say how sure the head is of a name that it does not have.
     if (one.novel) {
       felt.textContent = "Something new";
-      why.textContent = `Unlike every recording. The nearest name is ${one.label}.`;
+      why.textContent = `Unlike every recording. The nearest name is ${one.recorded?.[0]?.about.object ?? one.label}.`;
       return;
     }
     felt.textContent = one.label;

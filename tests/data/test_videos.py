@@ -165,3 +165,28 @@ def test_names_that_are_not_utf_8_are_read(tmp_path, kind):
     frames = 3 if kind == "avi" else 4
     assert done.stdout == f"{frames} {(*SHAPE, 3)} {frames} True\n"
     assert done.stderr == ""
+
+
+def test_a_video_is_written_under_a_name_that_is_not_utf_8(tmp_path):
+    """In a process of its own, for the same reason."""
+    name = os.fsencode(tmp_path) + b"/gr\xfcn/film.mp4"
+    code = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "import numpy as np\n"
+        "from anytouch_jax.data.images import frames_from_video\n"
+        "from anytouch_jax.fields.film import Film\n"
+        "path = Path(os.fsdecode(bytes.fromhex(sys.argv[1])))\n"
+        "path.parent.mkdir()\n"
+        "film = Film(path)\n"
+        "for grey in (50, 100, 150):\n"
+        "    film.add(np.full((64, 64, 3), grey, np.uint8))\n"
+        "film.finish()\n"
+        "print([int(round(frame.mean(), -1)) for frame in frames_from_video(path)])\n"
+        "print([file.name for file in path.parent.iterdir()])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, name.hex()], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["[50, 100, 150]", "['film.mp4']"]

@@ -131,7 +131,7 @@ class VideoFile:
         """Start at the first frame of a file. Raises ImageError for a codec without decoder."""
         self.release()
         self._name = path
-        with QUIET, _name_for_opencv(path) as name:
+        with QUIET, name_for_opencv(path) as name:
             told = cv2.VideoCapture(name)
             self._decoder = told
             if not told.isOpened():
@@ -252,8 +252,8 @@ def _by_pyav(path: str | Path, codec: str) -> _PyAv | None:
 
 
 @contextlib.contextmanager
-def _name_for_opencv(path: str | Path) -> Iterator[str]:
-    """Give the name of a file that OpenCV can open.
+def name_for_opencv(path: str | Path) -> Iterator[str]:
+    """Give the name of a file that OpenCV can open, to read or to write it.
 
     It takes UTF-8 only, and ends the process for other names, which ZIP files of Windows and old
     recorders leave. Such a file gets a second name while it is opened.

@@ -63,13 +63,15 @@ def faults_of(
             faults.append(
                 f"it looks {turned} when compared with its background. Read both in the same way."
             )
-    # With its own background a mirrored picture is measured as well as another one: the network
-    # has learned from simulated instances of which half are mirrored. On 20 presses each of a real
-    # DIGIT and a GelSight, mirrored, the deepest point changes by 4 % in the median.
+    # A device may be built another way round than the few known ones, and half of the simulated
+    # instances that the network has learned from are mirrored. With the background of the same
+    # device it reads an example and its mirror images alike (depth within 0.05 mm RMS, force within
+    # 17 %), and 20 presses each of a real DIGIT and GelSight turned in any way (the deepest point
+    # changes by 2 to 8 %). So a turn counts only without a background.
     check = check_layout(
         UnitFrames(sensor, "", [[frame]], background),
         known_gels(sensor),
-        may_be_mirrored=background is not None,
+        may_be_turned=background is not None,
     )
     if check.ok is False:
         faults.append(f"unlike other units of {sensor} it looks {check.value}. {check.advice}")

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from anytouch_jax.data.videos import name_for_opencv
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, part_path
 
@@ -52,7 +53,8 @@ class Film:
         code = "MJPG" if self._path.suffix == ".avi" else "mp4v"
         self._size = (picture.shape[1], picture.shape[0])
         fourcc = cv2.VideoWriter.fourcc(*code)
-        self._writer = cv2.VideoWriter(str(self._part), fourcc, self._rate, self._size)
+        with name_for_opencv(self._part) as name:
+            self._writer = cv2.VideoWriter(name, fourcc, self._rate, self._size)
         if not self._writer.isOpened():
             raise UserError(
                 f"{self._path} cannot be written as a film on this computer. Name an .avi file."
@@ -78,7 +80,8 @@ class Film:
 
     def _is_whole(self) -> bool:
         """Whether the written video opens, and has its last frame."""
-        video = cv2.VideoCapture(str(self._part))
+        with name_for_opencv(self._part) as name:
+            video = cv2.VideoCapture(name)
         try:
             if not video.isOpened() or video.get(cv2.CAP_PROP_FRAME_COUNT) < self._count:
                 return False

@@ -7,12 +7,6 @@ import anytouch_jax as at
 from anytouch_jax.data.background.layout import UnitFrames, check_layout, known_gels
 from anytouch_jax.fields.faults import faults_of
 
-WRONG = {
-    "upside down": lambda gel: gel[::-1, ::-1],
-    "mirrored top to bottom": lambda gel: gel[::-1],
-    "red and blue exchanged": lambda gel: gel[..., ::-1],
-}
-
 
 def checked(sensor: str, gel: np.ndarray, others: list[np.ndarray], **options):
     unit = UnitFrames(sensor, "", [[np.ascontiguousarray(gel)]])
@@ -20,17 +14,19 @@ def checked(sensor: str, gel: np.ndarray, others: list[np.ndarray], **options):
 
 
 @pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
-def test_a_mirror_image_may_be_allowed_and_other_faults_are_still_found(sensor):
+def test_turns_may_be_allowed_and_exchanged_colours_are_still_found(sensor):
     gels = known_gels(sensor)
     for number, gel in enumerate(gels):
         others = gels[:number] + gels[number + 1 :]
-        for one in (gel, gel[:, ::-1]):
-            assert checked(sensor, one, others, may_be_mirrored=True).ok
-        if sensor == "digit":  # a GelSight Mini looks the same in a mirror
-            mirrored = checked(sensor, gel[:, ::-1], others)
-            assert mirrored.ok is False and mirrored.value.startswith("mirrored left to right")
-        for wrong in WRONG.values():
-            assert checked(sensor, wrong(gel), others, may_be_mirrored=True).ok is False
+        # upside down, or in a mirror: a GelSight Mini looks the same in one from left to right
+        for turned in (gel[::-1, ::-1], gel[::-1]):
+            found = checked(sensor, turned, others)
+            assert found.ok is False
+            assert "--rotate 180" in found.advice or "--flip" in found.advice
+        for one in (gel, gel[:, ::-1], gel[::-1, ::-1], gel[::-1]):
+            assert checked(sensor, one, others, may_be_turned=True).ok
+        found = checked(sensor, gel[..., ::-1], others, may_be_turned=True)
+        assert found.ok is False and "red and blue exchanged" in found.value
 
 
 def test_no_example_of_the_package_is_called_faulty():

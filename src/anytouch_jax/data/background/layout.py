@@ -38,13 +38,12 @@ class Turn(NamedTuple):
 
 
 _UPRIGHT = Turn(0, False)
-_ACROSS = Turn(0, True)
 _TURNS = (
     _UPRIGHT,
     Turn(1, False),
     Turn(2, False),
     Turn(3, False),
-    _ACROSS,
+    Turn(0, True),
     Turn(1, True),
     Turn(2, True),
     Turn(3, True),
@@ -146,7 +145,7 @@ def known_gels(sensor: str) -> list[Array]:
 
 
 def check_layout(
-    unit: UnitFrames, references: Sequence[Array], *, may_be_mirrored: bool = False
+    unit: UnitFrames, references: Sequence[Array], *, may_be_turned: bool = False
 ) -> Check:
     """Compare with the references: which turn and order of colours fits them best?
 
@@ -156,8 +155,7 @@ def check_layout(
     Args:
         unit: Its background, or else its usual picture, is compared.
         references: Backgrounds u8 (h, w, 3) of the same family.
-        may_be_mirrored: A mirror image left to right is no fault, as for the simulator's instances,
-            of which half are.
+        may_be_turned: No turn is a fault, and no mirror image; exchanged colours still are.
     """
     name = "orientation and colours"
     if not references:
@@ -167,8 +165,9 @@ def check_layout(
     if most < _LIKE:
         return Check(name, None, f"unlike its family ({most:.2f})")
     as_it_is = scores.pop((_UPRIGHT, False), -1.0)
-    if may_be_mirrored:
-        as_it_is = max(as_it_is, scores.pop((_ACROSS, False), -1.0))
+    if may_be_turned:
+        turned = [scores.pop((turn, False), -1.0) for turn in _TURNS]
+        as_it_is = max(as_it_is, *turned)
     best = max(scores, key=lambda key: scores[key])
     margin = scores[best] - as_it_is
     if margin <= ORIENTATION:

@@ -1,7 +1,5 @@
 """Touches of your sensor next to known ones: the real world, touches, scorer and clock."""
 
-import time
-
 import jax
 import numpy as np
 import pytest
@@ -76,33 +74,3 @@ def test_the_score_is_the_share_of_touches_whose_nearest_is_the_same_touch():
     own[1, 1] = 0.9 * other[1, 1] + other[1, 3]  # nearer to a touch that is no rival
     parts = iter(zip(own, other, strict=True))
     assert tokens._found(held, lambda train, one: next(parts), {}) == pytest.approx(4 / 5)
-
-
-def test_a_training_lasts_as_long_as_asked_by_the_clock_and_its_rate_falls_to_zero():
-    """The first steps measure the speed. Compiling is not training, and does not count."""
-    seconds, pause, compiling = 1.0, 0.02, 1.0
-    calls, drawn = [], []
-
-    def step(kept, frozen, key, batch, number, rate):
-        time.sleep(pause if calls else compiling)
-        calls.append((number, batch, rate))
-        return (kept[0] + 1,), 1.0
-
-    def draw(number):
-        drawn.append(number)
-        return number
-
-    root, begun = jax.random.key(0), time.monotonic()
-    kept, history, finished = tokens._train(
-        (np.zeros(()),), step, {}, seconds, root, None, draw, "x", lambda _: None
-    )
-    lasted = time.monotonic() - begun
-    assert finished and float(kept[0]) == len(history) == len(calls)
-    assert 0.4 * seconds / pause < len(calls) <= 1.05 * seconds / pause
-    assert 0.5 * seconds < lasted - compiling < 5 * seconds, "on a busy machine too"
-    numbers, batches, rates = zip(*calls, strict=True)
-    assert numbers == tuple(range(len(calls)))
-    assert batches == tuple(number // tokens.REUSE for number in numbers)
-    assert drawn == sorted(set(batches)), "each batch is drawn once"
-    later = rates[tokens.TIMED + 1 :]
-    assert (np.diff(later) < 0).all() and later[-1] < 0.01 and rates[0] == 1

@@ -330,6 +330,7 @@ from anytouch_jax.cli.app import main
 assert main(["--help"]) == 0
 ours = [name for name in sys.modules if name.startswith("anytouch_jax.")]
 known = ("anytouch_jax.cli", "anytouch_jax.config", "anytouch_jax.doors", "anytouch_jax.errors",
+         "anytouch_jax.sensors", "anytouch_jax.signals", "anytouch_jax.text",
          "anytouch_jax.shown")
 assert not [name for name in ours if not name.startswith(known)], ours
 assert not [name for name in ours if name.startswith("anytouch_jax.cli.")

@@ -6,6 +6,8 @@ one product can resample, blur and differentiate at once. Maps are (rows, column
 rows, map @ M.T on columns.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,6 +72,16 @@ def average(count: int, cells: int) -> npt.NDArray[np.float32]:
     return np.asarray(np.maximum(overlap, 0) * cells / count, np.float32)
 
 
+class _Neighbours(NamedTuple):
+    """The four rows and the four columns around points, and their weights."""
+
+    rows: list[jax.Array]
+    columns: list[jax.Array]
+    down: tuple[jax.Array, ...]
+    across: tuple[jax.Array, ...]
+    inside: jax.Array  # whether a point lies on the raster
+
+
 def sample(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
     """Return values of a centred raster at points, by a cubic (Catmull-Rom) spline.
 
@@ -77,12 +89,84 @@ def sample(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
     image, which shows slopes. Outside of the raster and at NaN it is the lowest value on the
     border. A point costs sixteen reads. A raster of half floats is read as float32.
 
+    The spline overshoots at a cliff, by a sixteenth of its height and more. The simulator's own
+    surfaces have none (`shapes._STEEP`); for those of users there is `sample_sharp`.
+
     Args:
         raster: (H, W) values.
         pitch: mm between pixels.
         x: Places to the right of the middle, mm.
         y: Places below the middle, mm, of the shape of `x`.
     """
+    columns = raster.shape[1]
+    dtype = jnp.promote_types(raster.dtype, jnp.float32)
+    near = _neighbours(raster, pitch, x, y)
+    flat = jnp.asarray(raster).reshape(-1)
+    total = jnp.zeros(near.inside.shape, dtype)
+    for row, down in zip(near.rows, near.down, strict=True):
+        line = jnp.zeros_like(total)
+        for column, across in zip(near.columns, near.across, strict=True):
+            # The indices are clipped above, so the read need not check them again.
+            line = line + across * flat.at[row * columns + column].get(mode="promise_in_bounds")
+        total = total + down * line
+    return _or_border(raster, near.inside, total)
+
+
+def sample_sharp(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Return values as `sample`, without its overshoot at cliffs.
+
+    Along each axis a value stays between its two neighbours, but for the room that a gentle bend on
+    both sides of them leaves (`_limited`). So a plateau stays one up to its very edge, and a smooth
+    surface is the same as by `sample`: parabolas are exact.
+    """
+    columns = raster.shape[1]
+    near = _neighbours(raster, pitch, x, y)
+    flat = jnp.asarray(raster).reshape(-1)
+    lines = []
+    for row in near.rows:
+        reads = [
+            flat.at[row * columns + column].get(mode="promise_in_bounds") for column in near.columns
+        ]
+        lines.append(_limited(reads, near.across, pitch))
+    return _or_border(raster, near.inside, _limited(lines, near.down, pitch))
+
+
+def sample_nearest(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Return the values of the pixels nearest to points, for one read of each; see `sample`."""
+    rows, columns = raster.shape
+    down = jnp.nan_to_num(jnp.asarray(y) / pitch + (rows - 1) / 2, nan=-1.0)
+    across = jnp.nan_to_num(jnp.asarray(x) / pitch + (columns - 1) / 2, nan=-1.0)
+    row = jnp.round(down).astype(jnp.int32)
+    column = jnp.round(across).astype(jnp.int32)
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    place = jnp.clip(row, 0, rows - 1) * columns + jnp.clip(column, 0, columns - 1)
+    value = jnp.asarray(raster).reshape(-1).at[place].get(mode="promise_in_bounds")
+    return _or_border(raster, inside, value)
+
+
+def _limited(values: list[jax.Array], weights: tuple[jax.Array, ...], pitch: float) -> jax.Array:
+    """Return the cubic between the middle two of four values, without overshoot.
+
+    Between samples of a parabola of second difference k the largest value is at most k / 8 above
+    both. So the cubic may leave the interval between its neighbours by an eighth of the smaller of
+    their two second differences, if these have one sign. At the edge of a plateau one of them is 0.
+    On a ridge of two pixels both are cliffs: slopes that change by more than 1 within a pixel.
+    """
+    outer_left, left, right, outer_right = values
+    total = sum(weight * value for weight, value in zip(weights, values, strict=True))
+    bend_left = outer_left - 2 * left + right
+    bend_right = left - 2 * right + outer_right
+    smaller = jnp.minimum(jnp.abs(bend_left), jnp.abs(bend_right))
+    room = jnp.where(smaller <= pitch, smaller / 8, 0)
+    highest = jnp.maximum(left, right)
+    highest = highest + jnp.where((bend_left < 0) & (bend_right < 0), room, 0)
+    lowest = jnp.minimum(left, right)
+    lowest = lowest - jnp.where((bend_left > 0) & (bend_right > 0), room, 0)
+    return jnp.clip(total, lowest, highest)
+
+
+def _neighbours(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> _Neighbours:
+    """Return what surrounds points on a centred raster."""
     rows, columns = raster.shape
     dtype = jnp.promote_types(raster.dtype, jnp.float32)
     place = (jnp.asarray(y) / pitch + (rows - 1) / 2, jnp.asarray(x) / pitch + (columns - 1) / 2)
@@ -100,13 +184,10 @@ def sample(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
         inner = (1.5 * f - 2.5) * f * f + 1.0
         weights.append((outer, inner, ((-1.5 * f + 2.0) * f + 0.5) * f, (0.5 * f - 0.5) * f * f))
         index.append([jnp.clip(first.astype(jnp.int32) + i, 0, count - 1) for i in (-1, 0, 1, 2)])
-    flat = jnp.asarray(raster).reshape(-1)
-    total = jnp.zeros(inside.shape, dtype)
-    for row, across in zip(index[0], weights[0], strict=True):
-        line = jnp.zeros_like(total)
-        for column, along in zip(index[1], weights[1], strict=True):
-            # The indices are clipped above, so the read need not check them again.
-            line = line + along * flat.at[row * columns + column].get(mode="promise_in_bounds")
-        total = total + across * line
+    return _Neighbours(index[0], index[1], weights[0], weights[1], inside)
+
+
+def _or_border(raster: Leaf, inside: jax.Array, value: jax.Array) -> jax.Array:
+    """Return values `inside`, and the lowest one on the border elsewhere."""
     border = jnp.concatenate([raster[0], raster[-1], raster[:, 0], raster[:, -1]])
-    return jnp.where(inside, total, jnp.min(border).astype(dtype))
+    return jnp.where(inside, value, jnp.min(border).astype(value.dtype))

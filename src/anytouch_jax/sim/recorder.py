@@ -39,6 +39,7 @@ SPACING = 0.1  # mm between pixels of a height map
 RELIEF = 400  # pixels of a height map: 40 mm hold any rotated field and its motion
 GRID = 96  # pixels of the solve grid on the field's short side, at most
 FIELDS = ("displacement", "shear", "pressure")
+NOTHING = 10.0  # mm below the lowest place of a user's map: where it has a hole, and around it
 LEAST = 64  # with fidelity fast the grid has half the image's pixels, or as many as these
 
 
@@ -97,6 +98,35 @@ def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
     The first contact is at 0. The object turns and slides about the middle of the gel. Its tilt is
     that of the sensor in the hand.
     """
+    z = _heights(clip, x, y, interpolation.sample)
+    return z - jnp.max(z[0])
+
+
+def user_surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
+    """Return heights as `surfaces` of a map that may have cliffs, holes (NaN) and a near border.
+
+    In a hole and beyond the border there is nothing. What lies farther below the highest pixel
+    under the gel than twice the depth of the press is cut off there, in the map: the gel gives way
+    by the depth at most and never reaches it, so how deep it is may not matter. -inf everywhere is
+    no object under the gel.
+    """
+    known = jnp.isfinite(clip.relief)
+    lowest = jnp.min(jnp.where(known, clip.relief, jnp.inf))
+    nothing = lowest - NOTHING
+    # The lowest value on the border is that of everything outside.
+    relief = jnp.pad(jnp.where(known, clip.relief, nothing), 1, constant_values=nothing)
+    first = clip._replace(relief=relief, motion=clip.motion[:1])
+    top = jnp.max(_heights(first, x, y, interpolation.sample_nearest))
+    floor = jax.lax.stop_gradient(top - 2 * jnp.maximum(jnp.max(clip.depth), 0))
+    cut = clip._replace(relief=jnp.maximum(relief, floor))
+    z = _heights(cut, x, y, interpolation.sample_sharp)
+    return jnp.where(top >= lowest, z - jnp.max(z[0]), -jnp.inf)
+
+
+def _heights(
+    clip: ClipInput, x: Array, y: Array, look_up: Callable[[Leaf, float, Array, Array], Array]
+) -> Array:
+    """Return heights (T, h, w) mm of the object's map under the gel's points `x`, `y` mm."""
     x, y = gel_to_object(clip.unit, x, y)
     frames = len(clip.motion)
     halves = (2, -1, x.shape[-1])
@@ -105,7 +135,7 @@ def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
         motion, x, y = part
         u, v = rotated(x - motion[0], y - motion[1], -motion[2])
         u, v = rotated(u - clip.start[0], v - clip.start[1], -clip.start[2])
-        z = interpolation.sample(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
+        z = look_up(clip.relief, SPACING, u + clip.place[0], v + clip.place[1])
         return z + clip.tilt[0] * x + clip.tilt[1] * y
 
     # It has several users, and XLA would repeat the sixteen reads of a point for each of them,
@@ -115,8 +145,8 @@ def surfaces(clip: ClipInput, x: Array, y: Array) -> Array:
         jnp.repeat(clip.motion, 2, 0),
         *(jnp.tile(at.reshape(halves), (frames, 1, 1)) for at in (x, y)),
     )
-    z = jax.lax.map(under, parts).reshape(frames, *x.shape)
-    return z - jnp.max(z[0])
+    z: Array = jax.lax.map(under, parts).reshape(frames, *x.shape)
+    return z
 
 
 def gel_motion(clip: ClipInput) -> Array:
@@ -158,6 +188,7 @@ def simulate_clip(
     size: int = 0,
     fields: tuple[str, ...] = (),
     view: View | None = None,
+    surface: Callable[[ClipInput, Array, Array], Array] = surfaces,
 ) -> ClipOutput:
     """Simulate one clip: contact of every frame, shear with its history, images and labels.
 
@@ -168,11 +199,12 @@ def simulate_clip(
         size: Short side of the image in pixels, 0 for the sensor's resolution.
         fields: Names of FIELDS to return.
         view: Replaces the grid and the image that follow from `size`.
+        surface: Returns the heights of the object under the gel, as `surfaces`.
     """
     if view is None:
         grid, pitch = solve_grid(sensor, size, fidelity)
         view = View(grid, pitch, optics.picture_size(sensor, size))
-    contact = _touched(clip, sensor, view, fidelity)
+    contact = _touched(clip, sensor, view, fidelity, surface)
     labels = contact.labels
     if fidelity == "fast":
         del labels["converged"]  # a few iterations do not converge
@@ -195,7 +227,13 @@ def simulate_clip(
     return ClipOutput(image, background, mapped, labels)
 
 
-def _touched(clip: ClipInput, sensor: Sensor, view: View, fidelity: Fidelity) -> _Contact:
+def _touched(
+    clip: ClipInput,
+    sensor: Sensor,
+    view: View,
+    fidelity: Fidelity,
+    surface: Callable[[ClipInput, Array, Array], Array],
+) -> _Contact:
     """Return the normal contact, the tangential contact and the labels of every frame."""
     rows, columns = view.grid
     pitch = view.pitch
@@ -206,7 +244,7 @@ def _touched(clip: ClipInput, sensor: Sensor, view: View, fidelity: Fidelity) ->
     press = partial(
         mechanics.press, gel=gel, pitch=pitch, fidelity=fidelity, modulus_object=clip.modulus
     )
-    relief = surfaces(clip, x, y)
+    relief = surface(clip, x, y)
     contact = jax.vmap(press)(relief, clip.depth)
     squeezed = jax.vmap(
         lambda p: mechanics.sideways(p, gel, pitch, fidelity=fidelity, coarse=True)
@@ -437,8 +475,8 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
     *,
     drag: npt.ArrayLike | Array = (0.0, 0.0, 0.0),
     size: int = 224,
-    modulus: float = 1e6,
-    friction: float = 0.6,
+    modulus: float | Array = 1e6,
+    friction: float | Array = 0.6,
     fidelity: Fidelity = "fast",
     unit: Unit | None = None,
 ) -> SimulatedTouch:
@@ -448,9 +486,11 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
     to pose and drag.
 
     Args:
-        height_map: (H, W) mm, with 0.1 mm between pixels, its highest part nearest to the gel.
+        height_map: (H, W) mm, with 0.1 mm between pixels, its highest part nearest to the gel. NaN
+            is a hole, and beyond the map there is nothing: end it at the background, or on all
+            sides where the object ends.
         pose: (B, 4): the touched place x and y in mm from the map's centre, the turn in rad, and
-            the depth in mm.
+            the depth in mm. Where the map has nothing under the gel, nothing is touched.
         sensor: A name, or a folder NAME.sensor.
         drag: (B, 3) mm, mm and rad, by which the object moves over the gel under the whole
             pressure.
@@ -461,7 +501,8 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
         unit: A device (`sensors.draw_unit`), by default the nominal one without markers.
 
     Raises:
-        UserError: For a sensor without a camera, and for arrays of other shapes.
+        UserError: For a sensor without a camera, for arrays of other shapes, and for a map without
+            a height.
     """
     kind = find_sensor(sensor)
     if kind.kind != "image":
@@ -474,8 +515,20 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
             f"a height map is (H, W) mm with {SPACING} mm between pixels and a pose (B, 4), not "
             f"{relief.shape} and {pose.shape}"
         )
+    _check_heights(height_map)
     moves = jnp.broadcast_to(jnp.atleast_2d(jnp.asarray(drag, jnp.float32)), (len(pose), 3))
     device = identity_unit(kind) if unit is None else unit
+    # The device is a constant, so XLA would compute what depends on it alone while it compiles: by
+    # an interpreter, which takes seconds for products of matrices, and prints alarms. Behind a
+    # barrier they are a part of the program, which takes a millisecond for them. The tables of the
+    # gel are for numpy (`elastic._library`), so its two numbers stay in front of the barrier.
+    hidden, seed = jax.lax.optimization_barrier((device, jnp.uint32(0)))
+    device = hidden._replace(thickness=device.thickness, modulus=device.modulus)
+    hardness: Leaf
+    if isinstance(modulus, jax.core.Tracer):
+        hardness = jnp.asarray(modulus, jnp.float32)
+    else:
+        hardness = np.asarray(modulus, np.float32)
 
     def one(pose: Array, drag: Array) -> SimulatedTouch:
         clip = ClipInput(
@@ -485,13 +538,15 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
             motion=drag[None],
             depth=pose[3:],
             tilt=jnp.zeros(2),
-            modulus=jnp.float32(modulus),
+            modulus=hardness,
             friction=jnp.float32(friction),
             unit=device,
             drift=jnp.zeros((1, 3, 3)),
-            seed=jnp.uint32(0),
+            seed=seed,
         )
-        out = simulate_clip(clip, sensor=kind, fidelity=fidelity, size=size, fields=FIELDS)
+        out = simulate_clip(
+            clip, sensor=kind, fidelity=fidelity, size=size, fields=FIELDS, surface=user_surfaces
+        )
         assert out.image is not None and out.background is not None and out.field is not None
         force = jnp.stack([out.labels[name][-1] for name in ("force_x", "force_y", "force")])
         field = out.field[-1]
@@ -506,6 +561,18 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
         )
 
     return jax.vmap(one)(pose, moves)
+
+
+def _check_heights(height_map: npt.ArrayLike | Array) -> None:
+    """Raise UserError for a map without a height, unless it is traced and so not known yet."""
+    if isinstance(height_map, jax.core.Tracer):
+        return
+    heights = np.asarray(height_map)
+    if np.isposinf(heights).any() or not np.isfinite(heights).any():
+        raise UserError(
+            "a height map holds at least one height in mm, and NaN where the object has a hole; "
+            "this one has no height, or +inf"
+        )
 
 
 def ball(diameter: float, pixels: int = 200) -> np.ndarray:

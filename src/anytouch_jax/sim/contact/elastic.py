@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -301,7 +302,7 @@ def sideways_table(poisson: float) -> tuple[Host, float]:
     return bessel0 @ (weights * smooth), rest
 
 
-def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Array:
+def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Any:
     """Return the potential of the sideways motion of a layer's surface by a load on a pixel.
 
     Its gradient is that motion. It is (H, W) at offsets >= 0, in units of P / (pi E*). A load pulls
@@ -311,24 +312,38 @@ def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtyp
     table, rest = sideways_table(poisson)
     # Near the load the potential goes as -log r. At 0 this is the mean of log r over a pixel.
     radius = np.maximum(_radius(plan), np.exp(np.pi / 4 - 1.5 - np.log(2) / 2))
-    far = jnp.asarray(radius, dtype) * jnp.asarray(pitch / thickness, dtype)
-    return jnp.where(far < FAR, _between(far, table) + rest * jnp.arcsinh(2 / far), 0)
+    xp, kind = _library(dtype, pitch, thickness)
+    far = xp.asarray(radius, kind) * xp.asarray(pitch / thickness, kind)
+    return xp.where(far < FAR, _between(far, table) + rest * xp.arcsinh(2 / far), 0)
 
 
-def _between(far: Array, table: Host) -> Array:
+def _library(dtype: Any, *values: Any) -> tuple[ModuleType, Any]:
+    """Return the array library that computes with some values, and the type of its numbers.
+
+    Values that are known before a program runs are for numpy, in float64. XLA would compute with
+    them too while it compiles, but by an interpreter, which takes seconds and prints alarms.
+    """
+    if any(isinstance(value, jax.Array) for value in values):
+        return jnp, dtype
+    return np, np.float64
+
+
+def _between(far: Any, table: Host) -> Any:
     """Return values between those of a table at `DISTANCE`. Equal steps need no search."""
+    xp = far.__array_namespace__()
     step = far / DISTANCE[1]
-    left = jnp.clip(step.astype(jnp.int32), 0, len(table) - 2)
-    lines = jnp.asarray(np.stack([table[:-1], np.diff(table)], 1), far.dtype)[left]
+    left = xp.clip(step.astype(xp.int32), 0, len(table) - 2)
+    lines = xp.asarray(np.stack([table[:-1], np.diff(table)], 1), far.dtype)[left]
     return lines[..., 0] + (step - left) * lines[..., 1]
 
 
-def _looked_up(far: Array, table: Host, limit: float) -> Array:
+def _looked_up(far: Any, table: Host, limit: float) -> Any:
     """Return a difference between half-space and layer at any distance.
 
     Beyond FAR the layer does not move, so the difference is the half-space's motion, `limit` / far.
     """
-    return jnp.where(far < FAR, _between(far, table), limit / jnp.maximum(far, FAR))
+    xp = far.__array_namespace__()
+    return xp.where(far < FAR, _between(far, table), limit / xp.maximum(far, FAR))
 
 
 def normal_spectrum(
@@ -344,13 +359,15 @@ def normal_spectrum(
         share: E* over the gel's plane modulus: the part of the motion that is the layer's.
         dtype: Of the spectrum.
     """
-    deep = jnp.asarray(_normal_host(plan), dtype)
     if is_infinite(thickness):
-        return deep
-    scale = jnp.asarray(pitch / thickness, dtype)
+        return jnp.asarray(_normal_host(plan), dtype)
+    xp, kind = _library(dtype, pitch, thickness, share)
+    deep = xp.asarray(_normal_host(plan), kind)
+    scale = xp.asarray(pitch / thickness, kind)
     table, _, _ = layer_tables(poisson)
-    radius = jnp.asarray(_radius(plan), dtype) * scale
-    return deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, table, 1.0))
+    radius = xp.asarray(_radius(plan), kind) * scale
+    layer = deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, table, 1.0))
+    return jnp.asarray(layer, dtype)
 
 
 def tangential_spectra(
@@ -360,21 +377,23 @@ def tangential_spectra(
 
     Arguments are those of `normal_spectrum`.
     """
-    deep = jnp.asarray(_tangential_host(plan, poisson), dtype)
     if is_infinite(thickness):
-        return deep
-    scale = jnp.asarray(pitch / thickness, dtype)
+        return jnp.asarray(_tangential_host(plan, poisson), dtype)
+    xp, kind = _library(dtype, pitch, thickness, share)
+    deep = xp.asarray(_tangential_host(plan, poisson), kind)
+    scale = xp.asarray(pitch / thickness, kind)
     _, mean, twofold = layer_tables(poisson)
-    radius = jnp.asarray(_radius(plan), dtype) * scale
+    radius = xp.asarray(_radius(plan), kind) * scale
     ratio = poisson / (1 - poisson)
     mean_at = share * scale / np.pi * _looked_up(radius, mean, 1 + ratio / 2)
     twofold_at = share * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
-    cosine, sine = (jnp.asarray(table, dtype) for table in _twice_the_angle(plan))
+    cosine, sine = (xp.asarray(table, kind) for table in _twice_the_angle(plan))
     # A motion along x by a load along x varies as cos 2 phi about its mean over directions.
     parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)
-    return deep - jnp.stack(
+    layer = deep - xp.stack(
         [plan.spectrum(part, p) for part, p in zip(parts, (1, -1, 1), strict=True)]
     )
+    return jnp.asarray(layer, dtype)
 
 
 @functools.lru_cache(maxsize=64)

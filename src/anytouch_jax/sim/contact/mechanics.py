@@ -111,6 +111,7 @@ def press(
         surface = surface.astype(jnp.float32)
     dtype = surface.dtype
     depth = jnp.asarray(depth, dtype)
+    pitch_given = pitch
     pitch = jnp.asarray(pitch, dtype)
     plane = jnp.asarray(gel.plane, dtype)
     # The composite modulus E*, of 1 / E* = 1 / E_gel + 1 / E_object, over the gel's own. It is the
@@ -122,8 +123,10 @@ def press(
     # 1 at the deepest point
     cut = jnp.where(scale > 0, cut / jnp.where(scale > 0, scale, 1), -1)
     plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
+    known = known_numbers(gel, pitch_given, modulus_object)
+    step, part = (pitch, share) if known is None else known
     compliances = [
-        _compliance(plan, pitch * 2**level, gel, share, dtype) for level, plan in enumerate(plans)
+        _compliance(plan, step * 2**level, gel, part, dtype) for level, plan in enumerate(plans)
     ]
     if fidelity == "fast":
         solution, load, moved = _fast(compliances, cut, 2 if iterations is None else iterations)
@@ -187,6 +190,17 @@ def _check_elastic(
             )
 
 
+def known_numbers(gel: Gel, pitch: Any, modulus_object: Any) -> tuple[float, float] | None:
+    """Return pitch and share of a spectrum (`elastic.normal_spectrum`), if no number is traced.
+
+    With them the spectra of a constant gel are computed by numpy, and not by XLA as it compiles.
+    """
+    numbers = (pitch, gel.modulus, gel.thickness, modulus_object)
+    if any(isinstance(value, jax.core.Tracer) for value in numbers):
+        return None
+    return float(pitch), 1 / (1 + float(gel.plane) / float(modulus_object))
+
+
 def grids(shape: tuple[int, ...]) -> list[Plan]:
     """Return the grid of `shape` and up to two coarser ones, each half of the one before."""
     plans = [Plan(shape[0], shape[1])]
@@ -197,7 +211,10 @@ def grids(shape: tuple[int, ...]) -> list[Plan]:
     return plans
 
 
-def _compliance(plan: Plan, pitch: Array, gel: Gel, share: Array, dtype: Any) -> Compliance:
+def _compliance(
+    plan: Plan, pitch: float | Array, gel: Gel, share: float | Array, dtype: Any
+) -> Compliance:
+    """Return the normal displacement by a pressure (H, W), as a function."""
     spectrum = normal_spectrum(plan, pitch, gel.poisson, gel.thickness, share, dtype)
     return lambda pressure: plan.inverse(plan.even(plan.forward(pressure), spectrum))
 
@@ -300,15 +317,18 @@ def sideways(
     if is_infinite(gel.thickness):
         raise UserError("sideways motion needs a bonded layer: set the thickness of the gel")
     shape = pressure.shape
+    step = pitch
     pitch = jnp.asarray(pitch, pressure.dtype)
+    if isinstance(step, jax.core.Tracer) or isinstance(gel.thickness, jax.core.Tracer):
+        step = pitch
     if fidelity == "fast":
         for _ in grids(shape)[1:]:
             pressure = halved(pressure)
             pitch = 2 * pitch
+            step = 2 * step
     plan = Plan(*pressure.shape)
-    spectrum = plan.spectrum(
-        sideways_kernel(plan, pitch, gel.poisson, gel.thickness, pressure.dtype)
-    )
+    kernel = sideways_kernel(plan, step, gel.poisson, gel.thickness, pressure.dtype)
+    spectrum = jnp.asarray(plan.spectrum(kernel), pressure.dtype)
     summed = plan.inverse(plan.even(plan.forward(pressure), spectrum))
     # Its differences from pixel to pixel are mm.
     potential = summed * pitch / (jnp.pi * gel.plane)

@@ -29,6 +29,7 @@ from anytouch_jax.sim.contact.mechanics import (
     centroid,
     enlarged,
     grids,
+    known_numbers,
     positions,
 )
 from anytouch_jax.sim.contact.solver import Compliance, descent, ratio
@@ -132,7 +133,9 @@ def slide(
     times = pressure.shape[0] // plan.rows
     load = _pooled(pressure, times)
     before = _pooled(state.traction, times) / unit * times
-    spectra = tangential_spectra(plan, pitch * times, gel.poisson, gel.thickness, share, dtype)
+    known = known_numbers(gel, interface.pitch, interface.modulus_object)
+    step, part = (pitch, share) if known is None else known
+    spectra = tangential_spectra(plan, step * times, gel.poisson, gel.thickness, part, dtype)
     apply = _compliance(plan, spectra)
     limit = jnp.where(load > 0, friction * load, 0) / unit * times
     moved = _rigid(

@@ -20,6 +20,7 @@ def test_a_label_is_reported_on_test_and_written_as_json(
     [
         ("label --leave-out object --group unit --seeds 3", ["--group", "--seeds"]),
         ("label --leave-out object --protocol published", ["--protocol"]),
+        ("label --train-sensor a --test-sensor b --seeds 3", ["--seeds", "--train-sensor"]),
         ("label --save h.npz --model a b", ["--save", "--model"]),
         ("label --save h.json --model a", ["--save", ".npz"]),
         ("label --model a --save h.npz --out h.npz", ["--save", "--out"]),

@@ -168,6 +168,8 @@ def run_label(options: LabelOptions) -> int:
             ("group", "seeds", "protocol"),
             "with --leave-out, which makes its own folds",
         )
+    if options.train_sensor is not None:
+        refuse_unused(options, ("seeds", "details"), "with --train-sensor")
     models = _models(options)
     if options.save is not None and len(models) != 1:
         raise UserError(

@@ -32,11 +32,11 @@ WEIGHTS = {
 }
 # What reads sensor.json of a fitted sensor, a folder NAME.sensor.
 SENSORS = {
-    "fitted": Door("sim.sensing.own:read_numbers", "sim"),
+    "fitted": Door("sim.sensing.own:read_numbers"),
 }
 # Sources of training batches, by the word of --data. Each has the interface of `batch.BatchSource`.
 BATCHES = {
-    "simulated": Door("sim.batches:SimulatedLoader", "sim"),
+    "simulated": Door("sim.batches:SimulatedLoader"),
 }
 # Heads beside the embedding. Each is a `nn.heads.Head`; its loss is a row of OBJECTIVES.
 HEADS = {

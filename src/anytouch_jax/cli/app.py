@@ -74,7 +74,6 @@ COMMANDS = {
         "data:SimulateOptions",
         "data:run_simulate",
         "Simulate touches felt by several sensors, with photographs, captions and forces.",
-        extra="sim",
     ),
     "data index": Command(
         "data:DatasetOptions",
@@ -147,7 +146,6 @@ COMMANDS = {
         "sensor:FitOptions",
         "sensor:run_fit",
         "Fit the look of your sensor to 5 to 50 pictures of it, for the simulator.",
-        extra="sim",
     ),
     "report": Command(
         "retrieve:ReportOptions",

@@ -255,9 +255,7 @@ def _interpolated(options: ExportOptions, before: Path, loaded: Loaded) -> dict[
     if differ:
         raise UserError(
             f"{before} and {options.model} have different networks ({', '.join(differ)}). "
-            "--between "
-            "takes the run that "
-            "MODEL was trained from."
+            "--between takes the run that MODEL was trained from."
         )
     return tree.interpolate(other.params, loaded.params, options.share)
 

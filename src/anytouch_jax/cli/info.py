@@ -299,8 +299,8 @@ def _model(model: ModelConfig, *, heads_known: bool = True) -> str:
     heads = f"{model.touch.heads} heads" if heads_known else "heads unknown"
     return (
         f"touch encoder: width {model.touch.width}, depth {model.touch.depth}, {heads}, images of "
-        f"{model.image_size} "
-        f"pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} features"
+        f"{model.image_size} pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} "
+        "features"
     )
 
 
@@ -364,8 +364,7 @@ def _manifest(path: Path) -> list[str]:
     labels = [name.removeprefix("label.") for name in summary.filled if name.startswith("label.")]
     return [
         f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, "
-        f"{summary.clips:,} clips of "
-        "three frames",
+        f"{summary.clips:,} clips of three frames",
         f"splits: {counts('split')}",
         f"sensors: {counts('sensor')}",
         f"rows with {', '.join(filled) or 'no optional column'}",
@@ -396,8 +395,7 @@ def _arrays(path: Path) -> list[str]:
         return [
             f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
             f"for features of {len(head.mean)} with --pooling {head.pooling} --frames "
-            f"{head.frames}, "
-            f"encoder {head.fingerprint}",
+            f"{head.frames}, encoder {head.fingerprint}",
             *(head.promises() or ["without calibration: save it again"]),
         ]
     if not {"features", "rows"} <= arrays.keys():

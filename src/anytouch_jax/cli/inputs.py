@@ -302,10 +302,9 @@ def _recording_gel(
         return own, what
     if encoder.needs_background:
         raise UserError(
-            f"{data} has too few frames to estimate the untouched gel, which is subtracted. "
-            f"Give {rule.FEWEST} or "
-            "more, or a picture of the gel with nothing on it: --background, or background.png "
-            "next to the frames."
+            f"{data} has too few frames to estimate the untouched gel, which is subtracted. Give "
+            f"{rule.FEWEST} or more, or a picture of the gel with nothing on it: --background, or "
+            "background.png next to the frames."
         )
     return None, "not subtracted"
 

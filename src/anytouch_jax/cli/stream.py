@@ -167,8 +167,7 @@ def _check_film(options: StreamOptions, result: Result) -> None:
     if not len(result.numbers):
         raise UserError(
             f"{options.data} has too few frames for a clip of {options.frames} at stride "
-            f"{options.stride}. "
-            "Lower one of them."
+            f"{options.stride}. Lower one of them."
         )
     inputs.log_if_cut(Path(options.data), int(result.numbers[-1]) + 1)
 

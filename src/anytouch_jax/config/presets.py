@@ -134,8 +134,7 @@ _ALL = (
     Baseline(
         "tlv_link",
         "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor "
-        "tokens, no "
-        "matching",
+        "tokens, no matching",
         (2,),
         {
             "model.match_head": "none",

@@ -73,8 +73,7 @@ class CostEstimate(NamedTuple):
         price = "no prices given" if self.cost is None else f"about {self.cost:.2f}"
         return (
             f"{self.questions} questions ({self.cached} answered before), about {self.tokens_in} "
-            "tokens in and "
-            f"{self.tokens_out} out: {price}"
+            f"tokens in and {self.tokens_out} out: {price}"
         )
 
 

@@ -49,8 +49,7 @@ def check_features(values: np.ndarray) -> np.ndarray:
     if not np.isfinite(values).all():
         raise UserError(
             "the features are not finite (NaN or infinite): the weights are damaged or much too "
-            "large. Load them again "
-            "from their source, or take an earlier checkpoint."
+            "large. Load them again from their source, or take an earlier checkpoint."
         )
     return values
 
@@ -156,8 +155,8 @@ def spread_lines(values: np.ndarray) -> list[str]:
     if cosine > SPREAD_LEAST:
         lines.append(
             f"The features are nearly constant: a mean cosine above {SPREAD_LEAST} cannot "
-            "distinguish touches. "
-            "Train longer, and check background subtraction and that the frames differ."
+            "distinguish touches. Train longer, and check background subtraction and that the "
+            "frames differ."
         )
     return lines
 

@@ -244,8 +244,8 @@ class Encoder(Towers):
                 convert = "convert values 0 to 255 by np.asarray(frames, np.uint8), and "
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), "
-                f"not {frames.dtype} "
-                f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
+                f"not {frames.dtype} {frames.shape}; {convert}resize each frame with "
+                "encoder.preprocess(frame)"
             )
         arrays.check_frames(self.config.model, frames.shape[1])
         check_choices(pooling, join)

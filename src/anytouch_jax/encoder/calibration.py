@@ -112,17 +112,15 @@ class Calibration:
         own = counts[looks == sensor].sum()
         if own <= (1 - _OTHERS) * len(x) and commonest != sensor:
             return (
-                f"{counts.max()} of {len(x)} frames look like {commonest}, not "
-                f"{sensor}. "
-                "Check --sensor, --rotate and --flip."
+                f"{counts.max()} of {len(x)} frames look like {commonest}, not {sensor}. Check "
+                "--sensor, --rotate and --flip."
             )
         novel = np.mean(self.novelty(x) > self.novelty_limit)
         # Four times the false alarms: frames of one recording are novel together.
         if novel > max(_OTHERS, 4 * self.false_alarms):
             return (
                 f"{novel:.0%} of the frames are unlike every touch of {sensor} that the head was "
-                "fitted on. "
-                "Check the sensor's name, its orientation and its background."
+                "fitted on. Check the sensor's name, its orientation and its background."
             )
         return ""
 

@@ -258,8 +258,7 @@ def rows_with_gel(
     if not has.any():
         raise UserError(
             f"{encoder.source} subtracts the untouched gel. {len(rows)} rows have no picture of "
-            "it, and too few frames "
-            f"to estimate it. {ADVICE}"
+            f"it, and too few frames to estimate it. {ADVICE}"
         )
     if not has.all():
         log(

@@ -197,8 +197,8 @@ class TouchIndex:
         if self.about.get("weights") != fingerprint:
             raise UserError(
                 f"{self.source} was made by another encoder "
-                f"({self.about.get('weights', 'unknown')}) than {source} "
-                f"({fingerprint}). Embed again, or name its encoder with --model."
+                f"({self.about.get('weights', 'unknown')}) than {source} ({fingerprint}). Embed "
+                "again, or name its encoder with --model."
             )
 
     def describe(self, row: int) -> dict[str, str]:

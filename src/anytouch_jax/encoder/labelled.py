@@ -126,8 +126,7 @@ def choose_frames(
     if len(rows) < count:
         raise UserError(
             f"split {split!r} has {len(rows)} usable frames of {sensor}, not {count}; ask for "
-            "fewer, or name another "
-            f"sensor ({', '.join(sorted(set(sensors)))})"
+            f"fewer, or name another sensor ({', '.join(sorted(set(sensors)))})"
         )
     # 77 separates these draws from others of the same seed. numpy takes no negative seeds.
     rows = np.random.default_rng([seed % 2**63, 77]).permutation(rows)

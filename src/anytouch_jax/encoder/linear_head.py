@@ -178,8 +178,7 @@ class LinearHead:
         if fingerprint != self.fingerprint:
             raise UserError(
                 f"The head was fitted on features of another encoder ({self.fingerprint}) than "
-                f"{source} "
-                f"({fingerprint}). Fit one with `anytouch probe label --save`."
+                f"{source} ({fingerprint}). Fit one with `anytouch probe label --save`."
             )
 
 

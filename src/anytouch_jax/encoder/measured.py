@@ -170,6 +170,5 @@ def missing(source: str) -> UserError:
     """Return the error of an encoder without a decoder of fields."""
     return UserError(
         f"{source} does not measure depth and force: its weights have no fields. Use "
-        "anytouch-tiny, or train with "
-        "--model.fields 32"
+        "anytouch-tiny, or train with --model.fields 32"
     )

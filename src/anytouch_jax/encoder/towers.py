@@ -101,8 +101,7 @@ class Towers(TouchEncoder):
         if tokenizer.vocab_size > text.vocab:
             raise UserError(
                 f"{self.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of "
-                f"{self.source} has "
-                f"{text.vocab}; copy the tokenizer of its training"
+                f"{self.source} has {text.vocab}; copy the tokenizer of its training"
             )
         texts = [texts] if isinstance(texts, str) else list(texts)
         if not all(isinstance(sentence, str) for sentence in texts):

@@ -63,10 +63,8 @@ def space_section(study: Study, out: Path, seed: int) -> tuple[Section, list[plo
     )
     text = (
         "The same touches by several sensors. Alignment: mean squared distance of one touch by two "
-        "sensors (0 is "
-        "best). Uniformity: lower is more even. Silhouette (-1 to 1): good alignment makes it low "
-        "by sensor and high "
-        "by object."
+        "sensors (0 is best). Uniformity: lower is more even. Silhouette (-1 to 1): good alignment "
+        "makes it low by sensor and high by object."
     )
     return Section("The space of touches", text, markdown_table(head, lines), path), spaces
 

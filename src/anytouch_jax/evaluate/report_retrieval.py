@@ -139,10 +139,8 @@ def retrieval_section(
         covariates = ", ".join(name.removeprefix("label.") for name in matched[0].matched)
     text = (
         "A touch by one sensor is retrieved among touches by another. In matched galleries the "
-        "distractors are the "
-        f"nearest in {covariates}; by chance they are random. Centred: minus the mean of each "
-        "sensor. In brackets: "
-        "95 % under a bootstrap over objects."
+        f"distractors are the nearest in {covariates}; by chance they are random. Centred: minus "
+        "the mean of each sensor. In brackets: 95 % under a bootstrap over objects."
     )
     if near:
         text += f" Distractors lie at {np.mean(near):.2f} of the mean distance of all touches."
@@ -165,12 +163,10 @@ def matching_section(study: Study, encoder: Encoder) -> tuple[Section, dict[str,
         notes.append(f"not scored: {error}")
     text = (
         "Did two touches, by two sensors, come from the same place (Eq. 5)? Half of the pairs are "
-        "positives. With "
-        "negatives of any sensor, the two sensors alone reveal part of the answer. With negatives "
-        "of the positive's "
-        "sensor they do not. The rule of the sensors alone is learned on half of the touches and "
-        "scored on the other. "
-        "In brackets: 95 % under a bootstrap over objects."
+        "positives. With negatives of any sensor, the two sensors alone reveal part of the answer. "
+        "With negatives of the positive's sensor they do not. The rule of the sensors alone is "
+        "learned on half of the touches and scored on the other. In brackets: 95 % under a "
+        "bootstrap over objects."
     )
     names = {"any": "of any sensor", "same_sensor": "of the positive's sensor"}
     head = ("negatives", "accuracy (chance 50 %)", "AUC", "by the sensors alone", "triples")

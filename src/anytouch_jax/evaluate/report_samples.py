@@ -41,11 +41,10 @@ def facts_section(table: Manifest, first: Encoder, second: Encoder, lineage: str
             rows.append((name, part.sum(), touches, things, listed))
     text = (
         f"Data {table.content_hash[:12]}. Stage 1: preset {first.config.preset}, "
-        f"{first.config.run.steps} steps of "
-        f"{first.config.data.batch_size}. Stage 2: {second.config.run.steps} steps of "
-        f"{second.config.data.batch_size}, "
-        f"recipe {second.config.recipe}, towers {second.config.towers}. All figures below are of "
-        "split test."
+        f"{first.config.run.steps} steps of {first.config.data.batch_size}. Stage 2: "
+        f"{second.config.run.steps} steps of {second.config.data.batch_size}, recipe "
+        f"{second.config.recipe}, towers {second.config.towers}. All figures below are of split "
+        "test."
     )
     backgrounds = (first.config.data.background, second.config.data.background)
     if backgrounds[0] != backgrounds[1]:

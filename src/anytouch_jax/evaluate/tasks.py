@@ -333,15 +333,13 @@ def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
     if not len(rows):
         raise UserError(
             f"Task {task.name}: no row of split train, val or test has a label in "
-            f"{task.label!r}{_also_needed(task)}. "
-            "Check the filters and the splits."
+            f"{task.label!r}{_also_needed(task)}. Check the filters and the splits."
         )
     if labels.dtype.kind == "U":
         for alike in spellings(labels[first].tolist()):
             notes += (
                 f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or "
-                "Unicode form. They are "
-                "probed as different classes.",
+                "Unicode form. They are probed as different classes.",
             )
     return TaskRows(
         rows,

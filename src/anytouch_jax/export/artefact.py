@@ -28,6 +28,7 @@ from anytouch_jax.encoder.arrays import Engine
 from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.export import engines
+from anytouch_jax.export.packages import needed
 from anytouch_jax.shown import described
 
 FORMAT = "anytouch_jax.export.1"
@@ -72,7 +73,8 @@ class Exported:
             if self.about["form"] == "onnx":
                 run: Any = engines.session(self._data, self._engine or "onnxruntime")
             else:
-                run = jax.jit(jax_export.deserialize(bytearray(self._data)).call)
+                with needed("anytouch_jax[export]"):
+                    run = jax.jit(jax_export.deserialize(bytearray(self._data)).call)
             self._running[process] = run
         return self._running[process]
 
@@ -179,8 +181,7 @@ def load(path: str | Path, engine: Engine | None = None) -> Exported:
     if form == "jax" and here not in about["platforms"]:
         raise UserError(
             f"{path} was exported for {', '.join(map(str, about['platforms']))}; this machine runs "
-            f"jax on {here}; "
-            "export it again for this machine"
+            f"jax on {here}; export it again for this machine"
         )
     exported = Exported(about, data, engine)
     try:

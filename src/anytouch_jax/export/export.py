@@ -31,6 +31,7 @@ from anytouch_jax.export.artefact import Exported as Exported
 from anytouch_jax.export.artefact import load as load
 from anytouch_jax.export.artefact import read_checked as read_checked
 from anytouch_jax.export.engines import Engine
+from anytouch_jax.export.packages import needed
 from anytouch_jax.fields.outputs import LENGTH
 from anytouch_jax.files import atomic_write
 
@@ -170,8 +171,7 @@ def export_with(encoder: Encoder, path: str | Path, settings: ExportSettings) ->
     if differs > tolerance:
         raise CheckError(
             f"the artefact differs from the live model by {differs:.2g} of its largest feature, "
-            "more than "
-            f"{tolerance:g}: not written"
+            f"more than {tolerance:g}: not written"
         )
     int8 = None
     if settings.calibration is not None:
@@ -288,7 +288,9 @@ def _artefact(encoder: Encoder, settings: ExportSettings) -> bytes:
     touches = jax.ShapeDtypeStruct((batch, settings.frames, *blank.shape), blank.dtype)
     rows = jax.ShapeDtypeStruct((batch,), np.int32)
     platforms = tuple(settings.platforms)
-    return bytes(jax_export.export(jax.jit(run), platforms=platforms)(touches, rows).serialize())
+    program = jax_export.export(jax.jit(run), platforms=platforms)(touches, rows)
+    with needed("anytouch_jax[export]"):
+        return bytes(program.serialize())
 
 
 def _worst(encoder: Encoder, run: Any, settings: ExportSettings) -> tuple[float, int]:

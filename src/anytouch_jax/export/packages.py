@@ -17,7 +17,9 @@ def needed(package: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise UserError(f'{error.name} is not installed: pip install "{package}"') from None
+        # jax names flatbuffers, which its export needs, in the message alone.
+        missing = f"{error.name} is not installed" if error.name else str(error)
+        raise UserError(f'{missing}: pip install "{package}"') from None
 
 
 def imported(engine: Engine) -> Any:

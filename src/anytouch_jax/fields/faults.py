@@ -49,8 +49,7 @@ def faults_of(
     if shape is not None and abs(np.log(height / (width * shape))) > SHAPE_LIMIT:
         faults.append(
             f"a picture of {sensor} has a height of {shape:.3g} widths, and this one has {width} x "
-            f"{height} pixels. "
-            "Turn it, or name the width that it shows (width_mm)."
+            f"{height} pixels. Turn it, or name the width that it shows (width_mm)."
         )
     few = frame[::4, ::4].astype(np.int16)
     if np.abs(few - few[..., :1]).max() <= _GREY:

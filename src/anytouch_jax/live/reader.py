@@ -262,8 +262,7 @@ def camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]
             if decoded - failing > RETRY:
                 raise CameraError(
                     f"no frame of the camera could be read for {RETRY:g} s after {number} frames: "
-                    f"{fault}. "
-                    "Check its cable and other programs that use it, and start again."
+                    f"{fault}. Check its cable and other programs that use it, and start again."
                 )
             time.sleep(_PAUSE)
             continue

@@ -119,9 +119,8 @@ class Checkpoints:
         if disk.total and disk.free < needed and jax.process_count() == 1:
             raise CheckpointError(
                 f"cannot write a checkpoint in {self.folder}: the disk is full. It needs "
-                f"{needed:,} bytes and has "
-                f"{disk.free:,}. Free some space and run the same command again. Older checkpoints "
-                "are untouched."
+                f"{needed:,} bytes and has {disk.free:,}. Free some space and run the same command "
+                "again. Older checkpoints are untouched."
             )
 
     def save(self, step: int, state: Tree, metrics: Mapping[str, Any]) -> None:
@@ -435,8 +434,7 @@ def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any])
     if differing:
         raise CheckpointError(
             f"checkpoint {folder} does not fit this configuration, use the preset and settings it "
-            "was trained with; "
-            f"{len(differing)} entries differ "
+            f"was trained with; {len(differing)} entries differ "
             f"({'; '.join(differing[:_LISTED])}{'; ...' * (len(differing) > _LISTED)})"
         )
 

@@ -347,8 +347,8 @@ def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) ->
         ]
         raise UserError(
             f"the image tower in {path} has {sizes[0]}, this run's {name} {sizes[1]}: --preset "
-            "large fits ViT-L/14, "
-            "--preset base fits ViT-B/16; add the one that fits, or give other --clip-weights"
+            "large fits ViT-L/14, --preset base fits ViT-B/16; add the one that fits, or give "
+            "other --clip-weights"
         )
 
 

@@ -141,8 +141,8 @@ def check_finite(path: str | Path, arrays: Mapping[str, Any]) -> None:
         others = f" and {len(wrong) - 1} other arrays have" if len(wrong) > 1 else " has"
         raise WeightsError(
             f"{path}: {wrong[0]}{others} values that are not finite (NaN or infinite); its "
-            "training diverged or the "
-            "file is damaged, so take an earlier checkpoint or another file"
+            "training diverged or the file is damaged, so take an earlier checkpoint or another "
+            "file"
         )
 
 
@@ -381,8 +381,8 @@ def clip_activation(path: str | Path) -> str | None:
     if len(names) > 1 or not names <= {"gelu", "quick_gelu"}:
         raise WeightsError(
             f"the configuration in the folder of {path} names the activation "
-            f"{' and '.join(sorted(names))}; give CLIP "
-            "weights of which both towers use gelu, or both quick_gelu"
+            f"{' and '.join(sorted(names))}; give CLIP weights of which both towers use gelu, or "
+            "both quick_gelu"
         )
     return next(iter(names), None)
 

@@ -85,9 +85,8 @@ def load_init(
                 ours, other = sorted(("gelu", "quick_gelu"), key=config.model.activation.__ne__)
                 notes.append(
                     f"the activation of {file} is not stored, this run uses {ours}: OpenAI's CLIP "
-                    "wants quick_gelu, "
-                    "most others gelu; put the config.json of the weights next to the file, or add "
-                    f"--model.activation {other}"
+                    "wants quick_gelu, most others gelu; put the config.json of the weights next "
+                    f"to the file, or add --model.activation {other}"
                 )
             if init is None and not towers.keys() & {"visual_projection.weight", "visual.proj"}:
                 notes.append(
@@ -123,8 +122,7 @@ def _init_notes(loaded: Loaded, config: Config, fresh_parts: set[str]) -> list[s
     if background != config.data.background:
         notes.append(
             f"{path} was trained with --data.background {background}, this run with "
-            f"{config.data.background}: its "
-            "encoder was never trained on such touches"
+            f"{config.data.background}: its encoder was never trained on such touches"
         )
     ours = config.model.sensors
     lost = [

@@ -32,8 +32,7 @@ def touch_of_photographs(
     if model.family.sensors != IMAGES or form.model.touch.depth == 0 or not has_tokens:
         raise UserError(
             f"{source} is an encoder of {model.family.title}; a run starts from weights of "
-            "AnyTouch, DINOv2, ViT-MAE, "
-            "ViT, DeiT or CLIP"
+            "AnyTouch, DINOv2, ViT-MAE, ViT, DeiT or CLIP"
         )
     kept = {
         name: getattr(ours, name)

@@ -314,8 +314,7 @@ def _code(name: str) -> int:
 def _refused(name: str) -> WeightsError:
     return WeightsError(
         f"the pickle wants {name!r}, which is neither a tensor nor a plain container; it was "
-        "refused and nothing was "
-        "run: save the weights as a plain state_dict or as safetensors"
+        "refused and nothing was run: save the weights as a plain state_dict or as safetensors"
     )
 
 

@@ -487,8 +487,7 @@ READERS = {
         _fota,
         "<data set>/train/data-000000.tar",
         "Zhao et al., Transferable Tactile Transformers for Representation Learning Across Diverse "
-        "Sensors and Tasks, "
-        "CoRL 2024",
+        "Sensors and Tasks, CoRL 2024",
         "MIT",
         "https://huggingface.co/datasets/alanz-mit/FoundationTactile",
         uses=("val", "test", "url", "sensor"),

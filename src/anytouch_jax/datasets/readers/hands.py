@@ -88,8 +88,7 @@ def _listed_frames(index: DatasetIndex) -> Listed:
             elif task == index.options.task:
                 raise DatasetError(
                     f"expected the list {split}{ending}.txt in "
-                    f"{index.options.lists or index.root}, or "
-                    f"in the folder of --lists; {SOURCE}"
+                    f"{index.options.lists or index.root}, or in the folder of --lists; {SOURCE}"
                 )
             else:
                 index.notes.append(f"no {split}{ending}.txt: no labels of that list")
@@ -553,8 +552,7 @@ READERS = {
         _tacquad,
         "data_indoor/<item>/gelsight/0.png",
         "Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple "
-        "Visuo-tactile Sensors, "
-        "ICLR 2025",
+        "Visuo-tactile Sensors, ICLR 2025",
         url="https://huggingface.co/datasets/xxuan01/TacQuad",
         uses=("val", "test", "lists"),
         paper=55_082,

@@ -166,8 +166,7 @@ def _stated_splits(
         if splits and index.options.val + index.options.test:
             index.notes.append(
                 f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by "
-                "hash; --val 0 "
-                "--test 0 keeps all in train"
+                "hash; --val 0 --test 0 keeps all in train"
             )
         return {number: index.split_of(f"episode-{number:06d}") for number in episodes}
     for name, ranges in splits.items():
